@@ -1,0 +1,5 @@
+//! Floor 4: HTTP, WebSocket and the dashboard.
+
+mod config;
+
+pub use config::Config;

@@ -1,0 +1,79 @@
+//! The command line: one file a command.
+
+mod calibrate;
+mod check;
+mod devices;
+mod explain;
+mod failure;
+mod locate;
+mod review;
+mod run;
+mod simulate;
+mod tradeoff;
+
+use std::process::ExitCode;
+
+use clap::{Parser, Subcommand};
+
+pub use failure::{Failure, Outcome};
+
+/// Watches every beam that reaches a UAV-mounted optical access point.
+#[derive(Debug, Parser)]
+#[command(
+    version,
+    about,
+    after_help = "Exit codes: 0 done, 1 failed, 2 bad input, 64 bad config."
+)]
+pub struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    /// Run the monitor: frames in, positions and alerts out, API and dashboard on 127.0.0.1:8787
+    Run(run::Args),
+    /// Find the emitters in a recording, one JSON object a frame on stdout
+    Locate(locate::Args),
+    /// Run the whole chain over a replay as fast as possible and print the alert events
+    Review(review::Args),
+    /// Make frames, truth and claims from a scene
+    Simulate(simulate::Args),
+    /// Say which effects a scene simulates, why, and what each costs
+    Explain(explain::Args),
+    /// Fit the device's calibration from frames with known positions
+    Calibrate(calibrate::Args),
+    /// Measure what accuracy costs in time
+    Tradeoff(tradeoff::Args),
+    /// Validate a config or scene without running it
+    Check(check::Args),
+    /// List V4L2 devices with their formats and sizes
+    Devices(devices::Args),
+}
+
+/// Parses the command line and runs it.
+pub fn main() -> ExitCode {
+    let cli = match Cli::try_parse() {
+        Ok(cli) => cli,
+        Err(e) => {
+            let code = if e.use_stderr() { 2 } else { 0 };
+            let _ = e.print();
+            return ExitCode::from(code);
+        }
+    };
+    let outcome = match cli.command {
+        Command::Run(args) => run::run(args),
+        Command::Locate(args) => locate::run(args),
+        Command::Review(args) => review::run(args),
+        Command::Simulate(args) => simulate::run(args),
+        Command::Explain(args) => explain::run(args),
+        Command::Calibrate(args) => calibrate::run(args),
+        Command::Tradeoff(args) => tradeoff::run(args),
+        Command::Check(args) => check::run(args),
+        Command::Devices(args) => devices::run(args),
+    };
+    match outcome {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(failure) => failure.report(),
+    }
+}

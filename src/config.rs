@@ -1,0 +1,103 @@
+//! The whole configuration: each room owns its table, this file only composes and loads them.
+
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+
+use crate::{api, claims, estimate, frames, journal, monitor, notify, optics};
+
+/// A config file. Every table may be left out.
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Config {
+    pub optics: optics::Config,
+    pub source: frames::Config,
+    pub claims: claims::Config,
+    pub estimator: estimate::Config,
+    pub monitor: monitor::Config,
+    pub api: api::Config,
+    pub journal: journal::Config,
+    pub webhook: Vec<notify::Config>,
+}
+
+/// Why a config file cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    #[error("{path}: {source}")]
+    Unreadable { path: PathBuf, source: std::io::Error },
+    #[error("{path}: {message}{nearest}")]
+    Malformed {
+        path: PathBuf,
+        message: String,
+        nearest: Nearest,
+    },
+}
+
+/// The known key an unknown one was probably meant to be.
+#[derive(Debug)]
+pub struct Nearest(Option<String>);
+
+impl std::fmt::Display for Nearest {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match &self.0 {
+            Some(key) => write!(f, "did you mean `{key}`?"),
+            None => Ok(()),
+        }
+    }
+}
+
+/// Reads a TOML file into `T`, naming line, column and, for an unknown key, the nearest known one.
+pub fn read_toml<T: serde::de::DeserializeOwned>(path: &Path) -> Result<T, Error> {
+    let text = std::fs::read_to_string(path).map_err(|source| Error::Unreadable {
+        path: path.to_owned(),
+        source,
+    })?;
+    toml::from_str(&text).map_err(|e| Error::Malformed {
+        path: path.to_owned(),
+        message: e.to_string(),
+        nearest: nearest_key(e.message()),
+    })
+}
+
+/// Finds the nearest known name in serde's "unknown field `a`, expected one of `b`, `c`".
+fn nearest_key(message: &str) -> Nearest {
+    let is_unknown = ["unknown field", "unknown variant"]
+        .iter()
+        .any(|p| message.starts_with(p));
+    if !is_unknown {
+        return Nearest(None);
+    }
+    let mut names = message.split('`').skip(1).step_by(2);
+    let Some(wrong) = names.next() else {
+        return Nearest(None);
+    };
+    let best = names.max_by(|a, b| strsim::jaro_winkler(wrong, a).total_cmp(&strsim::jaro_winkler(wrong, b)));
+    Nearest(best.map(str::to_owned))
+}
+
+impl Config {
+    /// Reads a config; relative paths in it are taken from the file's own folder.
+    pub fn load(path: &Path) -> Result<Self, Error> {
+        let mut config: Self = read_toml(path)?;
+        let base = path.parent().unwrap_or(Path::new("")).to_owned();
+        config.rebase(&base);
+        Ok(config)
+    }
+
+    fn rebase(&mut self, base: &Path) {
+        let optional = [
+            &mut self.optics.calibration,
+            &mut self.source.scene,
+            &mut self.source.frames,
+            &mut self.claims.log,
+            &mut self.api.token_file,
+            &mut self.journal.path,
+        ];
+        for path in optional.into_iter().flatten() {
+            *path = base.join(&*path);
+        }
+        for webhook in &mut self.webhook {
+            webhook.secret_file = base.join(&webhook.secret_file);
+        }
+    }
+}

@@ -1,0 +1,1 @@
+//! Composes the daemon: capture thread → latest-wins slot → compute thread → snapshot and events → tasks.

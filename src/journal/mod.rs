@@ -1,0 +1,5 @@
+//! Floor 4: alerts and webhook deliveries on disk, before anyone hears of them.
+
+mod config;
+
+pub use config::Config;

@@ -1,0 +1,27 @@
+//! oapwatch: the real-time monitor of a UAV-mounted optical access point.
+//!
+//! Data flows one way: frame → heatmap → peaks → emitters → ground positions → matches → tracks →
+//! verdicts → alerts → journal → API and webhooks. The modules are that chain, and imports go down only;
+//! ARCHITECTURE.md has the map.
+#![forbid(unsafe_code)]
+
+pub mod frame;
+pub mod optics;
+
+pub mod assign;
+pub mod estimate;
+pub mod scene;
+
+pub mod claims;
+pub mod frames;
+
+pub mod monitor;
+
+pub mod api;
+pub mod journal;
+pub mod notify;
+pub mod study;
+
+pub mod cli;
+pub mod config;
+pub mod daemon;

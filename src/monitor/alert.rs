@@ -1,0 +1,88 @@
+use jiff::Timestamp;
+use serde::{Deserialize, Serialize};
+
+/// What an alert is about.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize, utoipa::ToSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum AlertKind {
+    /// A beam nobody claims: a possible eavesdropper.
+    UnclaimedEmitter,
+    /// A user is not where the log says.
+    PositionMismatch,
+    /// Claimed, active, not seen.
+    UserUnseen,
+    /// No usable frames: blinding the monitor is itself an attack.
+    SensorLost,
+    /// The network's log has gone quiet.
+    ClaimsStale,
+    /// All users are shifted alike: our own pose is off.
+    PoseInconsistent,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize, utoipa::ToSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum Severity {
+    Info,
+    Warning,
+    Critical,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, utoipa::ToSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum AlertState {
+    Open,
+    Acknowledged,
+    Cleared,
+}
+
+/// The frame an alert came from.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+pub struct AlertSource {
+    /// "simulator", "v4l2" or "replay".
+    pub kind: String,
+    pub frame: u64,
+    /// The recording that holds the frame, where there is one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub file: Option<String>,
+}
+
+/// One cause for alarm, from raise to clear.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+pub struct Alert {
+    /// Unique and, for the same input, the same in every run.
+    pub id: String,
+    pub kind: AlertKind,
+    pub severity: Severity,
+    pub state: AlertState,
+    #[schema(value_type = String, format = DateTime)]
+    pub raised_at: Timestamp,
+    #[schema(value_type = Option<String>, format = DateTime)]
+    pub cleared_at: Option<Timestamp>,
+    pub user: Option<String>,
+    pub x_m: Option<f64>,
+    pub y_m: Option<f64>,
+    pub cov_m2: Option<[[f64; 2]; 2]>,
+    /// The claim the position was held against, where there is one.
+    pub claimed: Option<serde_json::Value>,
+    pub evidence: serde_json::Value,
+    pub source: AlertSource,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, utoipa::ToSchema)]
+pub enum AlertEventKind {
+    #[serde(rename = "alert.raised")]
+    Raised,
+    #[serde(rename = "alert.updated")]
+    Updated,
+    #[serde(rename = "alert.acknowledged")]
+    Acknowledged,
+    #[serde(rename = "alert.cleared")]
+    Cleared,
+}
+
+/// A step in an alert's life, with the alert as it is after it.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+pub struct AlertEvent {
+    pub event: AlertEventKind,
+    pub alert: Alert,
+}

@@ -1,0 +1,66 @@
+use jiff::Timestamp;
+use serde::Serialize;
+
+use super::AlertEvent;
+use crate::claims::Claim;
+use crate::estimate::{Error, Estimate};
+
+/// What the sensor gave for one frame, as the monitor takes it.
+#[derive(Clone, Copy, Debug)]
+pub struct Observation<'a> {
+    pub frame: u64,
+    pub time: Timestamp,
+    pub result: Result<&'a Estimate, &'a Error>,
+    /// Hash of the frame's pixels: an exact repeat is a frozen sensor.
+    pub digest: u64,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, utoipa::ToSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum PositionStatus {
+    Verified,
+    Mismatch,
+    Unclaimed,
+    Pending,
+}
+
+/// One beam as the monitor knows it after a frame.
+#[derive(Clone, Debug, Serialize, utoipa::ToSchema)]
+pub struct TrackedPosition {
+    pub track: u64,
+    pub x_m: f64,
+    pub y_m: f64,
+    pub cov_m2: [[f64; 2]; 2],
+    pub energy_j: f64,
+    /// The claim it answers to, if any. Never an input to the position.
+    pub user: Option<String>,
+    pub status: PositionStatus,
+    pub flags: Vec<String>,
+}
+
+/// Outcome of one step: `GET /v1/positions` and the alert events it caused, in order.
+#[derive(Clone, Debug, Serialize, utoipa::ToSchema)]
+pub struct Report {
+    #[schema(value_type = String, format = DateTime)]
+    pub time: Timestamp,
+    pub frame: u64,
+    pub emitters: Vec<TrackedPosition>,
+    /// Active users in view that no beam answers for.
+    pub unseen: Vec<String>,
+    #[serde(skip)]
+    pub events: Vec<AlertEvent>,
+    /// Claims as they stand at the frame's time, for the map.
+    #[serde(skip)]
+    pub claims: Vec<Claim>,
+}
+
+/// `GET /v1/users/{user}/position`.
+#[derive(Clone, Debug, Serialize, utoipa::ToSchema)]
+pub struct UserPosition {
+    pub user: String,
+    #[schema(value_type = String, format = DateTime)]
+    pub time: Timestamp,
+    pub position: Option<TrackedPosition>,
+    #[schema(value_type = Option<Object>)]
+    pub claim: Option<Claim>,
+}

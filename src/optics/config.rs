@@ -1,0 +1,145 @@
+use std::path::PathBuf;
+
+use serde::{Deserialize, Serialize};
+
+use super::camera::{Axis, Camera};
+
+/// `[optics]` of a config or scene. What is left out takes the value of the paper's scene.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Config {
+    pub altitude_m: f64,
+    pub lens_radius_m: f64,
+    /// Lens-to-sensor distance z.
+    pub plane_distance_m: f64,
+    /// [Nx, Ny].
+    pub pixels: [usize; 2],
+    pub sensor_size_m: [f64; 2],
+    /// σ_eff. Leave out when `blur` is given.
+    pub spot_sigma_m: Option<f64>,
+    pub blur: Option<BlurConfig>,
+    pub noise_std_j: f64,
+    /// Scale of integer frames.
+    pub joules_per_count: Option<f64>,
+    /// A pixel at or above this is saturated and carries no more than that.
+    pub saturation_j: Option<f64>,
+    /// A file written by `oapwatch calibrate`.
+    pub calibration: Option<PathBuf>,
+}
+
+/// The blur budget σ_eff² = σ_def² + σ_diff² + σ_sens².
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct BlurConfig {
+    pub focal_length_m: f64,
+    pub wavelength_m: f64,
+    pub sensor_sigma_m: f64,
+}
+
+/// Why an `[optics]` table describes no camera.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    #[error("optics.{field}: expected {expected}, found {found}")]
+    OutOfRange {
+        field: &'static str,
+        expected: &'static str,
+        found: f64,
+    },
+    #[error("optics: give either spot_sigma_m or [optics.blur], not both")]
+    TwoBlurs,
+}
+
+impl Default for Config {
+    fn default() -> Self {
+        Self {
+            altitude_m: 300.0,
+            lens_radius_m: 0.05,
+            plane_distance_m: 0.036,
+            pixels: [64, 64],
+            sensor_size_m: [0.03, 0.03],
+            spot_sigma_m: None,
+            blur: None,
+            noise_std_j: 1e-6,
+            joules_per_count: None,
+            saturation_j: None,
+            calibration: None,
+        }
+    }
+}
+
+impl Config {
+    /// σ_eff when neither `spot_sigma_m` nor `blur` is given, m.
+    pub const DEFAULT_SPOT_SIGMA_M: f64 = 1e-3;
+
+    /// Checks every field and resolves the blur budget.
+    pub fn camera(&self) -> Result<Camera, Error> {
+        let positive = |field, value: f64| {
+            if value.is_finite() && value > 0.0 {
+                Ok(value)
+            } else {
+                Err(Error::OutOfRange {
+                    field,
+                    expected: "a positive finite number",
+                    found: value,
+                })
+            }
+        };
+        for n in self.pixels {
+            if n == 0 || n > 4096 {
+                return Err(Error::OutOfRange {
+                    field: "pixels",
+                    expected: "1 to 4096 a side",
+                    found: n as f64,
+                });
+            }
+        }
+        let axis = |k: usize| -> Result<Axis, Error> {
+            let size = positive("sensor_size_m", self.sensor_size_m[k])?;
+            Ok(Axis::centred(self.pixels[k], size))
+        };
+        let lens_radius_m = positive("lens_radius_m", self.lens_radius_m)?;
+        let plane_distance_m = positive("plane_distance_m", self.plane_distance_m)?;
+        let spot_sigma_m = match (&self.spot_sigma_m, &self.blur) {
+            (Some(_), Some(_)) => return Err(Error::TwoBlurs),
+            (Some(sigma), None) => positive("spot_sigma_m", *sigma)?,
+            (None, Some(blur)) => {
+                let f = positive("blur.focal_length_m", blur.focal_length_m)?;
+                let wavelength = positive("blur.wavelength_m", blur.wavelength_m)?;
+                let sensor = blur.sensor_sigma_m;
+                if !(sensor.is_finite() && sensor >= 0.0) {
+                    return Err(Error::OutOfRange {
+                        field: "blur.sensor_sigma_m",
+                        expected: "zero or more",
+                        found: sensor,
+                    });
+                }
+                if plane_distance_m > f {
+                    return Err(Error::OutOfRange {
+                        field: "plane_distance_m",
+                        expected: "at most blur.focal_length_m",
+                        found: plane_distance_m,
+                    });
+                }
+                super::blur::spot_sigma(lens_radius_m, plane_distance_m, f, wavelength, sensor)
+            }
+            (None, None) => Self::DEFAULT_SPOT_SIGMA_M,
+        };
+        if let Some(scale) = self.joules_per_count {
+            positive("joules_per_count", scale)?;
+        }
+        if let Some(level) = self.saturation_j {
+            positive("saturation_j", level)?;
+        }
+        Ok(Camera {
+            altitude_m: positive("altitude_m", self.altitude_m)?,
+            lens_radius_m,
+            plane_distance_m,
+            x: axis(0)?,
+            y: axis(1)?,
+            spot_sigma_m,
+            noise_std_j: positive("noise_std_j", self.noise_std_j)?,
+            joules_per_count: self.joules_per_count,
+            saturation_j: self.saturation_j,
+        })
+    }
+}

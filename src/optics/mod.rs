@@ -1,0 +1,9 @@
+//! Floor 0: the optics as pure functions. No IO, no clock, no randomness.
+
+pub mod blur;
+mod camera;
+mod config;
+pub mod psf;
+
+pub use camera::{Axis, Camera};
+pub use config::{BlurConfig, Config, Error};

@@ -1,0 +1,1 @@
+//! Floor 4: studies: what accuracy costs in time, numerical stability, training data.
