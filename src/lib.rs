@@ -5,6 +5,7 @@
 //! ARCHITECTURE.md has the map.
 #![forbid(unsafe_code)]
 
+pub mod claim;
 pub mod frame;
 pub mod optics;
 

@@ -6,6 +6,7 @@ pub use config::{Config, SourceKind};
 
 use std::time::Duration;
 
+use crate::claim::Claim;
 use crate::frame::Frame;
 
 /// A supply of frames with a thread of its own to block in.
@@ -17,11 +18,10 @@ pub trait FrameSource: Send {
 /// What a wait for a frame ended with.
 #[derive(Debug)]
 pub enum Next {
-    Frame(Frame),
+    /// A frame, with the claims that came with it (simulator, our own recordings; otherwise none).
+    Frame(Frame, Vec<Claim>),
     /// A frame arrived that cannot be used (short, error-flagged, wrong format).
-    Unusable {
-        reason: String,
-    },
+    Unusable { reason: String },
     /// Nothing in time; ask again.
     Nothing,
     /// A recording came to its end.
