@@ -1,0 +1,27 @@
+# `make run` and `make test` install what they need and say so.
+SHELL := /bin/bash
+SUDO := $(if $(filter 0,$(shell id -u)),,sudo)
+# install PACKAGE-IF-MISSING: $(call need,test command,packages)
+need = @$(1) >/dev/null 2>&1 || { echo "Installing $(2) (Debian packages)"; $(SUDO) apt-get update -qq && $(SUDO) env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends $(2) >/dev/null; }
+
+.PHONY: run test build setup setup-test
+
+run: setup
+	@echo "Building (a first build takes some minutes)"
+	@cargo build --release --locked
+	@echo "Starting on the built-in simulator; stop with Ctrl-C"
+	@exec target/release/oapwatch run
+
+build: setup
+	cargo build --release --locked
+
+test: setup setup-test
+	cargo test --locked
+
+setup:
+	@command -v cargo >/dev/null || { echo "Rust is missing: install it from https://rustup.rs"; exit 1; }
+	$(call need,command -v cc,build-essential)
+	$(call need,ls /usr/lib/llvm-*/lib/libclang.so* /usr/lib/*/libclang-*.so*,libclang-dev)
+
+setup-test:
+	$(call need,command -v chromium,chromium chromium-driver)

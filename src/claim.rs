@@ -1,0 +1,27 @@
+//! A position that the access network asserts for a user. An attacker may write one.
+
+use jiff::Timestamp;
+use serde::{Deserialize, Serialize};
+
+/// One line of the network's log.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Claim {
+    pub time: Timestamp,
+    pub user: String,
+    pub x_m: f64,
+    pub y_m: f64,
+    /// Standard deviation per axis of the claimed position.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub sigma_m: Option<f64>,
+    #[serde(default)]
+    pub state: ClaimState,
+}
+
+/// Whether the user still transmits.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum ClaimState {
+    #[default]
+    Active,
+    Ended,
+}
