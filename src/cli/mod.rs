@@ -2,10 +2,12 @@
 
 mod calibrate;
 mod check;
+mod completions;
 mod devices;
 mod explain;
 mod failure;
 mod locate;
+mod man;
 mod review;
 mod run;
 mod simulate;
@@ -49,6 +51,10 @@ enum Command {
     Check(check::Args),
     /// List V4L2 devices with their formats and sizes
     Devices(devices::Args),
+    /// Print shell completions
+    Completions(completions::Args),
+    /// Write the manual pages
+    Man(man::Args),
 }
 
 /// Parses the command line and runs it.
@@ -71,6 +77,8 @@ pub fn main() -> ExitCode {
         Command::Tradeoff(args) => tradeoff::run(args),
         Command::Check(args) => check::run(args),
         Command::Devices(args) => devices::run(args),
+        Command::Completions(args) => completions::run(args),
+        Command::Man(args) => man::run(args),
     };
     match outcome {
         Ok(()) => ExitCode::SUCCESS,
