@@ -25,3 +25,14 @@ setup:
 
 setup-test:
 	$(call need,command -v chromium,chromium chromium-driver)
+
+.PHONY: deb
+deb: setup
+	@command -v cargo-deb >/dev/null || cargo install --locked cargo-deb
+	cargo build --profile dist --locked
+	rm -rf target/man target/completions && mkdir -p target/completions
+	target/dist/oapwatch man target/man
+	target/dist/oapwatch completions bash > target/completions/oapwatch.bash
+	target/dist/oapwatch completions zsh > target/completions/_oapwatch
+	target/dist/oapwatch completions fish > target/completions/oapwatch.fish
+	cargo deb --no-build --profile dist --output target/oapwatch.deb
