@@ -1,6 +1,7 @@
 //! Floor 2: where frames come from: the built-in simulator, a V4L2 device, a recording.
 
 mod config;
+pub mod npy;
 
 pub use config::{Config, SourceKind};
 

@@ -1,0 +1,104 @@
+use std::fs::File;
+use std::io::{Seek, SeekFrom, Write};
+use std::path::{Path, PathBuf};
+
+use ndarray::ArrayView2;
+
+use super::header::WRITTEN_HEADER;
+use super::{Dtype, Error, Header};
+
+/// Writes joules frame by frame. The file is a valid npy at every moment: a frame's bytes go out before the
+/// header counts them, so that a killed process loses at most the frame it was writing.
+#[derive(Debug)]
+pub struct Writer {
+    path: PathBuf,
+    file: File,
+    header: Header,
+    bytes: Vec<u8>,
+}
+
+impl Writer {
+    /// Creates (or replaces) a frame file for frames of shape (Ny, Nx).
+    pub fn create(path: impl AsRef<Path>, (ny, nx): (usize, usize)) -> Result<Self, Error> {
+        let path = path.as_ref().to_owned();
+        let header = Header {
+            dtype: Dtype::JOULES,
+            frames: 0,
+            ny,
+            nx,
+            data_start: WRITTEN_HEADER as u64,
+        };
+        let created = File::create(&path).and_then(|mut file| {
+            file.write_all(&header.bytes())?;
+            Ok(file)
+        });
+        match created {
+            Ok(file) => Ok(Self {
+                path,
+                file,
+                header,
+                bytes: Vec::new(),
+            }),
+            Err(source) => Err(Error::Io { path, source }),
+        }
+    }
+
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Frames written so far.
+    pub fn frames(&self) -> u64 {
+        self.header.frames
+    }
+
+    /// Size of the file, bytes.
+    pub fn size(&self) -> u64 {
+        self.end_of(self.header.frames)
+    }
+
+    /// Appends a frame. After an error the file holds what it held before.
+    pub fn push(&mut self, pixels: ArrayView2<f64>) -> Result<(), Error> {
+        let (ny, nx) = pixels.dim();
+        if (ny, nx) != (self.header.ny, self.header.nx) {
+            return Err(Error::Shape {
+                path: self.path.clone(),
+                expected_x: self.header.nx,
+                expected_y: self.header.ny,
+                found_x: nx,
+                found_y: ny,
+            });
+        }
+        self.bytes.clear();
+        self.bytes.extend(pixels.iter().flat_map(|v| v.to_le_bytes()));
+        self.append().map_err(|source| Error::Io {
+            path: self.path.clone(),
+            source,
+        })
+    }
+
+    /// Sees everything on the disk.
+    pub fn sync(&mut self) -> Result<(), Error> {
+        self.file.sync_data().map_err(|source| Error::Io {
+            path: self.path.clone(),
+            source,
+        })
+    }
+
+    fn append(&mut self) -> std::io::Result<()> {
+        self.file.seek(SeekFrom::Start(self.end_of(self.header.frames)))?;
+        self.file.write_all(&self.bytes)?;
+        let counted = Header {
+            frames: self.header.frames + 1,
+            ..self.header
+        };
+        self.file.seek(SeekFrom::Start(0))?;
+        self.file.write_all(&counted.bytes())?;
+        self.header = counted;
+        Ok(())
+    }
+
+    fn end_of(&self, frames: u64) -> u64 {
+        self.header.data_start + frames * self.header.frame_bytes() as u64
+    }
+}
