@@ -1,3 +1,7 @@
+use std::sync::Arc;
+
+use super::{Distortion, PixelMaps};
+
 /// One axis of the photodetector array: `n` pixels of equal pitch from `min_m` upwards.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Axis {
@@ -40,34 +44,64 @@ pub struct Camera {
     pub plane_distance_m: f64,
     pub x: Axis,
     pub y: Axis,
-    /// σ_eff.
+    /// σ_eff on the optical axis.
     pub spot_sigma_m: f64,
+    /// Relative growth of σ_eff from the optical axis to the sensor's corner, with the square of the radius.
+    pub spot_growth: f64,
     /// Standard deviation of the additive noise of one pixel.
     pub noise_std_j: f64,
     pub joules_per_count: Option<f64>,
     pub saturation_j: Option<f64>,
+    /// The lens's departure from a pinhole.
+    pub distortion: Distortion,
+    /// Per-pixel corrections that frames need before they are estimated.
+    pub pixels: Option<Arc<PixelMaps>>,
 }
 
 impl Camera {
-    /// Ground metres per sensor metre, h_u/z.
+    /// Ground metres per sensor metre near the optical axis, h_u/z.
     pub fn ground_scale(&self) -> f64 {
-        self.altitude_m / self.plane_distance_m
+        self.altitude_m / (self.plane_distance_m * self.distortion.focal_scale)
     }
 
-    /// Ground position, m, of a sensor position, m: p̂ = (h_u/z)·(x̂, ŷ).
+    /// Ground position, m, of a sensor position, m: p̂ = h_u·(tan θ̂x, tan θ̂y), which is (h_u/z)·(x̂, ŷ) without
+    /// distortion.
     pub fn to_ground(&self, sensor: [f64; 2]) -> [f64; 2] {
-        sensor.map(|s| s * self.ground_scale())
+        self.distortion
+            .unproject(self.plane_distance_m, sensor)
+            .map(|t| t * self.altitude_m)
     }
 
-    /// Sensor position, m, of a ground position, m: x = z·tan θx.
+    /// Sensor position, m, of a ground position, m: x = z·tan θx without distortion.
     pub fn to_sensor(&self, ground: [f64; 2]) -> [f64; 2] {
-        ground.map(|p| p / self.ground_scale())
+        self.distortion.project(self.plane_distance_m, self.tangents(ground))
     }
 
-    /// Covariance on the ground, m², of a covariance on the sensor, m².
-    pub fn cov_to_ground(&self, _sensor: [f64; 2], cov: [[f64; 2]; 2]) -> [[f64; 2]; 2] {
-        let g2 = self.ground_scale().powi(2);
-        cov.map(|row| row.map(|c| c * g2))
+    /// (tan θx, tan θy) of a ground position, m.
+    pub fn tangents(&self, ground: [f64; 2]) -> [f64; 2] {
+        ground.map(|p| p / self.altitude_m)
+    }
+
+    /// σ_eff of a spot at a sensor position, m.
+    pub fn spot_sigma_at(&self, sensor: [f64; 2]) -> f64 {
+        self.spot_sigma_m * (1.0 + self.spot_growth * self.corner_ratio2(sensor))
+    }
+
+    /// Squared distance from the principal point over the squared half-diagonal of the sensor.
+    pub fn corner_ratio2(&self, [x, y]: [f64; 2]) -> f64 {
+        let [cx, cy] = self.distortion.principal_point_m;
+        ((x - cx).powi(2) + (y - cy).powi(2)) / (self.x.half_width().powi(2) + self.y.half_width().powi(2))
+    }
+
+    /// Covariance on the ground, m², of a covariance on the sensor, m², at a sensor position, m: J C Jᵀ with
+    /// J = ∂ground/∂sensor.
+    pub fn cov_to_ground(&self, sensor: [f64; 2], cov: [[f64; 2]; 2]) -> [[f64; 2]; 2] {
+        let tangents = self.distortion.unproject(self.plane_distance_m, sensor);
+        let [[a, b], [c, d]] = self.distortion.project_jacobian(self.plane_distance_m, tangents);
+        let scale = self.altitude_m / (a * d - b * c);
+        let j = [[scale * d, -scale * b], [-scale * c, scale * a]];
+        let half: [[f64; 2]; 2] = j.map(|row| std::array::from_fn(|k| row[0] * cov[0][k] + row[1] * cov[1][k]));
+        half.map(|row| std::array::from_fn(|k| row[0] * j[k][0] + row[1] * j[k][1]))
     }
 
     /// Whether a ground position is imaged onto the array (`fov_limits`).
@@ -79,5 +113,33 @@ impl Camera {
     /// Shape of a frame's pixels, (Ny, Nx).
     pub fn shape(&self) -> (usize, usize) {
         (self.y.n, self.x.n)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+
+    #[test]
+    fn covariance_follows_the_jacobian_of_to_ground() {
+        let mut camera = crate::optics::Config::default().camera().unwrap();
+        camera.distortion.radial = [0.12, -0.03, 0.0];
+        camera.distortion.tangential = [0.002, 0.001];
+        camera.distortion.principal_point_m = [1e-4, 2e-4];
+        let (at, h) = ([0.011, -0.007], 1e-7);
+        let column = |k: usize| {
+            let shifted = |s: f64| std::array::from_fn(|i| at[i] + if i == k { s } else { 0.0 });
+            let (up, down) = (camera.to_ground(shifted(h)), camera.to_ground(shifted(-h)));
+            [(up[0] - down[0]) / (2.0 * h), (up[1] - down[1]) / (2.0 * h)]
+        };
+        let (jx, jy) = (column(0), column(1));
+        let cov = [[2.0, 0.5], [0.5, 1.0]];
+        let got = camera.cov_to_ground(at, cov);
+        for a in 0..2 {
+            for b in 0..2 {
+                let expected = 2.0 * jx[a] * jx[b] + 0.5 * (jx[a] * jy[b] + jy[a] * jx[b]) + jy[a] * jy[b];
+                // Central differences of step h lose about half the digits.
+                assert!((got[a][b] - expected).abs() < 1e-6 * got[0][0], "{got:?}");
+            }
+        }
     }
 }

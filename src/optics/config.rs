@@ -3,6 +3,7 @@ use std::path::PathBuf;
 use serde::{Deserialize, Serialize};
 
 use super::camera::{Axis, Camera};
+use super::{Calibration, CalibrationError, Distortion};
 
 /// `[optics]` of a config or scene. What is left out takes the value of the paper's scene.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -25,6 +26,9 @@ pub struct Config {
     pub saturation_j: Option<f64>,
     /// A file written by `oapwatch calibrate`.
     pub calibration: Option<PathBuf>,
+    /// The content of that file, put here by whoever reads the config.
+    #[serde(skip)]
+    pub calibrated: Option<Calibration>,
 }
 
 /// The blur budget σ_eff² = σ_def² + σ_diff² + σ_sens².
@@ -47,6 +51,10 @@ pub enum Error {
     },
     #[error("optics: give either spot_sigma_m or [optics.blur], not both")]
     TwoBlurs,
+    #[error("optics.calibration: {0} was named but not read: only a config can name a calibration, a scene cannot")]
+    CalibrationNotRead(PathBuf),
+    #[error("optics.calibration: {0}")]
+    Calibration(#[from] CalibrationError),
 }
 
 impl Default for Config {
@@ -63,6 +71,7 @@ impl Default for Config {
             joules_per_count: None,
             saturation_j: None,
             calibration: None,
+            calibrated: None,
         }
     }
 }
@@ -130,7 +139,7 @@ impl Config {
         if let Some(level) = self.saturation_j {
             positive("saturation_j", level)?;
         }
-        Ok(Camera {
+        let camera = Camera {
             altitude_m: positive("altitude_m", self.altitude_m)?,
             lens_radius_m,
             plane_distance_m,
@@ -140,6 +149,14 @@ impl Config {
             noise_std_j: positive("noise_std_j", self.noise_std_j)?,
             joules_per_count: self.joules_per_count,
             saturation_j: self.saturation_j,
-        })
+            spot_growth: 0.0,
+            distortion: Distortion::default(),
+            pixels: None,
+        };
+        match (&self.calibrated, &self.calibration) {
+            (Some(calibration), _) => Ok(calibration.applied_to(&camera)?),
+            (None, Some(path)) => Err(Error::CalibrationNotRead(path.clone())),
+            (None, None) => Ok(camera),
+        }
     }
 }
