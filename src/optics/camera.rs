@@ -118,7 +118,6 @@ impl Camera {
 
 #[cfg(test)]
 mod tests {
-
     #[test]
     fn covariance_follows_the_jacobian_of_to_ground() {
         let mut camera = crate::optics::Config::default().camera().unwrap();
