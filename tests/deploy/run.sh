@@ -1,0 +1,116 @@
+#!/usr/bin/env bash
+# Boots a Debian with systemd under QEMU's software emulation, installs target/oapwatch.deb in it and runs guest.sh there.
+# Needs root (or fakeroot) for mmdebstrap. Everything it makes is kept under target/deploy-vm for the next run.
+set -euo pipefail
+cd "$(dirname "$0")/../.."
+work=$PWD/target/deploy-vm
+deb=$PWD/target/oapwatch.deb
+mkdir -p "$work"
+[ -f "$deb" ] || { echo "tests/deploy: target/oapwatch.deb is missing; run make deb"; exit 1; }
+
+suite=$(. /etc/os-release && echo "$VERSION_CODENAME")
+if [ ! -f "$work/root.tar" ]; then
+    echo "Making a minimal Debian $suite (about a minute)"
+    mmdebstrap --quiet --variant=minbase --include=systemd-sysv,udev,kmod,curl,python3-minimal,ca-certificates \
+        --dpkgopt='path-exclude=/usr/share/doc/*' --dpkgopt='path-exclude=/usr/share/locale/*' \
+        "$suite" "$work/root.tar.part"
+    mv "$work/root.tar.part" "$work/root.tar"
+fi
+if [ ! -d "$work/kernel" ]; then
+    echo "Fetching Debian's kernel"
+    package=$(apt-cache depends linux-image-amd64 | sed -n 's/.*Depends: //p' | head -n 1)
+    (cd "$work" && apt-get download -q "$package" 2>/dev/null)
+    mkdir -p "$work/kernel.part"
+    dpkg-deb --extract "$work"/linux-image-*.deb "$work/kernel.part"
+    rm "$work"/linux-image-*.deb
+    depmod -b "$work/kernel.part" "$(ls "$work/kernel.part/lib/modules")"
+    mv "$work/kernel.part" "$work/kernel"
+fi
+version=$(ls "$work/kernel/lib/modules")
+vmlinuz=$work/kernel/boot/vmlinuz-$version
+
+# Paths of MODULE and all it needs, in loading order.
+needs() {
+    modprobe -d "$work/kernel" -S "$version" --show-depends "$@" | sed -n 's/^insmod \([^ ]*\).*/\1/p'
+}
+
+initramfs() {
+    local dir=$work/initramfs
+    rm -rf "$dir"
+    mkdir -p "$dir"/{bin,dev,proc,sys,lower,upper,root,modules}
+    cp /bin/busybox "$dir/bin/"
+    local n=10
+    for module in virtio_pci virtio_blk squashfs overlay; do
+        for path in $(needs "$module"); do
+            cp -n "$path" "$dir/modules/$n-$(basename "$path")"
+            n=$((n + 1))
+        done
+    done
+    cat > "$dir/init" <<'INIT'
+#!/bin/busybox sh
+/bin/busybox --install -s /bin
+mount -t devtmpfs dev /dev; mount -t proc proc /proc; mount -t sysfs sys /sys
+for m in /modules/*; do insmod "$m" 2>/dev/null; done
+n=0; while [ ! -b /dev/vda ] && [ $n -lt 50 ]; do sleep 0.1; n=$((n+1)); done
+mount -t squashfs -o ro /dev/vda /lower || { echo "no root"; poweroff -f; }
+mount -t tmpfs -o size=400m tmpfs /upper; mkdir /upper/data /upper/work
+mount -t overlay -o lowerdir=/lower,upperdir=/upper/data,workdir=/upper/work overlay /root
+umount /proc /sys
+exec switch_root /root /lib/systemd/systemd
+INIT
+    chmod +x "$dir/init"
+    (cd "$dir" && find . | cpio --quiet -o -H newc | gzip -1) > "$work/initramfs.gz"
+}
+
+root_image() {
+    local dir=$work/root
+    rm -rf "$dir"
+    mkdir -p "$dir"
+    tar -C "$dir" --exclude='./dev/*' -xf "$work/root.tar"
+    for path in $(needs vivid); do
+        install -D "$path" "$dir/lib/modules/$version/${path##*/lib/modules/$version/}"
+    done
+    cp "$work/kernel/lib/modules/$version"/modules.{builtin,order}* "$dir/lib/modules/$version/"
+    depmod -b "$dir" "$version"
+    cp "$deb" "$dir/oapwatch.deb"
+    install -m 755 tests/deploy/guest.sh "$dir/guest.sh"
+    install -m 644 tests/deploy/receiver.py "$dir/receiver.py"
+    cat > "$dir/etc/systemd/system/guest.service" <<'UNIT'
+[Unit]
+After=multi-user.target
+[Service]
+Type=oneshot
+ExecStart=/guest.sh
+StandardOutput=tty
+StandardError=tty
+TTYPath=/dev/ttyS0
+[Install]
+WantedBy=multi-user.target
+UNIT
+    # Not multi-user.target's own dependency loop: start it from a timer-free wants of default.target.
+    mkdir -p "$dir/etc/systemd/system/default.target.wants"
+    ln -sf ../guest.service "$dir/etc/systemd/system/default.target.wants/guest.service"
+    for unit in systemd-timesyncd systemd-udev-settle apt-daily.timer apt-daily-upgrade.timer dpkg-db-backup.timer e2scrub_all.timer \
+        fstrim.timer getty@tty1 serial-getty@ttyS0 systemd-update-utmp systemd-random-seed; do
+        case $unit in *.timer) ;; *) unit=$unit.service ;; esac
+        ln -sf /dev/null "$dir/etc/systemd/system/$unit"
+    done
+    rm -f "$work/root.squashfs"
+    mksquashfs "$dir" "$work/root.squashfs" -comp gzip -Xcompression-level 1 -quiet -no-progress
+}
+
+initramfs
+root_image
+echo "Booting (software emulation; a few minutes at most)"
+status=0
+timeout 600 qemu-system-x86_64 -accel tcg -cpu max -smp 1 -m 1024 -nodefaults -display none -no-reboot \
+    -kernel "$vmlinuz" -initrd "$work/initramfs.gz" \
+    -append "console=ttyS0 quiet panic=-1 nokaslr mitigations=off tsc=reliable no_timer_check random.trust_cpu=on cryptomgr.notests systemd.show_status=false rd.systemd.show_status=false" \
+    -drive "file=$work/root.squashfs,format=raw,if=virtio,readonly=on" \
+    -device isa-debug-exit,iobase=0xf4,iosize=0x04 -serial stdio </dev/null | tee "$work/log" || status=${PIPESTATUS[0]}
+# The guest writes v to the port and QEMU ends with (v << 1) | 1.
+grep -a '^ok\|^not ok' "$work/log" > "$work/results" || true
+failed=$(grep -ac '^not ok' "$work/results" || true)
+passed=$(grep -ac '^ok' "$work/results" || true)
+echo "$passed passed, $failed failed"
+[ "$status" = 33 ] && [ "$failed" = 0 ] && [ "$passed" -gt 0 ]
