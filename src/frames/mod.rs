@@ -1,30 +1,89 @@
 //! Floor 2: where frames come from: the built-in simulator, a V4L2 device, a recording.
 
+mod capture;
 mod config;
 pub mod npy;
+mod replay;
+mod slot;
 
+pub use capture::{Capture, Captured};
 pub use config::{Config, SourceKind};
+pub use replay::Replay;
 
+use std::path::Path;
 use std::time::Duration;
+
+use jiff::Timestamp;
 
 use crate::claim::Claim;
 use crate::frame::Frame;
+use crate::optics::Camera;
 
 /// A supply of frames with a thread of its own to block in.
 pub trait FrameSource: Send {
     /// Waits up to `patience` for the next frame.
     fn next(&mut self, patience: Duration) -> Next;
+
+    /// The recording that holds the frame last given, where there is one.
+    fn file(&self) -> Option<&Path> {
+        None
+    }
+
+    /// Whether the source waits for its reader (a recording), or frames come and go (a device).
+    fn waits(&self) -> bool {
+        false
+    }
 }
 
 /// What a wait for a frame ended with.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub enum Next {
     /// A frame, with the claims that came with it (simulator, our own recordings; otherwise none).
     Frame(Frame, Vec<Claim>),
-    /// A frame arrived that cannot be used (short, error-flagged, wrong format).
-    Unusable { reason: String },
-    /// Nothing in time; ask again.
+    /// No usable frame at `time`: it was short or error-flagged, or none came for a whole second. All that
+    /// the monitor needs to know about a failing sensor comes as one of these, so that a recording of them
+    /// gives the same alerts.
+    Unusable {
+        index: u64,
+        time: Timestamp,
+        reason: String,
+    },
+    /// Nothing yet; ask again.
     Nothing,
     /// A recording came to its end.
     End,
+}
+
+/// Why a source cannot be opened.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    #[error("source.{field}: expected {expected}, found {found}")]
+    OutOfRange {
+        field: &'static str,
+        expected: &'static str,
+        found: f64,
+    },
+    #[error("source.{field}: needed for kind = {kind:?}, found nothing")]
+    Missing { field: &'static str, kind: &'static str },
+    #[error("source.kind = {kind:?} is not built yet")]
+    NotBuilt { kind: &'static str },
+    #[error(transparent)]
+    Npy(#[from] npy::Error),
+}
+
+impl Error {
+    /// Whether the config is at fault, not what it points at.
+    pub fn is_config(&self) -> bool {
+        matches!(self, Self::OutOfRange { .. } | Self::Missing { .. })
+    }
+}
+
+/// Opens the configured source. A device that is not there yet is no error: it is waited for.
+pub fn open(config: &Config, camera: &Camera) -> Result<Box<dyn FrameSource>, Error> {
+    match config.kind {
+        SourceKind::Replay => Ok(Box::new(Replay::open(config, camera.joules_per_count)?)),
+        SourceKind::Simulator | SourceKind::V4l2 => Err(Error::NotBuilt {
+            kind: config.kind.name(),
+        }),
+    }
 }

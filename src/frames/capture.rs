@@ -1,0 +1,112 @@
+//! The capture thread: blocks in a source so that nobody else has to.
+
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+use super::slot::{Slot, Taken};
+use super::{FrameSource, Next};
+
+/// How long a closing capture may go unnoticed.
+const PATIENCE: Duration = Duration::from_millis(100);
+
+/// What a source gave, and the recording it stands in.
+#[derive(Clone, Debug)]
+pub struct Captured {
+    pub next: Next,
+    pub file: Option<Arc<Path>>,
+}
+
+impl Captured {
+    pub fn new(next: Next, file: Option<Arc<Path>>) -> Self {
+        Self { next, file }
+    }
+}
+
+/// A running source. Dropping it stops the thread and waits for it.
+#[derive(Debug)]
+pub struct Capture {
+    slot: Arc<Slot>,
+    stop: Arc<AtomicBool>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Capture {
+    /// Starts a thread that empties `source` into a latest-wins slot; a recording waits for its reader.
+    pub fn start(source: Box<dyn FrameSource>) -> std::io::Result<Self> {
+        let slot = Arc::new(Slot::default());
+        let stop = Arc::new(AtomicBool::new(false));
+        let thread = std::thread::Builder::new().name("capture".into()).spawn({
+            let (slot, stop) = (slot.clone(), stop.clone());
+            move || {
+                let _closes = CloseOnExit(&slot);
+                run(source, &slot, &stop);
+            }
+        })?;
+        Ok(Self {
+            slot,
+            stop,
+            thread: Some(thread),
+        })
+    }
+
+    /// Waits up to `patience` for the latest frame. Gives `Next::End` once the source has ended.
+    pub fn next(&self, patience: Duration) -> Captured {
+        match self.slot.take(patience) {
+            Taken::Captured(captured, dropped) => {
+                if dropped > 0 {
+                    metrics::counter!("oapwatch_frames_dropped_total").increment(dropped);
+                }
+                captured
+            }
+            Taken::Nothing => Captured::new(Next::Nothing, None),
+            Taken::Closed => Captured::new(Next::End, None),
+        }
+    }
+}
+
+impl Drop for Capture {
+    fn drop(&mut self) {
+        self.stop.store(true, Ordering::Relaxed);
+        self.slot.close();
+        if let Some(thread) = self.thread.take()
+            && thread.join().is_err()
+        {
+            tracing::error!("the capture thread ended in a panic");
+        }
+    }
+}
+
+/// Closes the slot however the thread ends, so that the reader never waits for a dead one.
+struct CloseOnExit<'a>(&'a Slot);
+
+impl Drop for CloseOnExit<'_> {
+    fn drop(&mut self) {
+        self.0.close();
+    }
+}
+
+fn run(mut source: Box<dyn FrameSource>, slot: &Slot, stop: &AtomicBool) {
+    let mut file: Option<Arc<Path>> = None;
+    while !stop.load(Ordering::Relaxed) {
+        let next = source.next(PATIENCE);
+        match next {
+            Next::Nothing => continue,
+            Next::End => return,
+            Next::Frame(..) | Next::Unusable { .. } => {}
+        }
+        if source.file() != file.as_deref() {
+            file = source.file().map(Arc::from);
+        }
+        let captured = Captured::new(next, file.clone());
+        let open = match source.waits() {
+            true => slot.put_when_empty(captured),
+            false => slot.put(captured),
+        };
+        if !open {
+            return;
+        }
+    }
+}

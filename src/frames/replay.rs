@@ -1,0 +1,150 @@
+//! A recording as a source: at its own speed, n times it, or as fast as its reader takes it.
+
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use jiff::{SignedDuration, Timestamp};
+
+use super::npy::Reader;
+use super::{Config, Error, FrameSource, Next};
+use crate::frame::Frame;
+
+/// Frames of one .npy file. Frame k is at start + k/rate_hz whatever the speed; a loop goes on counting.
+pub struct Replay {
+    reader: Reader,
+    start: Timestamp,
+    rate_hz: f64,
+    looped: bool,
+    pace: Pace,
+    next: u64,
+    /// A file that was cut short has said so, once.
+    ended: bool,
+}
+
+impl Replay {
+    pub fn open(config: &Config, joules_per_count: Option<f64>) -> Result<Self, Error> {
+        let path = config.frames.as_ref().ok_or(Error::Missing {
+            field: "frames",
+            kind: "replay",
+        })?;
+        if !(config.rate_hz.is_finite() && config.rate_hz > 0.0) {
+            return Err(Error::OutOfRange {
+                field: "rate_hz",
+                expected: "a positive finite number",
+                found: config.rate_hz,
+            });
+        }
+        let start = config.start.unwrap_or_else(|| {
+            tracing::warn!(frames = %path.display(), "source.start is not set: frame 0 is taken to be at 1970-01-01T00:00:00Z");
+            Timestamp::UNIX_EPOCH
+        });
+        Ok(Self {
+            reader: Reader::open(path, joules_per_count)?,
+            start,
+            rate_hz: config.rate_hz,
+            looped: config.r#loop,
+            pace: Pace::new(config.speed)?,
+            next: 0,
+            ended: false,
+        })
+    }
+
+    fn time(&self, frame: u64) -> Timestamp {
+        let nanos = (frame as f64 / self.rate_hz * 1e9).round();
+        self.start
+            .checked_add(SignedDuration::from_nanos_i128(nanos as i128))
+            .unwrap_or(Timestamp::MAX)
+    }
+}
+
+impl FrameSource for Replay {
+    fn next(&mut self, patience: Duration) -> Next {
+        if self.ended {
+            return Next::End;
+        }
+        let time = self.time(self.next);
+        if !self.pace.wait(time, patience) {
+            return Next::Nothing;
+        }
+        if self.looped && self.reader.position() == self.reader.frames() && self.reader.seek(0).is_err() {
+            return Next::End;
+        }
+        let index = self.next;
+        match self.reader.next() {
+            Some(Ok(pixels)) => {
+                self.next += 1;
+                let frame = Frame {
+                    index,
+                    time,
+                    pixels,
+                    masked: None,
+                };
+                Next::Frame(frame, Vec::new())
+            }
+            Some(Err(error)) => {
+                tracing::error!(%error, "the recording ends early");
+                self.ended = true;
+                Next::Unusable {
+                    index,
+                    time,
+                    reason: error.to_string(),
+                }
+            }
+            None => Next::End,
+        }
+    }
+
+    fn file(&self) -> Option<&Path> {
+        Some(self.reader.path())
+    }
+
+    fn waits(&self) -> bool {
+        true
+    }
+}
+
+/// Holds recorded times against the clock on the wall.
+#[derive(Debug)]
+pub(super) struct Pace {
+    speed: f64,
+    origin: Option<(Timestamp, Instant)>,
+}
+
+impl Pace {
+    /// `speed` times the original; 0 is as fast as possible.
+    pub fn new(speed: f64) -> Result<Self, Error> {
+        match speed.is_finite() && speed >= 0.0 {
+            true => Ok(Self { speed, origin: None }),
+            false => Err(Error::OutOfRange {
+                field: "speed",
+                expected: "0 (as fast as possible) or a positive finite number",
+                found: speed,
+            }),
+        }
+    }
+
+    /// Waits until `time` is due, `patience` at most; `false` when it is not due yet. The first time asked
+    /// for is due at once.
+    pub fn wait(&mut self, time: Timestamp, patience: Duration) -> bool {
+        if self.speed == 0.0 {
+            return true;
+        }
+        let (first, began) = *self.origin.get_or_insert_with(|| (time, Instant::now()));
+        let offset = time.duration_since(first).as_secs_f64().max(0.0) / self.speed;
+        // A speed close to zero reaches past what the clock can hold: never due.
+        let due = Duration::try_from_secs_f64(offset)
+            .ok()
+            .and_then(|d| began.checked_add(d));
+        let left = due.map(|d| d.saturating_duration_since(Instant::now()));
+        match left {
+            Some(left) if left <= patience => {
+                std::thread::sleep(left);
+                true
+            }
+            _ => {
+                std::thread::sleep(patience);
+                false
+            }
+        }
+    }
+}

@@ -1,0 +1,211 @@
+//! Where the capture thread leaves what it has and the compute thread finds the latest.
+
+use std::collections::VecDeque;
+use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use super::{Captured, Next};
+
+/// Events other than frames that wait at most; more than this and the oldest goes.
+const MOST_UNUSABLE: usize = 64;
+
+/// Holds at most one frame. A newer frame takes its place and inherits its claims; the drop is counted.
+#[derive(Debug, Default)]
+pub struct Slot {
+    state: Mutex<State>,
+    changed: Condvar,
+}
+
+#[derive(Debug, Default)]
+struct State {
+    waiting: VecDeque<Captured>,
+    dropped: u64,
+    closed: bool,
+}
+
+/// What waiting on the slot ended with.
+#[derive(Debug)]
+pub enum Taken {
+    /// The oldest thing that is still of interest, and the number of frames dropped since the last one.
+    Captured(Captured, u64),
+    Nothing,
+    Closed,
+}
+
+impl Slot {
+    fn lock(&self) -> MutexGuard<'_, State> {
+        // Nothing in here panics while it holds the lock; a poisoned state is still whole.
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Leaves something; the latest frame wins. `false` when the slot is closed.
+    pub fn put(&self, mut captured: Captured) -> bool {
+        let mut state = self.lock();
+        if let Next::Frame(_, claims) = &mut captured.next {
+            let older = state
+                .waiting
+                .iter()
+                .position(|c| matches!(c.next, Next::Frame(..)))
+                .and_then(|k| state.waiting.remove(k));
+            if let Some(Captured {
+                next: Next::Frame(_, mut inherited),
+                ..
+            }) = older
+            {
+                inherited.append(claims);
+                *claims = inherited;
+                state.dropped += 1;
+            }
+        }
+        state.waiting.push_back(captured);
+        if state.waiting.len() > MOST_UNUSABLE {
+            let oldest = state.waiting.iter().position(|c| !matches!(c.next, Next::Frame(..)));
+            oldest.and_then(|k| state.waiting.remove(k));
+        }
+        self.changed.notify_all();
+        !state.closed
+    }
+
+    /// Leaves something as soon as the slot is empty. `false` when the slot is closed.
+    pub fn put_when_empty(&self, captured: Captured) -> bool {
+        let state = self.lock();
+        let mut state = self
+            .changed
+            .wait_while(state, |s| !s.waiting.is_empty() && !s.closed)
+            .unwrap_or_else(PoisonError::into_inner);
+        if !state.closed {
+            state.waiting.push_back(captured);
+            self.changed.notify_all();
+        }
+        !state.closed
+    }
+
+    /// Waits up to `patience` for something. What was left before the slot was closed is still given.
+    pub fn take(&self, patience: Duration) -> Taken {
+        let deadline = Instant::now() + patience;
+        let mut state = self.lock();
+        loop {
+            if let Some(captured) = state.waiting.pop_front() {
+                self.changed.notify_all();
+                let dropped = std::mem::take(&mut state.dropped);
+                return Taken::Captured(captured, dropped);
+            }
+            if state.closed {
+                return Taken::Closed;
+            }
+            let left = deadline.saturating_duration_since(Instant::now());
+            if left.is_zero() {
+                return Taken::Nothing;
+            }
+            state = match self.changed.wait_timeout(state, left) {
+                Ok((state, _)) => state,
+                Err(poisoned) => poisoned.into_inner().0,
+            };
+        }
+    }
+
+    /// Wakes both sides; nothing more is accepted.
+    pub fn close(&self) {
+        self.lock().closed = true;
+        self.changed.notify_all();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+    use std::thread;
+
+    use jiff::Timestamp;
+    use ndarray::Array2;
+
+    use super::*;
+    use crate::claim::{Claim, ClaimState};
+    use crate::frame::Frame;
+
+    const LONG: Duration = Duration::from_secs(20);
+
+    fn frame(index: u64) -> Captured {
+        let claim = Claim {
+            time: Timestamp::UNIX_EPOCH,
+            user: format!("u-{index}"),
+            x_m: 0.0,
+            y_m: 0.0,
+            sigma_m: None,
+            state: ClaimState::Active,
+        };
+        let frame = Frame {
+            index,
+            time: Timestamp::UNIX_EPOCH,
+            pixels: Array2::zeros((1, 1)),
+            masked: None,
+        };
+        Captured::new(Next::Frame(frame, vec![claim]), None)
+    }
+
+    fn unusable(index: u64) -> Captured {
+        let reason = "short".to_owned();
+        let time = Timestamp::UNIX_EPOCH;
+        Captured::new(Next::Unusable { index, time, reason }, None)
+    }
+
+    fn take(slot: &Slot) -> (Next, u64) {
+        match slot.take(LONG) {
+            Taken::Captured(c, dropped) => (c.next, dropped),
+            other => panic!("{other:?}"),
+        }
+    }
+
+    #[test]
+    fn the_latest_frame_wins_and_keeps_the_claims_of_the_dropped() {
+        let slot = Slot::default();
+        for k in 0..3 {
+            assert!(slot.put(frame(k)));
+        }
+        let (next, dropped) = take(&slot);
+        let Next::Frame(frame, claims) = next else {
+            panic!("{next:?}")
+        };
+        assert_eq!((frame.index, dropped), (2, 2));
+        let users: Vec<_> = claims.iter().map(|c| c.user.as_str()).collect();
+        assert_eq!(users, ["u-0", "u-1", "u-2"]);
+        assert!(matches!(slot.take(Duration::ZERO), Taken::Nothing));
+    }
+
+    #[test]
+    fn a_newer_frame_does_not_hide_that_one_was_unusable() {
+        let slot = Slot::default();
+        slot.put(frame(0));
+        slot.put(unusable(1));
+        slot.put(frame(2));
+        assert!(matches!(take(&slot), (Next::Unusable { index: 1, .. }, 1)));
+        assert!(matches!(take(&slot), (Next::Frame(Frame { index: 2, .. }, _), 0)));
+    }
+
+    #[test]
+    fn what_waits_is_bounded_and_keeps_the_frame() {
+        let slot = Slot::default();
+        slot.put(frame(0));
+        for k in 1..1000 {
+            slot.put(unusable(k));
+        }
+        assert_eq!(slot.lock().waiting.len(), MOST_UNUSABLE);
+        assert!(matches!(take(&slot), (Next::Frame(..), 0)));
+    }
+
+    #[test]
+    fn a_waiting_source_loses_nothing_and_closing_wakes_it() {
+        let slot = Arc::new(Slot::default());
+        let writer = thread::spawn({
+            let slot = slot.clone();
+            move || (0..).take_while(|k| slot.put_when_empty(frame(*k))).count()
+        });
+        for k in 0..100 {
+            assert!(matches!(take(&slot), (Next::Frame(f, _), 0) if f.index == k));
+        }
+        slot.close();
+        assert!(writer.join().unwrap() >= 100);
+        while let Taken::Captured(..) = slot.take(LONG) {}
+        assert!(matches!(slot.take(LONG), Taken::Closed));
+    }
+}
