@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use crate::{api, claims, estimate, frames, journal, monitor, notify, optics};
+use crate::{api, calibrate, claims, estimate, frames, journal, monitor, notify, optics};
 
 /// A config file. Every table may be left out.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
@@ -31,6 +31,8 @@ pub enum Error {
         message: String,
         nearest: Nearest,
     },
+    #[error("optics.calibration: {0}")]
+    Calibration(#[from] calibrate::file::Error),
 }
 
 /// The known key an unknown one was probably meant to be.
@@ -81,6 +83,9 @@ impl Config {
         let mut config: Self = read_toml(path)?;
         let base = path.parent().unwrap_or(Path::new("")).to_owned();
         config.rebase(&base);
+        if let Some(path) = &config.optics.calibration {
+            config.optics.calibrated = Some(calibrate::file::read(path)?);
+        }
         Ok(config)
     }
 

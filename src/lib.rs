@@ -13,6 +13,7 @@ pub mod assign;
 pub mod estimate;
 pub mod scene;
 
+pub mod calibrate;
 pub mod claims;
 pub mod frames;
 
