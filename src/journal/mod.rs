@@ -1,5 +1,339 @@
 //! Floor 4: alerts and webhook deliveries on disk, before anyone hears of them.
+//!
+//! One thread writes ([`Journal::record`] hands it the events and returns at once, so that a slow disk never
+//! delays a frame); any thread reads, each over its own read-only connection. SQLite in WAL mode with
+//! `synchronous=FULL`: what [`Follower`] gives out survives a kill -9 and a power cut. While the disk refuses
+//! writes, events wait in memory, in order, are heard of all the same, and [`Health`] says so.
 
 mod config;
+mod error;
+mod follow;
+mod health;
+mod outbox;
+mod query;
+mod schema;
+mod store;
+mod writer;
+
+use std::collections::BTreeMap;
+use std::fs::{File, OpenOptions, TryLockError};
+use std::path::Path;
+use std::sync::{Arc, Mutex};
+use std::thread::JoinHandle;
+
+use jiff::Timestamp;
+
+use crate::monitor::{Alert, AlertEvent};
+use store::{Store, Write};
+use writer::{Shared, Writer, lock};
 
 pub use config::Config;
+pub use error::Error;
+pub use follow::Follower;
+pub use health::Health;
+pub use outbox::{Attempt, DeadLetter, EndpointRecord, Outcome, Subscription, Waiting};
+pub use query::{Cursor, Filter, Recorded};
+
+/// A page of `GET /v1/alerts`.
+#[derive(Clone, Debug, Default)]
+pub struct Page {
+    pub alerts: Vec<Alert>,
+    /// Where the next page begins; `None` on the last.
+    pub next: Option<Cursor>,
+}
+
+/// A handle on the journal; clones share it. Dropping the last one writes what is queued and closes the file.
+#[derive(Clone)]
+pub struct Journal {
+    shared: Arc<Shared>,
+    readers: Arc<Mutex<Vec<Store>>>,
+    id: Arc<str>,
+    _thread: Arc<Thread>,
+}
+
+/// Ends the writer thread with the last handle, then gives the file free.
+struct Thread {
+    shared: Arc<Shared>,
+    join: Option<JoinHandle<()>>,
+    _claim: Option<File>,
+}
+
+impl Drop for Thread {
+    fn drop(&mut self) {
+        self.shared.close();
+        if let Some(join) = self.join.take()
+            && join.join().is_err()
+        {
+            tracing::error!("the journal's writer panicked");
+        }
+    }
+}
+
+/// Idle readers that are kept open.
+const READERS: usize = 4;
+
+/// Events that one alert's history shows at most.
+const HISTORY: usize = 1_000;
+
+impl Journal {
+    /// Opens or creates the journal. A full or read-only disk is no error here: the journal starts in memory and
+    /// writes once it can. A file that is not ours, or newer than us, is.
+    pub fn open(config: &Config, subscriptions: Vec<Subscription>) -> Result<Self, Error> {
+        let subscriptions: Arc<[Subscription]> = subscriptions.into();
+        let overlay = Store::open(None, subscriptions.clone())?;
+        let mut health = Health {
+            path: config.path.clone(),
+            writable: true,
+            ..Health::default()
+        };
+        let mut claim = None;
+        let mut disk = None;
+        let mut identity = overlay.identity()?;
+        if let Some(path) = &config.path {
+            claim = claim_file(path)?;
+            match Store::open(Some(path), subscriptions.clone()) {
+                Ok(store) => {
+                    identity = store.identity()?;
+                    disk = Some(store);
+                    health.working(path);
+                }
+                Err(Error::Unusable { source, path }) if error::is_passing(&source) => {
+                    tracing::error!(path = %path.display(), error = %source, "the journal cannot be written; alerts are held in memory");
+                    if let Ok(known) = Store::open_readable(&path).and_then(|store| store.identity()) {
+                        identity = known;
+                    }
+                    health.failed(source.to_string(), 0);
+                }
+                Err(error) => return Err(error),
+            }
+        }
+        let (id, last_seq) = identity;
+        let shared = Arc::new(Shared::new(
+            config.path.clone(),
+            subscriptions,
+            overlay,
+            last_seq,
+            health,
+        ));
+        let writer = Writer::new(shared.clone(), disk);
+        let join = std::thread::Builder::new()
+            .name("journal".to_owned())
+            .spawn(move || writer.run())
+            .map_err(|source| Error::Io {
+                path: config.path.clone().unwrap_or_default(),
+                source,
+            })?;
+        Ok(Self {
+            readers: Arc::default(),
+            id: id.into(),
+            _thread: Arc::new(Thread {
+                shared: shared.clone(),
+                join: Some(join),
+                _claim: claim,
+            }),
+            shared,
+        })
+    }
+
+    /// Hands alert events to the writer, which puts them and their webhook deliveries on disk in one transaction.
+    /// `at` is the frames' clock, `now` the wall's. Never waits for the disk. Gives the last sequence number; an
+    /// error means the backlog is full and these events are lost to the journal.
+    pub fn record(&self, events: &[AlertEvent], at: Timestamp, now: Timestamp) -> Result<u64, Error> {
+        self.shared.push_events(events.len(), |k, seq| Write::Event {
+            seq,
+            event: Arc::new(events[k].clone()),
+            at,
+            now,
+        })
+    }
+
+    /// Waits until all that was handed over so far is on disk or, where the disk refuses it, in memory.
+    pub async fn settled(&self) {
+        self.until(self.shared.accepted()).await;
+    }
+
+    async fn until(&self, done: u64) {
+        let mut watch = self.shared.done.subscribe();
+        // An error would mean that the sender, which `shared` holds, is gone.
+        let _ = watch.wait_for(|&n| n >= done).await;
+    }
+
+    /// Alert events from `after` on, as they become durable; none is left out however slowly they are taken.
+    pub fn follow(&self, after: u64) -> Follower {
+        Follower::new(self.clone(), self.shared.heard.subscribe(), after)
+    }
+
+    /// Sequence number of the last event that may be heard of.
+    pub fn last_seq(&self) -> u64 {
+        *self.shared.heard.borrow()
+    }
+
+    /// The journal's own random name, for ids that stay unique over journals.
+    pub fn id(&self) -> &str {
+        &self.id
+    }
+
+    pub fn health(&self) -> Health {
+        lock(&self.shared.health).clone()
+    }
+
+    /// Alerts that are not cleared, oldest first: what the monitor resumes with after a restart.
+    pub fn open_alerts(&self) -> Result<Vec<Alert>, Error> {
+        let (held, disk) = self.read(|store| store.open_alerts())?;
+        let newer = self.held_ids()?;
+        let disk = disk.unwrap_or_default().into_iter().filter(|a| !newer.contains(&a.id));
+        let mut alerts: Vec<Alert> = disk.chain(held.unwrap_or_default()).collect();
+        alerts.sort_by_key(|a| a.raised_at);
+        Ok(alerts)
+    }
+
+    /// Newest raised first.
+    pub fn alerts(&self, filter: &Filter, limit: usize) -> Result<Page, Error> {
+        let newer = self.held_ids()?;
+        let take = limit.saturating_add(1).saturating_add(newer.len());
+        let (held, disk) = self.read(|store| store.alerts(filter, take))?;
+        let disk = disk
+            .unwrap_or_default()
+            .into_iter()
+            .filter(|l| !newer.contains(&l.alert.id));
+        let mut listed: Vec<_> = disk.chain(held.unwrap_or_default()).collect();
+        listed.sort_by_key(|l| std::cmp::Reverse(l.cursor));
+        let more = listed.len() > limit;
+        listed.truncate(limit);
+        Ok(Page {
+            next: listed.last().filter(|_| more).map(|l| l.cursor),
+            alerts: listed.into_iter().map(|l| l.alert).collect(),
+        })
+    }
+
+    pub fn alert(&self, id: &str) -> Result<Option<Alert>, Error> {
+        let (held, disk) = self.read(|store| store.alert(id))?;
+        Ok(held.flatten().or(disk.flatten()))
+    }
+
+    /// One alert's life, oldest event first.
+    pub fn events(&self, alert: &str) -> Result<Vec<Recorded>, Error> {
+        let (held, disk) = self.read(|store| store.events_of(alert, HISTORY))?;
+        Ok(in_order(held, disk))
+    }
+
+    /// Events of every alert after a sequence number, oldest first.
+    pub fn events_after(&self, seq: u64, limit: usize) -> Result<Vec<Recorded>, Error> {
+        let (held, disk) = self.read(|store| store.events_after(seq, limit))?;
+        let mut events = in_order(held, disk);
+        events.truncate(limit);
+        Ok(events)
+    }
+
+    /// Deliveries to an endpoint that are still to be made, for events after a sequence number.
+    pub fn waiting(&self, endpoint: &str, after: u64) -> Result<Vec<Waiting>, Error> {
+        let (held, disk) = self.read(|store| store.waiting(endpoint, after))?;
+        let all = disk.into_iter().chain(held).flatten();
+        let by_seq: BTreeMap<u64, Waiting> = all.map(|w| (w.seq, w)).collect();
+        Ok(by_seq.into_values().collect())
+    }
+
+    pub fn dead_letters(&self, endpoint: &str, limit: usize) -> Result<Vec<DeadLetter>, Error> {
+        let (held, disk) = self.read(|store| store.dead_letters(endpoint, limit))?;
+        Ok(disk.into_iter().chain(held).flatten().collect())
+    }
+
+    pub fn endpoint(&self, id: &str) -> Result<EndpointRecord, Error> {
+        let (held, disk) = self.read(|store| store.endpoint(id))?;
+        Ok(disk.or(held).unwrap_or_default())
+    }
+
+    /// Notes how a delivery attempt ended.
+    pub fn attempted(&self, attempt: Attempt) {
+        self.shared.push(Write::Attempt(attempt));
+    }
+
+    pub fn disable(&self, endpoint: &str, at: Timestamp, reason: String) {
+        self.shared.push(Write::Disable {
+            endpoint: endpoint.to_owned(),
+            at,
+            reason,
+        });
+    }
+
+    pub async fn enable(&self, endpoint: &str) {
+        let endpoint = endpoint.to_owned();
+        let done = self.shared.push(Write::Enable { endpoint });
+        self.until(done).await;
+    }
+
+    /// Puts one dead letter, or all of an endpoint's, back into the outbox.
+    pub async fn replay(&self, endpoint: &str, seq: Option<u64>, at: Timestamp) {
+        let endpoint = endpoint.to_owned();
+        let done = self.shared.push(Write::Replay { endpoint, seq, at });
+        self.until(done).await;
+    }
+
+    /// Removes what is older than `keep_days` or beyond `max_mb`.
+    pub fn maintain(&self, now: Timestamp) {
+        self.shared.push(Write::Maintain { now });
+    }
+
+    fn held_ids(&self) -> Result<std::collections::HashSet<String>, Error> {
+        let overlay = lock(&self.shared.overlay);
+        match overlay.in_use {
+            true => Ok(overlay.store.alert_ids()?),
+            false => Ok(Default::default()),
+        }
+    }
+
+    /// Asks the memory first and the disk after it: a record that moves from one to the other in between is then
+    /// seen twice, never missed. A disk that cannot even be read leaves what memory holds.
+    fn read<T>(&self, ask: impl Fn(&Store) -> Result<T, rusqlite::Error>) -> Result<(Option<T>, Option<T>), Error> {
+        let held = {
+            let overlay = lock(&self.shared.overlay);
+            overlay.in_use.then(|| ask(&overlay.store)).transpose()?
+        };
+        let Some(path) = &self.shared.path else {
+            return Ok((held, None));
+        };
+        let reader = lock(&self.readers).pop();
+        let answer = match reader {
+            Some(reader) => Ok(reader),
+            None => Store::open_readable(path),
+        }
+        .and_then(|reader| Ok((ask(&reader)?, reader)));
+        match answer {
+            Ok((found, reader)) => {
+                let mut readers = lock(&self.readers);
+                if readers.len() < READERS {
+                    readers.push(reader);
+                }
+                Ok((held, Some(found)))
+            }
+            Err(error) if held.is_some() => {
+                tracing::warn!(%error, "the journal's disk cannot be read; only what memory holds is shown");
+                Ok((held, None))
+            }
+            Err(error) => Err(error.into()),
+        }
+    }
+}
+
+fn in_order(held: Option<Vec<Recorded>>, disk: Option<Vec<Recorded>>) -> Vec<Recorded> {
+    let all = disk.into_iter().chain(held).flatten();
+    let by_seq: BTreeMap<u64, Recorded> = all.map(|e| (e.seq, e)).collect();
+    by_seq.into_values().collect()
+}
+
+/// Claims the journal for this process. On a disk where no lock file can be made, nobody else can write either.
+fn claim_file(path: &Path) -> Result<Option<File>, Error> {
+    let mut name = path.as_os_str().to_owned();
+    name.push(".lock");
+    let Ok(file) = OpenOptions::new().create(true).truncate(false).write(true).open(&name) else {
+        return Ok(None);
+    };
+    match file.try_lock() {
+        Ok(()) => Ok(Some(file)),
+        Err(TryLockError::WouldBlock) => Err(Error::InUse { path: path.to_owned() }),
+        Err(TryLockError::Error(error)) => {
+            tracing::warn!(%error, "the journal's file system has no locks; a second oapwatch would not be noticed");
+            Ok(None)
+        }
+    }
+}

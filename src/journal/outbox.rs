@@ -1,0 +1,84 @@
+use jiff::Timestamp;
+
+use crate::monitor::{AlertEvent, AlertEventKind, AlertKind};
+
+/// What one webhook endpoint wants to hear; the outbox gets a row for each event that matches.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Subscription {
+    /// The endpoint's name in the journal; stable over restarts.
+    pub endpoint: String,
+    /// All kinds when `None`.
+    pub kinds: Option<Vec<AlertKind>>,
+}
+
+/// An outbox row that is still to be sent.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Waiting {
+    pub seq: u64,
+    pub endpoint: String,
+    pub alert: String,
+    /// Steps of the retry schedule that are used up.
+    pub step: u32,
+    /// HTTP requests made so far.
+    pub attempts: u32,
+    pub next_at: Timestamp,
+}
+
+/// How one delivery attempt ended.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Attempt {
+    pub seq: u64,
+    pub endpoint: String,
+    pub at: Timestamp,
+    pub outcome: Outcome,
+}
+
+#[derive(Clone, Debug, PartialEq)]
+pub enum Outcome {
+    Sent,
+    Retry {
+        step: u32,
+        next_at: Timestamp,
+        error: String,
+    },
+    /// The schedule is used up: kept, and sent again only on request.
+    Dead {
+        error: String,
+    },
+}
+
+/// A delivery that the schedule gave up on.
+#[derive(Clone, Debug, PartialEq, serde::Serialize, utoipa::ToSchema)]
+pub struct DeadLetter {
+    pub seq: u64,
+    pub alert: String,
+    pub attempts: u32,
+    #[schema(value_type = String, format = DateTime)]
+    pub given_up_at: Timestamp,
+    pub error: String,
+}
+
+/// What the journal remembers of an endpoint.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct EndpointRecord {
+    pub sent: u64,
+    pub waiting: u64,
+    pub dead: u64,
+    /// When the oldest event that waits was recorded.
+    pub oldest_waiting: Option<Timestamp>,
+    pub last_success: Option<Timestamp>,
+    pub last_failure: Option<Timestamp>,
+    pub last_error: Option<String>,
+    pub disabled_at: Option<Timestamp>,
+}
+
+impl Subscription {
+    /// Acknowledging is the operator's own act and no news to a receiver.
+    pub fn wants(&self, event: &AlertEvent) -> bool {
+        event.event != AlertEventKind::Acknowledged
+            && self
+                .kinds
+                .as_ref()
+                .is_none_or(|kinds| kinds.contains(&event.alert.kind))
+    }
+}

@@ -1,0 +1,135 @@
+use std::path::Path;
+use std::time::Duration;
+
+use rusqlite::{Connection, OpenFlags, TransactionBehavior};
+
+use super::Error;
+
+/// "OAPW", so that `file` and we ourselves can tell a journal from any other SQLite file.
+const APPLICATION_ID: i64 = 0x4F41_5057;
+
+/// Longest wait for another process (a backup, a shell) that holds the file.
+const BUSY: Duration = Duration::from_millis(1000);
+
+/// Step k takes a journal from `user_version` k to k + 1. Never edit a step that was released: add one.
+const MIGRATIONS: &[&str] = &["
+    CREATE TABLE journal (
+        id       TEXT NOT NULL,
+        last_seq INTEGER NOT NULL
+    );
+    INSERT INTO journal VALUES (lower(hex(randomblob(6))), 0);
+
+    CREATE TABLE alert (
+        id          TEXT PRIMARY KEY,
+        kind        TEXT NOT NULL,
+        state       TEXT NOT NULL,
+        raised_us   INTEGER NOT NULL,
+        first_seq   INTEGER NOT NULL,
+        recorded_us INTEGER NOT NULL,
+        body        TEXT NOT NULL
+    );
+    CREATE INDEX alert_newest ON alert (raised_us, first_seq);
+    CREATE INDEX alert_open ON alert (state) WHERE state <> 'cleared';
+    CREATE INDEX alert_oldest ON alert (recorded_us);
+
+    CREATE TABLE event (
+        seq         INTEGER PRIMARY KEY,
+        alert       TEXT NOT NULL REFERENCES alert (id) ON DELETE CASCADE,
+        at_us       INTEGER NOT NULL,
+        recorded_us INTEGER NOT NULL,
+        body        TEXT NOT NULL
+    );
+    CREATE INDEX event_alert ON event (alert, seq);
+
+    CREATE TABLE delivery (
+        seq        INTEGER NOT NULL REFERENCES event (seq) ON DELETE CASCADE,
+        endpoint   TEXT NOT NULL,
+        state      TEXT NOT NULL CHECK (state IN ('waiting', 'sent', 'dead')),
+        step       INTEGER NOT NULL,
+        attempts   INTEGER NOT NULL,
+        next_us    INTEGER NOT NULL,
+        settled_us INTEGER,
+        error      TEXT,
+        PRIMARY KEY (seq, endpoint)
+    ) WITHOUT ROWID;
+    CREATE INDEX delivery_unsent ON delivery (endpoint, state, seq) WHERE state <> 'sent';
+
+    CREATE TABLE endpoint (
+        id              TEXT PRIMARY KEY,
+        sent            INTEGER NOT NULL DEFAULT 0,
+        last_success_us INTEGER,
+        last_failure_us INTEGER,
+        last_error      TEXT,
+        disabled_us     INTEGER
+    );
+"];
+
+/// Opens a journal for writing, creating or migrating it where needed. `None` is a journal in memory.
+pub(super) fn open_writable(path: Option<&Path>) -> Result<Connection, Error> {
+    let name = path.unwrap_or(Path::new(":memory:"));
+    let flags = OpenFlags::SQLITE_OPEN_READ_WRITE | OpenFlags::SQLITE_OPEN_CREATE | OpenFlags::SQLITE_OPEN_NO_MUTEX;
+    let unusable = |source: rusqlite::Error| match source.sqlite_error_code() {
+        Some(rusqlite::ErrorCode::NotADatabase) => Error::Foreign { path: name.to_owned() },
+        _ => Error::Unusable {
+            path: name.to_owned(),
+            source,
+        },
+    };
+    let mut db = Connection::open_with_flags(name, flags).map_err(unusable)?;
+    db.busy_timeout(BUSY).map_err(unusable)?;
+    check(&db, name, unusable)?;
+    prepare(&mut db).map_err(unusable)?;
+    Ok(db)
+}
+
+/// Opens a journal that exists for reading beside its writer.
+pub(super) fn open_readable(path: &Path) -> Result<Connection, rusqlite::Error> {
+    let db = Connection::open_with_flags(path, OpenFlags::SQLITE_OPEN_READ_ONLY | OpenFlags::SQLITE_OPEN_NO_MUTEX)?;
+    db.busy_timeout(BUSY)?;
+    Ok(db)
+}
+
+fn pragma(db: &Connection, name: &str) -> Result<i64, rusqlite::Error> {
+    db.pragma_query_value(None, name, |row| row.get(0))
+}
+
+fn check(db: &Connection, path: &Path, unusable: impl Fn(rusqlite::Error) -> Error) -> Result<(), Error> {
+    let tables: i64 = db
+        .query_row("SELECT count(*) FROM sqlite_schema", [], |row| row.get(0))
+        .map_err(&unusable)?;
+    let owner = pragma(db, "application_id").map_err(&unusable)?;
+    if tables > 0 && owner != APPLICATION_ID {
+        return Err(Error::Foreign { path: path.to_owned() });
+    }
+    let found = pragma(db, "user_version").map_err(&unusable)?;
+    let known = MIGRATIONS.len() as i64;
+    if found > known {
+        return Err(Error::NewerSchema {
+            path: path.to_owned(),
+            found,
+            known,
+        });
+    }
+    Ok(())
+}
+
+fn prepare(db: &mut Connection) -> Result<(), rusqlite::Error> {
+    // Only takes effect in a file that has no tables yet.
+    db.pragma_update(None, "auto_vacuum", "INCREMENTAL")?;
+    db.pragma_update_and_check(None, "journal_mode", "WAL", |_| Ok(()))?;
+    db.pragma_update(None, "synchronous", "FULL")?;
+    db.pragma_update(None, "foreign_keys", true)?;
+    db.pragma_update(None, "journal_size_limit", 4 << 20)?;
+    if pragma(db, "user_version")? == MIGRATIONS.len() as i64 {
+        return Ok(());
+    }
+    let tx = db.transaction_with_behavior(TransactionBehavior::Immediate)?;
+    // Read again under the lock: another process may have migrated in between.
+    let from = pragma(&tx, "user_version")?;
+    for step in MIGRATIONS.iter().skip(from as usize) {
+        tx.execute_batch(step)?;
+    }
+    tx.pragma_update(None, "application_id", APPLICATION_ID)?;
+    tx.pragma_update(None, "user_version", MIGRATIONS.len() as i64)?;
+    tx.commit()
+}
