@@ -1,17 +1,109 @@
-use super::Outcome;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use indicatif::{ProgressBar, ProgressStyle};
+use jiff::Timestamp;
+use rayon::prelude::*;
+
+use super::{Failure, Outcome};
+use crate::scene::{Element, Plan, Recording, Scene, SimulatedFrame};
 
 #[derive(Debug, clap::Args)]
 pub struct Args {
+    /// A scene file
     #[arg(long)]
-    scene: std::path::PathBuf,
+    scene: PathBuf,
+    /// How many frames
     #[arg(long)]
     frames: u64,
+    /// The same seed gives the same frames
     #[arg(long, default_value_t = 0)]
     seed: u64,
+    /// Folder for frames.npy, truth.ndjson and claims.ndjson; made when it is not there, files in it are replaced
     #[arg(long)]
-    out: std::path::PathBuf,
+    out: PathBuf,
+    /// Time of frame 0
+    #[arg(long, default_value = "2026-01-01T00:00:00Z")]
+    start: Timestamp,
+    /// Numbers in frames.npy: f4 is half the size, f8 the simulator's own bits
+    #[arg(long, value_enum, default_value_t = Dtype::F4)]
+    dtype: Dtype,
 }
 
-pub fn run(_args: Args) -> Outcome {
-    Err(super::Failure::other(anyhow::anyhow!("simulate is not built yet")))
+#[derive(Clone, Copy, Debug, clap::ValueEnum)]
+enum Dtype {
+    F4,
+    F8,
+}
+
+/// Pixels held in memory at a time, over all frames of a batch.
+const BATCH_PIXELS: usize = 1 << 20;
+
+pub fn run(args: Args) -> Outcome {
+    let scene = Scene::load(&args.scene).map_err(Failure::config)?;
+    let plan = Plan::compile(&scene, args.seed).map_err(Failure::config)?;
+    let plan = plan.starting_at(args.start);
+    let element = match args.dtype {
+        Dtype::F4 => Element::F4,
+        Dtype::F8 => Element::F8,
+    };
+    let interrupted = watch_for_interrupt().map_err(Failure::other)?;
+    let shape = plan.camera().shape();
+    let mut recording = Recording::create(&args.out, shape, element).map_err(Failure::other)?;
+
+    let style = "{bar:40} {pos}/{len} frames, {per_sec}, {eta} left";
+    let bar = ProgressBar::new(args.frames).with_style(ProgressStyle::with_template(style).expect("a valid template"));
+    let batch = (BATCH_PIXELS / (shape.0 * shape.1)).clamp(1, 256) as u64;
+    let mut next = 0;
+    while next < args.frames && !interrupted.load(Ordering::Relaxed) {
+        let end = args.frames.min(next + batch);
+        let frames: Vec<SimulatedFrame> = (next..end).into_par_iter().map(|k| plan.frame(k)).collect();
+        let written = frames
+            .iter()
+            .try_for_each(|f| recording.append(f))
+            .and_then(|()| recording.commit());
+        if let Err(e) = written {
+            bar.abandon();
+            let kept = recording.frames();
+            return Err(Failure::other(anyhow::Error::new(e).context(format!(
+                "{kept} of {} frames were written to {}, and the files are valid",
+                args.frames,
+                args.out.display()
+            ))));
+        }
+        bar.inc(end - next);
+        next = end;
+    }
+    bar.finish_and_clear();
+    if next < args.frames {
+        return Err(Failure::other(anyhow::anyhow!(
+            "interrupted: {next} of {} frames were written to {}, and the files are valid",
+            args.frames,
+            args.out.display()
+        )));
+    }
+    eprintln!("{next} frames in {}", args.out.display());
+    Ok(())
+}
+
+/// Becomes true on Ctrl-C or SIGTERM.
+fn watch_for_interrupt() -> std::io::Result<Arc<AtomicBool>> {
+    let flag = Arc::new(AtomicBool::new(false));
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+    let raised = Arc::clone(&flag);
+    let mut terminate = {
+        let _inside = runtime.enter();
+        tokio::signal::unix::signal(tokio::signal::unix::SignalKind::terminate())?
+    };
+    std::thread::spawn(move || {
+        runtime.block_on(async {
+            tokio::select! {
+                _ = tokio::signal::ctrl_c() => {}
+                _ = terminate.recv() => {}
+            }
+        });
+        raised.store(true, Ordering::Relaxed);
+    });
+    Ok(flag)
 }

@@ -1,0 +1,257 @@
+use std::collections::HashSet;
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
+
+use super::effects::Effects;
+use super::error::{Error, Field};
+use super::motion::{Motion, Schedule};
+use crate::{config, optics};
+
+/// A scene file. Only `optics` and `link` have defaults that do something (the paper's); everything else is there
+/// because the file names it.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Scene {
+    /// What the scene is for, in a sentence.
+    pub about: String,
+    pub rate_hz: f64,
+    pub optics: optics::Config,
+    pub link: LinkConfig,
+    pub random_emitters: Option<RandomEmittersConfig>,
+    pub user: Vec<UserConfig>,
+    pub intruder: Vec<IntruderConfig>,
+    pub claims: ClaimsConfig,
+    pub effects: Effects,
+}
+
+/// What every beam has in common; the paper's values when left out.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct LinkConfig {
+    /// P.
+    pub power_w: f64,
+    /// w_z, the beam's 1/e² radius at the lens.
+    pub beam_radius_m: f64,
+    /// τ.
+    pub transmittance: f64,
+    /// η_s.
+    pub efficiency: f64,
+    /// T_int.
+    pub integration_time_s: f64,
+    /// T_coh, over which fading and pointing offset stay what they are.
+    pub coherence_time_s: f64,
+}
+
+/// Emitters drawn anew for every frame: how many, and where, both uniform.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RandomEmittersConfig {
+    /// Smallest and largest number.
+    pub count: [u32; 2],
+    /// Width and height of the area they fall on, centred below the lens.
+    pub area_m: [f64; 2],
+}
+
+/// A legitimate user: transmits and claims where it is.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct UserConfig {
+    pub name: String,
+    pub motion: Motion,
+    /// Where the network's log says it is, when that is not the truth.
+    pub claimed: Option<Motion>,
+    #[serde(default)]
+    pub present: Schedule,
+    /// `false`: claims but does not transmit.
+    #[serde(default = "yes")]
+    pub beam: bool,
+    pub power_w: Option<f64>,
+}
+
+/// A beam that nobody claims.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct IntruderConfig {
+    pub name: String,
+    pub motion: Motion,
+    #[serde(default)]
+    pub present: Schedule,
+    pub power_w: Option<f64>,
+}
+
+/// How the network logs its users.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct ClaimsConfig {
+    /// Time between two claims of a user; the first comes with the session.
+    pub period_s: f64,
+    /// The standard deviation per axis that a claim states.
+    pub sigma_m: Option<f64>,
+}
+
+fn yes() -> bool {
+    true
+}
+
+impl Default for Scene {
+    fn default() -> Self {
+        Self {
+            about: String::new(),
+            rate_hz: 1.0,
+            optics: optics::Config::default(),
+            link: LinkConfig::default(),
+            random_emitters: None,
+            user: Vec::new(),
+            intruder: Vec::new(),
+            claims: ClaimsConfig::default(),
+            effects: Effects::default(),
+        }
+    }
+}
+
+impl Default for LinkConfig {
+    fn default() -> Self {
+        Self {
+            power_w: 1.0,
+            beam_radius_m: 0.6,
+            transmittance: 0.9,
+            efficiency: 0.9,
+            integration_time_s: 1.0,
+            coherence_time_s: 0.01,
+        }
+    }
+}
+
+impl Default for ClaimsConfig {
+    fn default() -> Self {
+        Self {
+            period_s: 1.0,
+            sigma_m: Some(0.3),
+        }
+    }
+}
+
+impl Scene {
+    /// Reads and checks a scene file.
+    ///
+    /// # Errors
+    /// The file cannot be read, is not TOML, has an unknown key (the nearest known one is named), or a field is out of
+    /// range (the field is named).
+    pub fn load(path: &Path) -> Result<Self, Error> {
+        let scene: Self = config::read_toml(path)?;
+        match scene.validate() {
+            Ok(()) => Ok(scene),
+            Err(e) => Err(Error::Scene {
+                path: path.to_owned(),
+                reason: Box::new(e),
+            }),
+        }
+    }
+
+    /// The scene that the program runs on when nothing is configured.
+    pub fn builtin() -> Self {
+        toml::from_str(include_str!("../../config/scenes/builtin.toml")).expect("a test reads the embedded scene")
+    }
+
+    /// Checks every field that the optics do not check themselves.
+    pub fn validate(&self) -> Result<(), Error> {
+        let root = Field::new("");
+        root.at("rate_hz").positive(self.rate_hz)?;
+        self.optics.camera()?;
+        self.link.validate(&root.at("link"), self.rate_hz)?;
+        if let Some(random) = &self.random_emitters {
+            random.validate(&root.at("random_emitters"))?;
+        }
+        root.at("claims").at("period_s").positive(self.claims.period_s)?;
+        if let Some(sigma) = self.claims.sigma_m {
+            root.at("claims").at("sigma_m").positive(sigma)?;
+        }
+        self.validate_names(&root)?;
+        for (k, user) in self.user.iter().enumerate() {
+            user.validate(&root.item("user", k))?;
+        }
+        for (k, intruder) in self.intruder.iter().enumerate() {
+            self.validate_intruder(intruder, &root.item("intruder", k))?;
+        }
+        self.effects.validate(&root.at("effects"))
+    }
+
+    fn validate_names(&self, root: &Field) -> Result<(), Error> {
+        let mut seen = HashSet::new();
+        let users = self.user.iter().enumerate().map(|(k, u)| ("user", k, &u.name));
+        let intruders = self.intruder.iter().enumerate().map(|(k, i)| ("intruder", k, &i.name));
+        for (table, k, name) in users.chain(intruders) {
+            if name.is_empty() || !seen.insert(name) {
+                return Err(root
+                    .item(table, k)
+                    .at("name")
+                    .refuse("a name that no other emitter has", name));
+            }
+        }
+        Ok(())
+    }
+
+    fn validate_intruder(&self, intruder: &IntruderConfig, field: &Field) -> Result<(), Error> {
+        let motion = field.at("motion");
+        intruder.motion.validate(&motion)?;
+        if let Motion::Beside(beside) | Motion::AtClaimOf(beside) = &intruder.motion
+            && !self.user.iter().any(|u| u.name == beside.user)
+        {
+            return Err(motion.at("user").refuse("the name of a [[user]]", &beside.user));
+        }
+        intruder.present.validate(&field.at("present"))?;
+        validate_power(intruder.power_w, field)
+    }
+}
+
+impl UserConfig {
+    fn validate(&self, field: &Field) -> Result<(), Error> {
+        for (name, motion) in [("motion", Some(&self.motion)), ("claimed", self.claimed.as_ref())] {
+            let Some(motion) = motion else { continue };
+            let field = field.at(name);
+            if let Motion::Beside(_) | Motion::AtClaimOf(_) = motion {
+                return Err(field.refuse("a motion of its own (only an intruder follows somebody)", motion));
+            }
+            motion.validate(&field)?;
+        }
+        self.present.validate(&field.at("present"))?;
+        validate_power(self.power_w, field)
+    }
+}
+
+fn validate_power(power_w: Option<f64>, field: &Field) -> Result<(), Error> {
+    power_w.map_or(Ok(()), |p| field.at("power_w").positive(p).map(drop))
+}
+
+impl LinkConfig {
+    fn validate(&self, field: &Field, rate_hz: f64) -> Result<(), Error> {
+        field.at("power_w").positive(self.power_w)?;
+        field.at("beam_radius_m").positive(self.beam_radius_m)?;
+        field.at("transmittance").fraction(self.transmittance)?;
+        field.at("efficiency").fraction(self.efficiency)?;
+        field.at("coherence_time_s").positive(self.coherence_time_s)?;
+        let exposure = field.at("integration_time_s").positive(self.integration_time_s)?;
+        if exposure * rate_hz > 1.0 + 1e-9 {
+            return Err(field
+                .at("integration_time_s")
+                .refuse("at most 1/rate_hz, the time from frame to frame", exposure));
+        }
+        Ok(())
+    }
+}
+
+impl RandomEmittersConfig {
+    fn validate(&self, field: &Field) -> Result<(), Error> {
+        if self.count[0] > self.count[1] {
+            return Err(field.at("count").refuse("[smallest, largest]", self.count));
+        }
+        if self.count[1] > 10_000 {
+            return Err(field.at("count").refuse("at most 10000 emitters", self.count));
+        }
+        for side in self.area_m {
+            field.at("area_m").positive(side)?;
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,27 @@
+use rand::Rng;
+use rand_distr::{Distribution, StandardNormal};
+use serde::{Deserialize, Serialize};
+
+use crate::scene::error::{Error, Field};
+
+/// Additive white Gaussian noise of the read-out, σ_n joules per pixel (`meas_total`).
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ThermalNoise {
+    /// `optics.noise_std_j` when left out.
+    pub std_j: Option<f64>,
+}
+
+impl ThermalNoise {
+    pub(in crate::scene) fn validate(&self, field: &Field) -> Result<(), Error> {
+        self.std_j.map_or(Ok(()), |s| field.at("std_j").positive(s).map(drop))
+    }
+
+    /// Adds noise of `std_j` to every pixel.
+    pub(in crate::scene) fn add<R: Rng + ?Sized>(std_j: f64, pixels: &mut [f64], rng: &mut R) {
+        for pixel in pixels {
+            let z: f64 = StandardNormal.sample(rng);
+            *pixel += std_j * z;
+        }
+    }
+}
