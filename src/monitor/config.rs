@@ -6,7 +6,29 @@ use serde::{Deserialize, Serialize};
 pub struct Config {
     /// A user this far from the claim is still where they say.
     pub tolerated_distance_m: f64,
+    /// False alerts a month of continuous watching may bring, all kinds together.
     pub false_alerts_per_month: f64,
+    /// Seconds from the first sight of a beam nobody claims to its alert; claims may come this much later than beams.
+    pub decision_s: f64,
+    /// Seconds without a usable frame before the sensor counts as lost.
+    pub sensor_lost_s: f64,
+    /// Seconds without a new claim before the log counts as quiet; never below five claim periods.
+    pub claims_stale_s: f64,
+    /// Seconds a beam may stay on after its user's claim says "ended".
+    pub ended_grace_s: f64,
+    /// A common shift of all users up to this is corrected; a larger one is an alert.
+    pub pose_limit_m: f64,
+    /// Longest time that a cause which comes and goes is held open before it counts as cleared.
+    pub cool_down_s: f64,
+}
+
+/// Why a `[monitor]` table cannot be used.
+#[derive(Debug, thiserror::Error)]
+#[error("monitor.{field}: expected {expected}, found {found}")]
+pub struct ConfigError {
+    pub field: &'static str,
+    pub expected: &'static str,
+    pub found: f64,
 }
 
 impl Default for Config {
@@ -14,6 +36,39 @@ impl Default for Config {
         Self {
             tolerated_distance_m: 5.0,
             false_alerts_per_month: 1.0,
+            decision_s: 1.0,
+            sensor_lost_s: 1.0,
+            claims_stale_s: 5.0,
+            ended_grace_s: 3.0,
+            pose_limit_m: 2.0,
+            cool_down_s: 60.0,
         }
+    }
+}
+
+impl Config {
+    /// Checks every number.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        const POSITIVE: &str = "a positive finite number";
+        let positive = [
+            ("tolerated_distance_m", self.tolerated_distance_m),
+            ("false_alerts_per_month", self.false_alerts_per_month),
+            ("decision_s", self.decision_s),
+            ("sensor_lost_s", self.sensor_lost_s),
+            ("claims_stale_s", self.claims_stale_s),
+            ("ended_grace_s", self.ended_grace_s),
+            ("pose_limit_m", self.pose_limit_m),
+            ("cool_down_s", self.cool_down_s),
+        ];
+        for (field, found) in positive {
+            if !(found.is_finite() && found > 0.0) {
+                return Err(ConfigError {
+                    field,
+                    expected: POSITIVE,
+                    found,
+                });
+            }
+        }
+        Ok(())
     }
 }

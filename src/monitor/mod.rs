@@ -2,9 +2,20 @@
 //! no clock in here, so a replay gives the same alerts every time.
 
 mod alert;
+mod book;
 mod config;
+mod motion;
 mod report;
+mod residuals;
+mod sight;
+mod source;
+mod thresholds;
+mod tracks;
+mod users;
+mod watch;
 
 pub use alert::{Alert, AlertEvent, AlertEventKind, AlertKind, AlertSource, AlertState, Severity};
-pub use config::Config;
+pub use config::{Config, ConfigError};
 pub use report::{Observation, PositionStatus, Report, TrackedPosition, UserPosition};
+pub use source::Source;
+pub use watch::Monitor;

@@ -1,0 +1,219 @@
+use jiff::{SignedDuration, Timestamp};
+use serde_json::Value;
+
+use super::{Claim, ClaimState, Config, config::Origin};
+
+/// Longest user name accepted, in bytes.
+const LONGEST_USER: usize = 256;
+/// A local coordinate beyond this is a mistake of units or axes.
+const FARTHEST_M: f64 = 1e7;
+
+/// Why a line is no claim.
+#[derive(Debug, thiserror::Error)]
+pub enum LineError {
+    #[error("not a JSON object: {0}")]
+    NotJson(#[from] serde_json::Error),
+    #[error("field `{field}` is missing: expected {expected}")]
+    Missing { field: String, expected: &'static str },
+    #[error("field `{field}`: expected {expected}, found {found}")]
+    Wrong {
+        field: String,
+        expected: &'static str,
+        found: String,
+    },
+    #[error("the line is longer than {limit} bytes")]
+    TooLong { limit: usize },
+}
+
+/// Reads one line of the network's log: a JSON object with the fields that `config` names, by default
+/// `{"time", "user", "x_m", "y_m", "sigma_m"?, "state"?}`. Other fields are ignored.
+pub fn parse_line(line: &[u8], config: &Config) -> Result<Claim, LineError> {
+    let object: Value = serde_json::from_slice(line)?;
+    if !object.is_object() {
+        return Err(wrong("the line", "a JSON object", &object));
+    }
+    let names = &config.fields;
+    let time = time(&names.time, required(&object, &names.time, TIME)?, config.clock_offset_s)?;
+    let user = user(&names.user, required(&object, &names.user, USER)?)?;
+    let [x_m, y_m] = match &config.origin {
+        None => [
+            number(&object, &names.x_m, METRES, |x| x.abs() <= FARTHEST_M)?,
+            number(&object, &names.y_m, METRES, |y| y.abs() <= FARTHEST_M)?,
+        ],
+        Some(origin) => local_metres(
+            origin,
+            number(&object, &names.latitude_deg, LATITUDE, |l| l.abs() <= 90.0)?,
+            number(&object, &names.longitude_deg, LONGITUDE, |l| l.abs() <= 180.0)?,
+        ),
+    };
+    let sigma_m = match optional(&object, &names.sigma_m) {
+        None => None,
+        Some(_) => Some(number(&object, &names.sigma_m, SIGMA, |s| s >= 0.0)?),
+    };
+    let state = match optional(&object, &names.state) {
+        None => ClaimState::Active,
+        Some(value) => match value.as_str() {
+            Some("active") => ClaimState::Active,
+            Some("ended") => ClaimState::Ended,
+            _ => return Err(wrong(&names.state, "\"active\" or \"ended\"", value)),
+        },
+    };
+    Ok(Claim {
+        time,
+        user,
+        x_m,
+        y_m,
+        sigma_m,
+        state,
+    })
+}
+
+const TIME: &str = "an RFC 3339 time or seconds since 1970";
+const USER: &str = "a name of 1 to 256 bytes";
+const METRES: &str = "metres within 10000 km of the nadir";
+const LATITUDE: &str = "degrees between -90 and 90";
+const LONGITUDE: &str = "degrees between -180 and 180";
+const SIGMA: &str = "metres, zero or more";
+
+fn optional<'a>(object: &'a Value, name: &str) -> Option<&'a Value> {
+    let value = if name.starts_with('/') {
+        object.pointer(name)
+    } else {
+        object.get(name)
+    };
+    value.filter(|v| !v.is_null())
+}
+
+fn required<'a>(object: &'a Value, name: &str, expected: &'static str) -> Result<&'a Value, LineError> {
+    optional(object, name).ok_or_else(|| LineError::Missing {
+        field: name.to_owned(),
+        expected,
+    })
+}
+
+fn wrong(field: &str, expected: &'static str, found: &Value) -> LineError {
+    let mut found = found.to_string();
+    if found.len() > 80 {
+        let cut = (0..=77).rev().find(|&i| found.is_char_boundary(i)).unwrap_or(0);
+        found.truncate(cut);
+        found.push('…');
+    }
+    LineError::Wrong {
+        field: field.to_owned(),
+        expected,
+        found,
+    }
+}
+
+fn number(object: &Value, name: &str, expected: &'static str, fits: impl Fn(f64) -> bool) -> Result<f64, LineError> {
+    let value = required(object, name, expected)?;
+    match value.as_f64() {
+        Some(x) if x.is_finite() && fits(x) => Ok(x),
+        _ => Err(wrong(name, expected, value)),
+    }
+}
+
+fn user(name: &str, value: &Value) -> Result<String, LineError> {
+    let user = match value {
+        Value::String(s) => s.clone(),
+        Value::Number(n) => n.to_string(),
+        _ => return Err(wrong(name, USER, value)),
+    };
+    if user.is_empty() || user.len() > LONGEST_USER || user.chars().any(char::is_control) {
+        return Err(wrong(name, USER, value));
+    }
+    Ok(user)
+}
+
+fn time(name: &str, value: &Value, offset_s: f64) -> Result<Timestamp, LineError> {
+    let stamp = match value {
+        Value::String(s) => s.parse::<Timestamp>().ok(),
+        Value::Number(n) => n
+            .as_f64()
+            .filter(|s| s.abs() < 1e11)
+            .and_then(|s| Timestamp::from_nanosecond((s * 1e9).round() as i128).ok()),
+        _ => None,
+    };
+    let offset = SignedDuration::from_secs_f64(offset_s);
+    stamp
+        .and_then(|t| t.checked_add(offset).ok())
+        .ok_or_else(|| wrong(name, TIME, value))
+}
+
+/// East and north metres of a geodetic position near `origin` on WGS 84, from the meridian and prime-vertical
+/// radii of curvature (Torge and Müller, 2012, eqs. 4.13 and 4.14), turned into the camera's axes. Good to millimetres
+/// within a kilometre.
+fn local_metres(origin: &Origin, latitude_deg: f64, longitude_deg: f64) -> [f64; 2] {
+    const A: f64 = 6_378_137.0;
+    const E2: f64 = 6.694_379_990_141_3e-3;
+    let middle = (0.5 * (latitude_deg + origin.latitude_deg)).to_radians();
+    let w2 = 1.0 - E2 * middle.sin().powi(2);
+    let meridian = A * (1.0 - E2) / (w2 * w2.sqrt()) + origin.altitude_m;
+    let prime_vertical = A / w2.sqrt() + origin.altitude_m;
+    let turn = (longitude_deg - origin.longitude_deg + 540.0).rem_euclid(360.0) - 180.0;
+    let north = meridian * (latitude_deg - origin.latitude_deg).to_radians();
+    let east = prime_vertical * middle.cos() * turn.to_radians();
+    let (sin, cos) = origin.heading_deg.to_radians().sin_cos();
+    [east * cos - north * sin, east * sin + north * cos]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn parse(line: &str) -> Result<Claim, LineError> {
+        parse_line(line.as_bytes(), &Config::default())
+    }
+
+    #[test]
+    fn reads_the_contracts_line_and_its_short_form() {
+        let c = parse(r#"{"time":"2026-11-21T08:00:00.000Z","user":"u-17","x_m":12.5,"y_m":-80.0,"sigma_m":1.0,"state":"ended"}"#).unwrap();
+        assert_eq!((c.user.as_str(), c.x_m, c.y_m, c.sigma_m), ("u-17", 12.5, -80.0, Some(1.0)));
+        assert_eq!(c.state, ClaimState::Ended);
+        let c = parse(r#"{"time":"2026-11-21T08:00:00Z","user":"u","x_m":1,"y_m":2,"more":[]}"#).unwrap();
+        assert_eq!((c.sigma_m, c.state), (None, ClaimState::Active));
+    }
+
+    #[test]
+    fn names_the_field_that_is_wrong() {
+        for (line, field) in [
+            (r#"{"user":"u","x_m":1,"y_m":2}"#, "time"),
+            (r#"{"time":"yesterday","user":"u","x_m":1,"y_m":2}"#, "time"),
+            (r#"{"time":"2026-11-21T08:00:00Z","user":"","x_m":1,"y_m":2}"#, "user"),
+            (r#"{"time":"2026-11-21T08:00:00Z","user":"u","x_m":"1","y_m":2}"#, "x_m"),
+            (r#"{"time":"2026-11-21T08:00:00Z","user":"u","x_m":1,"y_m":1e300}"#, "y_m"),
+            (r#"{"time":"2026-11-21T08:00:00Z","user":"u","x_m":1,"y_m":2,"sigma_m":-1}"#, "sigma_m"),
+            (r#"{"time":"2026-11-21T08:00:00Z","user":"u","x_m":1,"y_m":2,"state":"gone"}"#, "state"),
+        ] {
+            let message = parse(line).unwrap_err().to_string();
+            assert!(message.contains(&format!("`{field}`")), "{line}: {message}");
+        }
+        assert!(matches!(parse("{\"time\""), Err(LineError::NotJson(_))));
+        assert!(matches!(parse("[1]"), Err(LineError::Wrong { .. })));
+    }
+
+    #[test]
+    fn fields_can_be_mapped_and_positions_geodetic() {
+        let mut config = Config::default();
+        config.fields.time = "ts".into();
+        config.fields.latitude_deg = "/pos/lat".into();
+        config.fields.longitude_deg = "/pos/lon".into();
+        config.origin = Some(Origin {
+            latitude_deg: 48.0,
+            longitude_deg: 11.0,
+            altitude_m: 0.0,
+            heading_deg: 0.0,
+        });
+        config.clock_offset_s = 1.5;
+        let line = br#"{"ts":1795248000,"user":7,"pos":{"lat":48.001,"lon":11.001}}"#;
+        let c = parse_line(line, &config).unwrap();
+        // One degree of latitude at 48° is 111.20 km, one of longitude 74.63 km (tables of WGS 84).
+        assert!((c.y_m - 111.2).abs() < 0.01, "{}", c.y_m);
+        assert!((c.x_m - 74.63).abs() < 0.01, "{}", c.x_m);
+        assert_eq!(c.user, "7");
+        assert_eq!(c.time.as_millisecond(), 1_795_248_001_500);
+        config.origin.as_mut().unwrap().heading_deg = 90.0;
+        let c = parse_line(line, &config).unwrap();
+        assert!((c.y_m - 74.63).abs() < 0.01 && (c.x_m + 111.2).abs() < 0.01, "{c:?}");
+    }
+}

@@ -1,0 +1,251 @@
+use std::collections::BTreeMap;
+
+use jiff::Timestamp;
+use serde_json::Value;
+
+use super::{Alert, AlertEvent, AlertEventKind, AlertKind, AlertSource, AlertState, Severity};
+use crate::claims::seconds;
+
+/// What an alert is about: while one is open for a cause, the cause raises no other.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) enum Cause {
+    User(AlertKind, String),
+    Track(AlertKind, u64),
+    Whole(AlertKind),
+}
+
+/// What is known of a cause in this frame.
+#[derive(Clone, Debug)]
+pub(super) struct Finding {
+    pub severity: Severity,
+    pub x_m: Option<f64>,
+    pub y_m: Option<f64>,
+    pub cov_m2: Option<[[f64; 2]; 2]>,
+    pub claimed: Option<Value>,
+    pub evidence: Value,
+}
+
+#[derive(Clone, Debug)]
+struct Open {
+    alert: Alert,
+    /// Since when the cause has been absent.
+    quiet_since: Option<Timestamp>,
+    /// How often the cause came back after it had been absent.
+    recurrences: u32,
+}
+
+/// The alerts of a run: raised once per cause, updated, acknowledged, cleared.
+#[derive(Debug)]
+pub(super) struct Book {
+    open: BTreeMap<Cause, Open>,
+    /// When causes cleared lately, and how often they had come back.
+    cleared: BTreeMap<Cause, (Timestamp, u32)>,
+    events: Vec<AlertEvent>,
+    source_kind: String,
+    source_file: Option<String>,
+    cool_down_s: f64,
+}
+
+/// A cause absent for this long is over, at its first occurrence.
+const CLEAR_S: f64 = 1.0;
+
+impl Cause {
+    pub fn kind(&self) -> AlertKind {
+        match self {
+            Self::User(kind, _) | Self::Track(kind, _) | Self::Whole(kind) => *kind,
+        }
+    }
+
+    fn user(&self) -> Option<&str> {
+        match self {
+            Self::User(_, user) => Some(user),
+            _ => None,
+        }
+    }
+}
+
+impl Finding {
+    pub fn new(severity: Severity, evidence: Value) -> Self {
+        Self {
+            severity,
+            x_m: None,
+            y_m: None,
+            cov_m2: None,
+            claimed: None,
+            evidence,
+        }
+    }
+}
+
+impl Book {
+    pub fn new(source_kind: String, source_file: Option<String>, cool_down_s: f64) -> Self {
+        Self {
+            open: BTreeMap::new(),
+            cleared: BTreeMap::new(),
+            events: Vec::new(),
+            source_kind,
+            source_file,
+            cool_down_s,
+        }
+    }
+
+    pub fn is_open(&self, cause: &Cause) -> bool {
+        self.open.contains_key(cause)
+    }
+
+    pub fn open(&self) -> impl Iterator<Item = (&Cause, &Alert)> {
+        self.open.iter().map(|(cause, open)| (cause, &open.alert))
+    }
+
+    /// The cause is there: raises its alert, or brings the open one up to date (an event only when its severity changed).
+    pub fn report(&mut self, cause: &Cause, finding: Finding, now: Timestamp, frame: u64) {
+        if let Some(open) = self.open.get_mut(cause) {
+            if open.quiet_since.take().is_some() {
+                open.recurrences += 1;
+            }
+            let alert = &mut open.alert;
+            // An alert does not grow milder while its cause lasts.
+            let severity = alert.severity.max(finding.severity);
+            let escalated = severity != alert.severity;
+            finding.write_to(alert);
+            alert.severity = severity;
+            note_recurrences(alert, open.recurrences);
+            if escalated {
+                alert.source.frame = frame;
+                self.events.push(AlertEvent {
+                    event: AlertEventKind::Updated,
+                    alert: alert.clone(),
+                });
+            }
+            return;
+        }
+        let cool_down = self.cool_down_s;
+        self.cleared.retain(|_, (at, _)| seconds(*at, now) <= cool_down);
+        let recurrences = self.cleared.remove(cause).map_or(0, |(_, n)| n + 1);
+        let mut alert = Alert {
+            id: self.new_id(cause.kind(), now),
+            kind: cause.kind(),
+            severity: finding.severity,
+            state: AlertState::Open,
+            raised_at: now,
+            cleared_at: None,
+            user: cause.user().map(str::to_owned),
+            x_m: None,
+            y_m: None,
+            cov_m2: None,
+            claimed: None,
+            evidence: Value::Null,
+            source: AlertSource {
+                kind: self.source_kind.clone(),
+                frame,
+                file: self.source_file.clone(),
+            },
+        };
+        finding.write_to(&mut alert);
+        note_recurrences(&mut alert, recurrences);
+        self.events.push(AlertEvent {
+            event: AlertEventKind::Raised,
+            alert: alert.clone(),
+        });
+        self.open.insert(
+            cause.clone(),
+            Open {
+                alert,
+                quiet_since: None,
+                recurrences,
+            },
+        );
+    }
+
+    /// The cause is absent. Its alert clears after a second of that; twice as long each time it comes back within the
+    /// cool-down, so that a flapping cause stays one open alert.
+    pub fn absent(&mut self, cause: &Cause, now: Timestamp) {
+        let Some(open) = self.open.get_mut(cause) else {
+            return;
+        };
+        let since = *open.quiet_since.get_or_insert(now);
+        let hold = (CLEAR_S * 2f64.powi(open.recurrences.min(20) as i32)).min(self.cool_down_s);
+        if seconds(since, now) >= hold {
+            self.clear(cause, now);
+        }
+    }
+
+    /// The cause is known to be over.
+    pub fn clear(&mut self, cause: &Cause, now: Timestamp) {
+        if let Some(mut open) = self.open.remove(cause) {
+            open.alert.state = AlertState::Cleared;
+            open.alert.cleared_at = Some(now);
+            self.cleared.insert(cause.clone(), (now, open.recurrences));
+            self.events.push(AlertEvent {
+                event: AlertEventKind::Cleared,
+                alert: open.alert,
+            });
+        }
+    }
+
+    /// The same cause under another name (a track that was lost and found again).
+    pub fn rename(&mut self, from: &Cause, to: Cause) {
+        if let Some(open) = self.open.remove(from) {
+            self.open.insert(to, open);
+        }
+    }
+
+    pub fn acknowledge(&mut self, id: &str) -> Option<AlertEvent> {
+        let open = self.open.values_mut().find(|o| o.alert.id == id)?;
+        if open.alert.state != AlertState::Open {
+            return None;
+        }
+        open.alert.state = AlertState::Acknowledged;
+        Some(AlertEvent {
+            event: AlertEventKind::Acknowledged,
+            alert: open.alert.clone(),
+        })
+    }
+
+    /// Takes over an alert that was open when the last run ended.
+    pub fn restore(&mut self, cause: Cause, alert: Alert) {
+        self.open.entry(cause).or_insert(Open {
+            alert,
+            quiet_since: None,
+            recurrences: 0,
+        });
+    }
+
+    pub fn take_events(&mut self) -> Vec<AlertEvent> {
+        std::mem::take(&mut self.events)
+    }
+
+    /// Kind, time and a count within the same instant: the same input gives the same ids.
+    fn new_id(&self, kind: AlertKind, now: Timestamp) -> String {
+        let kind = serde_json::to_value(kind).ok();
+        let kind = kind.as_ref().and_then(Value::as_str).unwrap_or("alert");
+        let stem = format!("{kind}-{}", now.strftime("%Y%m%dT%H%M%S%6fZ"));
+        let taken = |id: &String| {
+            let earlier = self.events.iter().map(|e| &e.alert.id);
+            self.open.values().map(|o| &o.alert.id).chain(earlier).any(|other| other == id)
+        };
+        (0..)
+            .map(|n| format!("{stem}-{n}"))
+            .find(|id| !taken(id))
+            .expect("fewer alerts than numbers")
+    }
+}
+
+impl Finding {
+    fn write_to(self, alert: &mut Alert) {
+        alert.severity = self.severity;
+        alert.x_m = self.x_m;
+        alert.y_m = self.y_m;
+        alert.cov_m2 = self.cov_m2;
+        alert.claimed = self.claimed;
+        alert.evidence = self.evidence;
+    }
+}
+
+fn note_recurrences(alert: &mut Alert, recurrences: u32) {
+    if recurrences > 0
+        && let Value::Object(evidence) = &mut alert.evidence
+    {
+        evidence.insert("recurrences".into(), recurrences.into());
+    }
+}

@@ -1,0 +1,90 @@
+use std::collections::VecDeque;
+
+use jiff::Timestamp;
+use serde_json::{Value, json};
+
+use super::Observation;
+use crate::claims::seconds;
+use crate::estimate::Estimate;
+
+/// A frame whose pixels are this much saturated shows nothing of the rest.
+const BLINDING_SHARE: f64 = 0.5;
+/// Exact repeats are looked for among this many frames.
+const REMEMBERED: usize = 8;
+
+/// Whether the sensor sees. A frame without information is no evidence of anything, least of all of absence.
+#[derive(Debug, Default)]
+pub(super) struct Sight {
+    digests: VecDeque<u64>,
+    last_usable: Option<Timestamp>,
+    started: Option<Timestamp>,
+    blind: Option<Blind>,
+    blind_frames: u64,
+}
+
+/// Why a frame carries no information.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) enum Blind {
+    NoFrame,
+    Unusable(String),
+    Saturated(f64),
+    Repeated,
+    /// Every user's beam went out in the same frame.
+    AllDark(usize),
+}
+
+impl Sight {
+    /// The estimate if the frame can be believed. `lit` is how many active users were seen a moment ago.
+    pub fn judge<'a>(&mut self, seen: &Observation<'a>, lit: usize) -> Option<&'a Estimate> {
+        self.started.get_or_insert(seen.time);
+        let blind = match seen.result {
+            Err(error) => Some(Blind::Unusable(error.to_string())),
+            Ok(_) if self.digests.contains(&seen.digest) => Some(Blind::Repeated),
+            Ok(e) if e.saturated_share >= BLINDING_SHARE => Some(Blind::Saturated(e.saturated_share)),
+            Ok(e) if e.emitters.is_empty() && lit >= 2 => Some(Blind::AllDark(lit)),
+            Ok(_) => None,
+        };
+        if self.digests.len() == REMEMBERED {
+            self.digests.pop_front();
+        }
+        self.digests.push_back(seen.digest);
+        if blind.is_some() {
+            self.blind = blind;
+            self.blind_frames += 1;
+            return None;
+        }
+        self.blind = None;
+        self.blind_frames = 0;
+        self.last_usable = Some(seen.time);
+        seen.result.ok()
+    }
+
+    /// Nothing came.
+    pub fn nothing(&mut self, now: Timestamp) {
+        self.started.get_or_insert(now);
+        self.blind.get_or_insert(Blind::NoFrame);
+    }
+
+    /// Seconds since a frame could be believed.
+    pub fn blind_s(&self, now: Timestamp) -> f64 {
+        let since = self.last_usable.or(self.started).unwrap_or(now);
+        if self.blind.is_some() { seconds(since, now) } else { 0.0 }
+    }
+
+    pub fn evidence(&self, now: Timestamp) -> Value {
+        let (reason, detail) = match &self.blind {
+            None | Some(Blind::NoFrame) => ("no_frame", Value::Null),
+            Some(Blind::Unusable(error)) => ("unusable", json!(error)),
+            Some(Blind::Saturated(share)) => ("saturated", json!({ "share": share })),
+            Some(Blind::Repeated) => ("frozen", Value::Null),
+            Some(Blind::AllDark(users)) => ("all_beams_lost", json!({ "users": users })),
+        };
+        json!({
+            "reason": reason,
+            "detail": detail,
+            "last_usable": self.last_usable,
+            "unusable_frames": self.blind_frames,
+            "blind_s": self.blind_s(now),
+        })
+    }
+}

@@ -1,0 +1,309 @@
+use std::collections::VecDeque;
+
+use jiff::Timestamp;
+use nalgebra::{Matrix2, Vector2};
+
+use super::motion::{Motion, mahalanobis2};
+use crate::assign::assign;
+use crate::claims::seconds;
+use crate::estimate::{Estimate, Flags};
+use crate::optics::Camera;
+
+/// Squared Mahalanobis gate of the association: χ² of two degrees exceeds it 4 times in 10⁶.
+const GATE: f64 = 25.0;
+/// Added to the gate per axis, m: a beam may turn between two frames faster than the motion model likes.
+const GATE_FLOOR_M: f64 = 0.4;
+/// What a fit's covariance leaves out (calibration, pixel gains), m.
+const POSITION_FLOOR_M: f64 = 0.02;
+/// A track is confirmed by M hits of its last N frames.
+const CONFIRM: (u32, u32) = (3, 5);
+/// A confirmed track is kept this long without a hit, in time the sensor could see.
+const KEEP_S: f64 = 1.5;
+/// With the sensor blind for longer, positions have nothing to do with what was.
+const FORGET_AFTER_S: f64 = 30.0;
+/// How far back a track knows where it was, for claims that come late.
+const TRAIL_S: f64 = 6.0;
+const TRAIL_STEP_S: f64 = 0.05;
+
+/// One frame's emitter as the tracks take it.
+#[derive(Clone, Debug)]
+pub(super) struct Detection {
+    pub position: Vector2<f64>,
+    pub cov: Matrix2<f64>,
+    pub energy_j: f64,
+    pub energy_std_j: f64,
+    pub flags: Flags,
+    /// Distance within which a second emitter of like energy cannot be told apart, m.
+    pub resolution_m: f64,
+    /// How probable a spurious detection is here in a frame.
+    pub ghost: f64,
+}
+
+/// A beam over time. Its identity comes from its positions alone.
+#[derive(Clone, Debug)]
+pub(super) struct Track {
+    pub id: u64,
+    pub motion: Motion,
+    pub since: Timestamp,
+    pub last_hit: Timestamp,
+    pub detection: Detection,
+    pub confirmed: bool,
+    /// Detected in the newest frame.
+    pub hit: bool,
+    /// Too near another beam to be told apart in the newest frame.
+    pub merged: bool,
+    /// ln likelihood ratio of "an emitter" to "spurious detections".
+    pub score: f64,
+    /// Newest hits, one bit a frame.
+    hits: u32,
+    frames: u32,
+    missed_s: f64,
+    trail: VecDeque<(Timestamp, Vector2<f64>)>,
+}
+
+#[derive(Debug)]
+pub(super) struct Tracks {
+    pub all: Vec<Track>,
+    next_id: u64,
+    time: Option<Timestamp>,
+    score_ceiling: f64,
+}
+
+/// Chance that an emitter in view is detected in a frame; low, so that misses cost an eavesdropper's score little.
+const DETECTED: f64 = 0.9;
+
+impl Detection {
+    /// The emitters of an estimate on the ground, with what is known of how far each can be trusted.
+    pub fn of(estimate: &Estimate, camera: &Camera) -> Vec<Self> {
+        // A frame that the model explains badly has errors beyond its covariances.
+        let inflation = if estimate.reduced_chi2.is_finite() {
+            estimate.reduced_chi2.clamp(1.0, 100.0)
+        } else {
+            100.0
+        };
+        let usable = |e: &&crate::estimate::Emitter| {
+            e.x_m.is_finite() && e.y_m.is_finite() && e.cov_m2.iter().flatten().all(|c| c.is_finite())
+        };
+        let mut detections: Vec<Self> = estimate
+            .emitters
+            .iter()
+            .filter(usable)
+            .map(|e| {
+                let [[a, b], [_, c]] = e.cov_m2;
+                let cov = Matrix2::new(a.max(0.0), b, b, c.max(0.0)) * inflation
+                    + Matrix2::identity() * POSITION_FLOOR_M.powi(2);
+                Self {
+                    position: Vector2::new(e.x_m, e.y_m),
+                    cov,
+                    energy_j: e.energy_j,
+                    energy_std_j: e.energy_std_j,
+                    flags: e.flags,
+                    resolution_m: resolution_m(camera, e.energy_j),
+                    ghost: 0.0,
+                }
+            })
+            .collect();
+        for i in 0..detections.len() {
+            detections[i].ghost = ghost(&detections, i, camera);
+        }
+        detections
+    }
+}
+
+/// An equal pair can be told apart at d ≥ 5 σ/√SNR, SNR = A·pitch/(2√π·σ·σ_n) (measured on the fit); never taken beyond
+/// 3 σ, where any two spots show two maxima.
+fn resolution_m(camera: &Camera, energy_j: f64) -> f64 {
+    let sigma = camera.spot_sigma_m;
+    let pitch = camera.x.pitch_m.max(camera.y.pitch_m);
+    let noise = camera.noise_std_j;
+    let snr = energy_j.max(0.0) * pitch / (2.0 * std::f64::consts::PI.sqrt() * sigma * noise);
+    let apart = 5.0 * sigma / snr.max(1e-3).sqrt();
+    apart.max(0.5 * pitch).min(3.0 * sigma) * camera.ground_scale()
+}
+
+/// How probable it is that detection `i` is spurious: rare on its own, common where a spot may have been split in two or
+/// the frame is not what the model says.
+fn ghost(detections: &[Detection], i: usize, camera: &Camera) -> f64 {
+    const ALONE: f64 = 1e-3;
+    const NEIGHBOURED: f64 = 1e-2;
+    const DOUBTFUL: f64 = 0.3;
+    let d = &detections[i];
+    let doubtful = Flags::UNRESOLVED | Flags::NO_CONVERGENCE | Flags::POOR_FIT;
+    if d.flags.intersects(doubtful) {
+        return DOUBTFUL;
+    }
+    let nearest = (0..detections.len())
+        .filter(|&j| j != i)
+        .map(|j| (detections[j].position - d.position).norm())
+        .fold(f64::INFINITY, f64::min);
+    if nearest < d.resolution_m {
+        DOUBTFUL
+    } else if nearest < 3.0 * camera.spot_sigma_m * camera.ground_scale() {
+        NEIGHBOURED
+    } else {
+        ALONE
+    }
+}
+
+impl Track {
+    fn start(id: u64, time: Timestamp, detection: &Detection) -> Self {
+        Self {
+            id,
+            motion: Motion::start(detection.position, detection.cov),
+            since: time,
+            last_hit: time,
+            confirmed: false,
+            hit: true,
+            merged: false,
+            score: (DETECTED / detection.ghost).ln(),
+            hits: 1,
+            frames: 1,
+            missed_s: 0.0,
+            trail: VecDeque::from([(time, detection.position)]),
+            detection: detection.clone(),
+        }
+    }
+
+    /// Where the beam was at `time`, if the track reaches back that far.
+    pub fn at(&self, time: Timestamp) -> Option<Vector2<f64>> {
+        let after = self.trail.partition_point(|(t, _)| *t <= time);
+        match (after.checked_sub(1).map(|i| self.trail[i]), self.trail.get(after)) {
+            (Some((ta, a)), Some(&(tb, b))) => Some(a + (b - a) * (seconds(ta, time) / seconds(ta, tb))),
+            (Some((t, p)), None) if seconds(t, time) < 2.0 * TRAIL_STEP_S => Some(p),
+            _ => None,
+        }
+    }
+
+    fn take(&mut self, time: Timestamp, detection: &Detection, ceiling: f64) {
+        self.motion.update(detection.position, detection.cov);
+        self.last_hit = time;
+        self.hit = true;
+        self.missed_s = 0.0;
+        self.score = (self.score + (DETECTED / detection.ghost).ln()).min(ceiling);
+        self.detection = detection.clone();
+        self.note(true);
+        let due = self.trail.back().is_none_or(|(t, _)| seconds(*t, time) >= TRAIL_STEP_S);
+        if due {
+            self.trail.push_back((time, self.motion.position()));
+            while self.trail.front().is_some_and(|(t, _)| seconds(*t, time) > TRAIL_S) {
+                self.trail.pop_front();
+            }
+        }
+    }
+
+    fn miss(&mut self, dt: f64, ghost: f64) {
+        self.hit = false;
+        self.missed_s += dt;
+        self.score += ((1.0 - DETECTED) / (1.0 - ghost)).ln();
+        self.note(false);
+    }
+
+    fn note(&mut self, hit: bool) {
+        let (m, n) = CONFIRM;
+        self.hits = (self.hits << 1) | u32::from(hit);
+        self.frames = self.frames.saturating_add(1);
+        self.confirmed |= (self.hits & ((1 << n) - 1)).count_ones() >= m;
+    }
+
+    fn is_over(&self) -> bool {
+        let (m, n) = CONFIRM;
+        if self.confirmed {
+            return self.missed_s > KEEP_S;
+        }
+        let misses = self.frames.min(n) - (self.hits & ((1 << n) - 1)).count_ones();
+        misses > n - m
+    }
+}
+
+impl Tracks {
+    /// `score_ceiling` bounds how far a long life can outweigh later misses.
+    pub fn new(score_ceiling: f64) -> Self {
+        Self {
+            all: Vec::new(),
+            next_id: 1,
+            time: None,
+            score_ceiling,
+        }
+    }
+
+    /// Links one frame's detections to the tracks; `dt_s` is the time the sensor could see since the last frame.
+    pub fn step(&mut self, time: Timestamp, detections: &[Detection], dt_s: f64) {
+        let elapsed = self.time.map_or(0.0, |t| seconds(t, time)).max(0.0);
+        self.time = Some(time);
+        if elapsed > FORGET_AFTER_S {
+            self.all.clear();
+        }
+        for track in &mut self.all {
+            track.motion.predict(elapsed);
+            track.merged = false;
+        }
+        let mut owner: Vec<Option<usize>> = vec![None; detections.len()];
+        // Confirmed tracks choose first: a newcomer's wide gate must not take an old track's detection.
+        for confirmed in [true, false] {
+            let rows: Vec<usize> = (0..self.all.len()).filter(|&i| self.all[i].confirmed == confirmed).collect();
+            let columns: Vec<usize> = (0..detections.len()).filter(|&j| owner[j].is_none()).collect();
+            let floor = Matrix2::identity() * GATE_FLOOR_M.powi(2);
+            let matching = assign(rows.len(), columns.len(), GATE, |i, j| {
+                let (motion, d) = (&self.all[rows[i]].motion, &detections[columns[j]]);
+                mahalanobis2(d.position - motion.position(), motion.position_cov() + d.cov + floor)
+            });
+            for (i, j) in matching.pairs {
+                owner[columns[j]] = Some(rows[i]);
+            }
+        }
+        let mut hit = vec![None; self.all.len()];
+        for (j, o) in owner.iter().enumerate() {
+            if let Some(i) = *o {
+                hit[i] = Some(j);
+            }
+        }
+        for (track, found) in self.all.iter_mut().zip(&hit) {
+            match *found {
+                Some(j) => track.take(time, &detections[j], self.score_ceiling),
+                None => track.miss_or_merge(detections, &owner, dt_s),
+            }
+        }
+        self.all.retain(|t| !t.is_over());
+        for (j, o) in owner.iter().enumerate() {
+            if o.is_none() {
+                self.all.push(Track::start(self.next_id, time, &detections[j]));
+                self.next_id += 1;
+            }
+        }
+    }
+
+    /// A number that no track will have.
+    pub fn reserve(&mut self) -> u64 {
+        self.next_id += 1;
+        self.next_id - 1
+    }
+
+    pub fn get(&self, id: u64) -> Option<&Track> {
+        self.all.iter().find(|t| t.id == id)
+    }
+}
+
+impl Track {
+    /// Without a detection of its own the beam may have melted into a neighbour's spot: it is then known to be there, as
+    /// well as the two can be told apart.
+    fn miss_or_merge(&mut self, detections: &[Detection], owner: &[Option<usize>], dt_s: f64) {
+        let here = self.motion.position();
+        let spread = self.motion.position_cov();
+        let neighbour = (0..detections.len()).filter(|&j| owner[j].is_some()).find(|&j| {
+            let d = &detections[j];
+            let r = Matrix2::identity() * (0.5 * d.resolution_m + GATE_FLOOR_M).powi(2);
+            mahalanobis2(d.position - here, r + spread.map(|s| s.min(4.0))) < 9.0
+        });
+        match neighbour {
+            Some(j) if self.confirmed => {
+                let d = &detections[j];
+                self.motion.update(d.position, d.cov + Matrix2::identity() * d.resolution_m.powi(2));
+                self.merged = true;
+                self.hit = false;
+                // Bounds a track that shadows another one: it lives a few times longer than one lost in the open.
+                self.missed_s += 0.2 * dt_s;
+            }
+            _ => self.miss(dt_s, self.detection.ghost),
+        }
+    }
+}

@@ -1,0 +1,80 @@
+use jiff::Timestamp;
+use nalgebra::{Matrix2, Vector2};
+
+use super::residuals::Residuals;
+use crate::claims::{Claim, ClaimState, Standing, seconds};
+
+/// A user may leave their last claim by this much a second without a new one, beyond the pace they claimed, m/s.
+const FREE_SPEED_M_S: f64 = 3.0;
+/// Paces above this are not believed when they widen what is tolerated, m/s.
+const FASTEST_M_S: f64 = 20.0;
+/// A claim older than this answers for no beam that is not already known to be the user's, s.
+pub(super) const CLAIM_LIFE_S: f64 = 60.0;
+
+/// A user's claim as it bears on the frame at hand.
+#[derive(Clone, Debug)]
+pub(super) struct Asserted {
+    pub claim: Claim,
+    /// Where the claim puts the beam, our own pose error included.
+    pub position: Vector2<f64>,
+    /// Variance per axis.
+    pub variance: f64,
+    /// Age of the claim, s.
+    pub age_s: f64,
+    /// How far the user may have gone since, m.
+    pub slack_m: f64,
+    /// The beam must be seen if the claim holds.
+    pub expected: bool,
+    pub ended: bool,
+    pub period_s: Option<f64>,
+    pub came: Timestamp,
+}
+
+impl Asserted {
+    /// `largest_sigma_m` bounds what a claim may say of its own error: a lie there must not hide a lie about the place.
+    pub fn new(
+        standing: &Standing,
+        now: Timestamp,
+        shift: Vector2<f64>,
+        default_sigma_m: f64,
+        largest_sigma_m: f64,
+    ) -> Self {
+        let claim = standing.claim;
+        let age_s = seconds(claim.time, now).max(0.0);
+        let sigma = claim.sigma_m.unwrap_or(default_sigma_m).clamp(0.01, largest_sigma_m);
+        Self {
+            position: Vector2::new(claim.x_m, claim.y_m) + shift,
+            variance: sigma * sigma,
+            age_s,
+            slack_m: (FREE_SPEED_M_S + standing.pace_m_s.min(FASTEST_M_S)) * age_s,
+            expected: false,
+            ended: claim.state == ClaimState::Ended,
+            period_s: standing.period_s,
+            came: standing.came,
+            claim: claim.clone(),
+        }
+    }
+
+    /// Covariance for asking which beam answers the claim.
+    pub fn spread(&self, tolerated_m: f64) -> Matrix2<f64> {
+        let slack = 0.5 * self.slack_m.min(60.0);
+        Matrix2::identity() * (self.variance + slack * slack + 0.25 * tolerated_m * tolerated_m)
+    }
+}
+
+/// What the monitor remembers of a user.
+#[derive(Clone, Debug, Default)]
+pub(super) struct User {
+    /// The beam that answered last.
+    pub track: Option<u64>,
+    pub residuals: Residuals,
+    /// First frame since which no beam answers.
+    pub unanswered_since: Option<Timestamp>,
+    /// ln likelihood ratio of "absent" to "missed by chance".
+    pub absence: f64,
+    /// Frames in a row with the beam outside what is tolerated.
+    pub outside: u32,
+    pub last_answered: Option<Timestamp>,
+    /// A beam elsewhere took the user's place when they vanished.
+    pub displaced: bool,
+}
