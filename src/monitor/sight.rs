@@ -59,6 +59,13 @@ impl Sight {
         seen.result.ok()
     }
 
+    /// A frame came to harm on its way.
+    pub fn unusable(&mut self, time: Timestamp, reason: &str) {
+        self.started.get_or_insert(time);
+        self.blind = Some(Blind::Unusable(reason.to_owned()));
+        self.blind_frames += 1;
+    }
+
     /// Nothing came.
     pub fn nothing(&mut self, now: Timestamp) {
         self.started.get_or_insert(now);

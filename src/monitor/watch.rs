@@ -105,6 +105,18 @@ impl Monitor {
         self.report(&asserted, seen.frame, now)
     }
 
+    /// A frame that the source itself could not deliver whole.
+    pub fn unusable(&mut self, frame: u64, time: Timestamp, reason: &str, claims: &mut Store) -> Report {
+        claims.advance(time);
+        self.frame = frame;
+        self.first.get_or_insert(time);
+        self.time = Some(self.time.map_or(time, |t| t.max(time)));
+        self.sight.unusable(time, reason);
+        let asserted = self.assert(claims, time);
+        self.watch_inputs(&asserted, claims, time);
+        self.report(&asserted, frame, time)
+    }
+
     /// Time passes without a frame.
     pub fn tick(&mut self, now: Timestamp, claims: &mut Store) -> Vec<AlertEvent> {
         if self.time.is_some_and(|t| now <= t) {
