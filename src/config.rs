@@ -103,6 +103,7 @@ impl Config {
         }
         for webhook in &mut self.webhook {
             webhook.secret_file = base.join(&webhook.secret_file);
+            webhook.ca_file = webhook.ca_file.as_ref().map(|path| base.join(path));
         }
     }
 }

@@ -22,6 +22,7 @@ use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 
 use jiff::Timestamp;
+use tokio::sync::watch;
 
 use crate::monitor::{Alert, AlertEvent};
 use store::{Store, Write};
@@ -168,6 +169,11 @@ impl Journal {
         *self.shared.heard.borrow()
     }
 
+    /// [`Journal::last_seq`] as it grows.
+    pub fn heard(&self) -> watch::Receiver<u64> {
+        self.shared.heard.subscribe()
+    }
+
     /// The journal's own random name, for ids that stay unique over journals.
     pub fn id(&self) -> &str {
         &self.id
@@ -223,6 +229,11 @@ impl Journal {
         let mut events = in_order(held, disk);
         events.truncate(limit);
         Ok(events)
+    }
+
+    pub fn event(&self, seq: u64) -> Result<Option<Recorded>, Error> {
+        let found = self.events_after(seq.saturating_sub(1), 1)?.pop();
+        Ok(found.filter(|event| event.seq == seq))
     }
 
     /// Deliveries to an endpoint that are still to be made, for events after a sequence number.

@@ -17,6 +17,8 @@ pub struct Waiting {
     pub seq: u64,
     pub endpoint: String,
     pub alert: String,
+    /// When the event was recorded, on the wall's clock.
+    pub recorded_at: Timestamp,
     /// Steps of the retry schedule that are used up.
     pub step: u32,
     /// HTTP requests made so far.

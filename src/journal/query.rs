@@ -135,7 +135,7 @@ impl Store {
 
     pub(super) fn waiting(&self, endpoint: &str, after: u64) -> Result<Vec<Waiting>, rusqlite::Error> {
         let mut statement = self.db.prepare_cached(
-            "SELECT d.seq, d.endpoint, e.alert, d.step, d.attempts, d.next_us
+            "SELECT d.seq, d.endpoint, e.alert, e.recorded_us, d.step, d.attempts, d.next_us
              FROM delivery d JOIN event e USING (seq)
              WHERE d.endpoint = ?1 AND d.state = 'waiting' AND d.seq > ?2 ORDER BY d.seq",
         )?;
@@ -144,9 +144,10 @@ impl Store {
                 seq: row.get(0)?,
                 endpoint: row.get(1)?,
                 alert: row.get(2)?,
-                step: row.get(3)?,
-                attempts: row.get(4)?,
-                next_at: time(row.get(5)?),
+                recorded_at: time(row.get(3)?),
+                step: row.get(4)?,
+                attempts: row.get(5)?,
+                next_at: time(row.get(6)?),
             })
         })?;
         rows.collect()

@@ -8,10 +8,29 @@ use crate::monitor::AlertKind;
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Config {
+    /// What the endpoint is called in status, metrics and journal. Left out, it follows from the URL; give one,
+    /// and deliveries that wait survive a change of the URL.
+    #[serde(default)]
+    pub name: Option<String>,
     pub url: String,
-    /// File with a Standard Webhooks secret (`whsec_…`, or `whsk_…` for ed25519).
+    /// File with Standard Webhooks secrets, one a line (`whsec_…`, or `whsk_…` for ed25519). Every request is
+    /// signed with each, so that secrets can be rotated.
     pub secret_file: PathBuf,
     /// Alert kinds to send; all when left out.
     #[serde(default)]
     pub kinds: Option<Vec<AlertKind>>,
+    /// Allows `http://` to hosts other than this one.
+    #[serde(default)]
+    pub allow_http: bool,
+    /// Certificates (PEM) of a private authority that the receiver's certificate may come from.
+    #[serde(default)]
+    pub ca_file: Option<PathBuf>,
+    /// Longest wait for an answer, s.
+    #[serde(default = "twenty")]
+    pub timeout_s: f64,
+}
+
+/// In the middle of the 15 to 30 s that Standard Webhooks recommends.
+fn twenty() -> f64 {
+    20.0
 }

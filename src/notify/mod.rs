@@ -1,5 +1,120 @@
 //! Floor 4: signed webhooks, at least once, in order per alert, from a durable outbox.
+//!
+//! The journal writes an outbox row with each alert event, in the same transaction; [`spawn`]'s worker sends
+//! what waits there until the receiver has confirmed it. docs/webhooks.md is the receiver's side of it.
 
+mod client;
+mod clock;
 mod config;
+mod endpoint;
+mod payload;
+mod queue;
+mod schedule;
+mod signature;
+mod status;
+mod worker;
 
+use std::sync::{Arc, Mutex, PoisonError};
+
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+use tokio::sync::{mpsc, oneshot};
+use tokio::task::JoinHandle;
+
+use crate::journal::{self, DeadLetter, Journal};
+use worker::{Command, Worker};
+
+pub use clock::Clock;
 pub use config::Config;
+pub use endpoint::{Endpoint, Error, load};
+pub use status::{EndpointState, EndpointStatus};
+
+/// Why a request of the operator cannot be met.
+#[derive(Debug, thiserror::Error)]
+pub enum AskError {
+    #[error("there is no webhook `{0}`")]
+    Unknown(String),
+    #[error("the journal cannot be written now; dead letters stay where they are")]
+    ReadOnly,
+    #[error("the daemon is stopping")]
+    Stopping,
+    #[error(transparent)]
+    Journal(#[from] journal::Error),
+}
+
+/// A handle on the webhook worker, for the API.
+#[derive(Clone)]
+pub struct Notifier {
+    names: Arc<[String]>,
+    shown: Arc<Mutex<Vec<EndpointStatus>>>,
+    commands: mpsc::Sender<Command>,
+    journal: Journal,
+}
+
+/// Starts sending. The journal must have been opened with the endpoints' subscriptions. `seed` is the retry
+/// jitter's. Once `shutdown` completes, requests that are under way get a few seconds; what is left then waits
+/// in the journal for the next start.
+pub fn spawn(
+    endpoints: Vec<Endpoint>,
+    journal: Journal,
+    clock: Clock,
+    seed: u64,
+    shutdown: impl Future<Output = ()> + Send + 'static,
+) -> (Notifier, JoinHandle<()>) {
+    let endpoints: Vec<Arc<Endpoint>> = endpoints.into_iter().map(Arc::new).collect();
+    let names = endpoints.iter().map(|e| e.name().to_owned()).collect();
+    let shown = Arc::new(Mutex::new(endpoints.iter().map(|e| EndpointStatus::new(e)).collect()));
+    let (commands, receiver) = mpsc::channel(16);
+    let rng = ChaCha8Rng::seed_from_u64(seed);
+    let worker = Worker::new(endpoints, journal.clone(), clock, rng, receiver, shown.clone());
+    let notifier = Notifier {
+        names,
+        shown,
+        commands,
+        journal,
+    };
+    (notifier, tokio::spawn(worker.run(shutdown)))
+}
+
+impl Notifier {
+    /// How each endpoint fares, in the order of the config.
+    pub fn status(&self) -> Vec<EndpointStatus> {
+        self.shown.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    /// Deliveries that the schedule gave up on, oldest first.
+    pub fn dead_letters(&self, endpoint: &str, limit: usize) -> Result<Vec<DeadLetter>, AskError> {
+        self.index(endpoint)?;
+        Ok(self.journal.dead_letters(endpoint, limit)?)
+    }
+
+    /// Sends to an endpoint again that had answered 410 Gone.
+    pub async fn enable(&self, endpoint: &str) -> Result<(), AskError> {
+        let endpoint = self.index(endpoint)?;
+        self.ask(|done| Command::Enable { endpoint, done }).await
+    }
+
+    /// Puts one dead letter, or all of them, back into the queue; gives how many. They go out beside later
+    /// events of their alert that were sent meanwhile: the order is then the operator's.
+    pub async fn replay(&self, endpoint: &str, seq: Option<u64>) -> Result<u64, AskError> {
+        let endpoint = self.index(endpoint)?;
+        if !self.journal.health().writable {
+            return Err(AskError::ReadOnly);
+        }
+        self.ask(|done| Command::Replay { endpoint, seq, done }).await
+    }
+
+    fn index(&self, name: &str) -> Result<usize, AskError> {
+        let found = self.names.iter().position(|n| n == name);
+        found.ok_or_else(|| AskError::Unknown(name.chars().take(64).collect()))
+    }
+
+    async fn ask<T>(&self, command: impl FnOnce(oneshot::Sender<T>) -> Command) -> Result<T, AskError> {
+        let (done, answer) = oneshot::channel();
+        self.commands
+            .send(command(done))
+            .await
+            .map_err(|_| AskError::Stopping)?;
+        answer.await.map_err(|_| AskError::Stopping)
+    }
+}

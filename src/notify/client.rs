@@ -1,0 +1,197 @@
+use std::error::Error as _;
+use std::time::Duration;
+
+use jiff::Timestamp;
+use jiff::fmt::rfc2822::DateTimeParser;
+use reqwest::header::{CONTENT_TYPE, HeaderMap, RETRY_AFTER};
+use reqwest::{Certificate, Client, StatusCode, redirect};
+
+use super::endpoint::{Endpoint, Error};
+use super::{Config, payload};
+use crate::journal::{self, Recorded};
+
+/// Read of an answer so that its connection can be used again; a longer one costs the connection.
+const ANSWER: usize = 4 << 10;
+
+/// A receiver that asks for more patience than this is asked again all the same: nobody may put off alerts
+/// for good.
+const LONGEST_RETRY_AFTER: Duration = Duration::from_secs(3600);
+
+/// Why a `ca_file` cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum AuthorityError {
+    #[error(transparent)]
+    Unreadable(#[from] std::io::Error),
+    #[error("not PEM certificates: {0}")]
+    Malformed(#[from] reqwest::Error),
+    #[error("holds no certificate")]
+    Empty,
+}
+
+/// How a request ended.
+#[derive(Debug)]
+pub(super) enum Verdict {
+    Delivered,
+    /// 410: the receiver wants no more.
+    Gone,
+    Failed {
+        failure: Failure,
+        retry_after: Option<Duration>,
+    },
+}
+
+/// Why a request was no delivery.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum Failure {
+    #[error("the receiver answered {0}")]
+    Status(StatusCode),
+    #[error("the receiver answered {0}, a redirect, which is not followed; put its new address into the config")]
+    Redirect(StatusCode),
+    #[error("no answer in time")]
+    Timeout,
+    #[error("the journal cannot be read: {0}")]
+    Journal(journal::Error),
+    #[error("the request broke off inside oapwatch")]
+    Broken,
+    #[error("no connection: {0}")]
+    Connect(Cause),
+    #[error("{0}")]
+    Transport(Cause),
+}
+
+/// Prints the innermost causes, which say what happened; the outer ones only say that something did.
+#[derive(Debug)]
+pub(super) struct Cause(reqwest::Error);
+
+impl std::fmt::Display for Cause {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let mut causes = Vec::new();
+        let mut source = self.0.source();
+        while let Some(cause) = source {
+            causes.push(cause.to_string());
+            source = cause.source();
+        }
+        match &causes[..] {
+            [] => self.0.fmt(f),
+            [cause] => f.write_str(cause),
+            [.., outer, inner] => write!(f, "{outer}: {inner}"),
+        }
+    }
+}
+
+pub(super) fn build(index: usize, config: &Config, timeout: Duration, loopback: bool) -> Result<Client, Error> {
+    // Any earlier choice of the process stands.
+    let _ = rustls::crypto::ring::default_provider().install_default();
+    let mut builder = Client::builder()
+        .user_agent(concat!("oapwatch/", env!("CARGO_PKG_VERSION")))
+        .redirect(redirect::Policy::none())
+        .referer(false)
+        .connect_timeout(timeout.min(Duration::from_secs(10)))
+        .timeout(timeout)
+        .pool_idle_timeout(Duration::from_secs(60));
+    if loopback {
+        builder = builder.no_proxy();
+    }
+    if let Some(path) = &config.ca_file {
+        let authority = |source| Error::Authority {
+            index,
+            path: path.clone(),
+            source,
+        };
+        let pem = std::fs::read(path).map_err(|e| authority(e.into()))?;
+        let certificates = Certificate::from_pem_bundle(&pem).map_err(|e| authority(e.into()))?;
+        if certificates.is_empty() {
+            return Err(authority(AuthorityError::Empty));
+        }
+        builder = builder.tls_certs_merge(certificates);
+    }
+    builder.build().map_err(|source| Error::Client { index, source })
+}
+
+/// Makes one signed request and judges the answer.
+pub(super) async fn send(endpoint: &Endpoint, id: &str, event: &Recorded, now: Timestamp) -> Verdict {
+    let body = payload::body(event);
+    let unix_s = now.as_second();
+    let request = endpoint
+        .client
+        .post(endpoint.url.clone())
+        .header(CONTENT_TYPE, "application/json")
+        .header("webhook-id", id)
+        .header("webhook-timestamp", unix_s)
+        .header("webhook-signature", endpoint.signer.sign(id, unix_s, &body))
+        .body(body);
+    match request.send().await {
+        Ok(mut answer) => {
+            let status = answer.status();
+            let retry_after = retry_after(answer.headers(), now);
+            let mut read = 0;
+            while read < ANSWER
+                && let Ok(Some(chunk)) = answer.chunk().await
+            {
+                read += chunk.len();
+            }
+            match status {
+                StatusCode::GONE => Verdict::Gone,
+                _ if status.is_success() => Verdict::Delivered,
+                _ => Verdict::Failed {
+                    failure: match status.is_redirection() {
+                        true => Failure::Redirect(status),
+                        false => Failure::Status(status),
+                    },
+                    retry_after,
+                },
+            }
+        }
+        Err(error) => Verdict::Failed {
+            failure: describe(error.without_url()),
+            retry_after: None,
+        },
+    }
+}
+
+fn describe(error: reqwest::Error) -> Failure {
+    if error.is_timeout() {
+        Failure::Timeout
+    } else if error.is_connect() {
+        Failure::Connect(Cause(error))
+    } else {
+        Failure::Transport(Cause(error))
+    }
+}
+
+/// RFC 9110 §10.2.3: seconds, or a date.
+fn retry_after(headers: &HeaderMap, now: Timestamp) -> Option<Duration> {
+    let text = headers.get(RETRY_AFTER)?.to_str().ok()?.trim();
+    let wait = if !text.is_empty() && text.bytes().all(|b| b.is_ascii_digit()) {
+        // More digits than fit are as good as for ever.
+        Duration::from_secs(text.parse().unwrap_or(u64::MAX))
+    } else {
+        const DATE: DateTimeParser = DateTimeParser::new().relaxed_weekday(true);
+        let date = DATE.parse_timestamp(text).ok()?;
+        Duration::try_from(date.duration_since(now)).unwrap_or(Duration::ZERO)
+    };
+    Some(wait.min(LONGEST_RETRY_AFTER))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn retry_after_is_seconds_or_a_date_and_bounded() {
+        let now: Timestamp = "1994-11-06T08:49:07Z".parse().unwrap();
+        let read = |text: &str| {
+            let mut headers = HeaderMap::new();
+            headers.insert(RETRY_AFTER, text.parse().unwrap());
+            retry_after(&headers, now).map(|d| d.as_secs())
+        };
+        assert_eq!(read("120"), Some(120));
+        assert_eq!(read("Sun, 06 Nov 1994 08:49:37 GMT"), Some(30));
+        assert_eq!(read("Sun, 06 Nov 1994 08:48:37 GMT"), Some(0));
+        assert_eq!(read("Sun, 06 Nov 2094 08:49:37 GMT"), Some(3600));
+        assert_eq!(read("99999999999999999999999"), Some(3600));
+        assert_eq!(read("-5"), None);
+        assert_eq!(read("soon"), None);
+        assert_eq!(read(""), None);
+    }
+}

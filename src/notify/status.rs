@@ -1,0 +1,59 @@
+use jiff::Timestamp;
+
+use super::Endpoint;
+use crate::monitor::AlertKind;
+
+/// How one endpoint fares. Holds no secret, and of the URL neither query nor credentials.
+#[derive(Clone, Debug, PartialEq, serde::Serialize, utoipa::ToSchema)]
+pub struct EndpointStatus {
+    pub name: String,
+    pub url: String,
+    /// `null` is all.
+    pub kinds: Option<Vec<AlertKind>>,
+    pub state: EndpointState,
+    /// Deliveries still to be made.
+    pub queued: u64,
+    pub sent: u64,
+    /// Dead letters: given up at the end of the retry schedule, kept, sent again on request.
+    pub failed: u64,
+    /// When the oldest event that is still queued was recorded.
+    #[schema(value_type = Option<String>, format = DateTime)]
+    pub oldest_queued: Option<Timestamp>,
+    #[schema(value_type = Option<String>, format = DateTime)]
+    pub last_success: Option<Timestamp>,
+    #[schema(value_type = Option<String>, format = DateTime)]
+    pub last_failure: Option<Timestamp>,
+    pub last_error: Option<String>,
+    /// When the next request goes out, if nothing happens before.
+    #[schema(value_type = Option<String>, format = DateTime)]
+    pub next_attempt: Option<Timestamp>,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize, utoipa::ToSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum EndpointState {
+    Working,
+    /// The last request failed; it is tried again.
+    Failing,
+    /// The receiver answered 410 Gone; nothing is sent until someone enables it.
+    Disabled,
+}
+
+impl EndpointStatus {
+    pub(super) fn new(endpoint: &Endpoint) -> Self {
+        Self {
+            name: endpoint.name().to_owned(),
+            url: endpoint.shown_url(),
+            kinds: endpoint.subscription().kinds,
+            state: EndpointState::Working,
+            queued: 0,
+            sent: 0,
+            failed: 0,
+            oldest_queued: None,
+            last_success: None,
+            last_failure: None,
+            last_error: None,
+            next_attempt: None,
+        }
+    }
+}

@@ -1,0 +1,362 @@
+use std::collections::HashMap;
+use std::pin::pin;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
+
+use jiff::{SignedDuration, Timestamp};
+use metrics::{counter, gauge};
+use rand_chacha::ChaCha8Rng;
+use tokio::sync::{mpsc, oneshot};
+use tokio::task::{Id, JoinError, JoinSet};
+
+use super::client::{self, Failure, Verdict};
+use super::queue::{Next, Queue};
+use super::status::{EndpointState, EndpointStatus};
+use super::{Clock, Endpoint, schedule};
+use crate::journal::{self, Attempt, Journal, Outcome, Waiting};
+
+/// How long requests that are under way may still take when the daemon stops.
+const GRACE: Duration = Duration::from_secs(3);
+
+/// How soon a journal that could not be read is read again.
+const REREAD: Duration = Duration::from_secs(1);
+
+/// How often the age of the oldest delivery is brought up to date.
+const TICK: Duration = Duration::from_secs(10);
+
+/// What an operator asks of the worker.
+pub(super) enum Command {
+    Enable {
+        endpoint: usize,
+        done: oneshot::Sender<()>,
+    },
+    Replay {
+        endpoint: usize,
+        seq: Option<u64>,
+        done: oneshot::Sender<u64>,
+    },
+}
+
+/// One endpoint's deliveries.
+struct Lane {
+    endpoint: Arc<Endpoint>,
+    queue: Queue,
+    /// Events up to this one are in the queue, or done with.
+    read_to: u64,
+    status: EndpointStatus,
+}
+
+pub(super) struct Worker {
+    lanes: Vec<Lane>,
+    journal: Journal,
+    clock: Clock,
+    rng: ChaCha8Rng,
+    commands: mpsc::Receiver<Command>,
+    shown: Arc<Mutex<Vec<EndpointStatus>>>,
+    requests: JoinSet<Verdict>,
+    /// Lane and event of each request.
+    under_way: HashMap<Id, (usize, u64)>,
+}
+
+impl Worker {
+    pub(super) fn new(
+        endpoints: Vec<Arc<Endpoint>>,
+        journal: Journal,
+        clock: Clock,
+        rng: ChaCha8Rng,
+        commands: mpsc::Receiver<Command>,
+        shown: Arc<Mutex<Vec<EndpointStatus>>>,
+    ) -> Self {
+        let lane = |endpoint: Arc<Endpoint>| Lane {
+            status: EndpointStatus::new(&endpoint),
+            endpoint,
+            queue: Queue::default(),
+            read_to: 0,
+        };
+        Self {
+            lanes: endpoints.into_iter().map(lane).collect(),
+            journal,
+            clock,
+            rng,
+            commands,
+            shown,
+            requests: JoinSet::new(),
+            under_way: HashMap::new(),
+        }
+    }
+
+    pub(super) async fn run(mut self, shutdown: impl Future<Output = ()>) {
+        let mut shutdown = pin!(shutdown);
+        let mut heard = self.journal.heard();
+        let mut known = vec![false; self.lanes.len()];
+        loop {
+            heard.mark_unchanged();
+            let mut readable = true;
+            for (k, known) in known.iter_mut().enumerate() {
+                let read = match *known {
+                    true => self.read_new(k).await,
+                    false => self.resume(k).await.inspect(|()| *known = true),
+                };
+                if let Err(error) = read {
+                    tracing::warn!(%error, "the webhook outbox cannot be read");
+                    readable = false;
+                }
+            }
+            let now = self.clock.uptime();
+            self.start(now);
+            self.show(now);
+            let wakes = self.lanes.iter().filter_map(|lane| lane.queue.wake_at());
+            // What is due already waits for a request that is under way.
+            let wake = wakes
+                .filter(|&at| at > now)
+                .min()
+                .unwrap_or(Duration::MAX)
+                .min(now + TICK);
+            tokio::select! {
+                () = &mut shutdown => break,
+                Some(ended) = self.requests.join_next_with_id(), if !self.requests.is_empty() => self.settle(ended),
+                Ok(()) = heard.changed() => {}
+                Some(command) = self.commands.recv() => self.obey(command).await,
+                () = self.clock.sleep_until(wake) => {}
+                () = tokio::time::sleep(REREAD), if !readable => {}
+            }
+        }
+        // What is cut off here stays in the outbox and goes out after the next start.
+        let grace = tokio::time::sleep(GRACE);
+        let mut grace = pin!(grace);
+        while !self.requests.is_empty() {
+            tokio::select! {
+                () = &mut grace => break,
+                Some(ended) = self.requests.join_next_with_id() => self.settle(ended),
+            }
+        }
+        self.journal.settled().await;
+    }
+
+    /// Takes up what an earlier run left behind.
+    async fn resume(&mut self, k: usize) -> Result<(), journal::Error> {
+        let name = self.lanes[k].endpoint.name().to_owned();
+        let record = self.ask(move |journal| journal.endpoint(&name)).await?;
+        self.read_new(k).await?;
+        let now = self.clock.uptime();
+        let lane = &mut self.lanes[k];
+        lane.status.sent = record.sent;
+        lane.status.failed = record.dead;
+        lane.status.last_success = record.last_success;
+        lane.status.last_failure = record.last_failure;
+        lane.status.last_error = record.last_error;
+        if record.disabled_at.is_some() {
+            tracing::warn!(
+                endpoint = lane.endpoint.name(),
+                "this webhook's receiver answered 410 Gone; nothing is sent until it is enabled"
+            );
+            lane.queue.disable();
+        } else if lane.queue.len() > 0 {
+            lane.queue.probe_first(now);
+        }
+        Ok(())
+    }
+
+    /// Takes the deliveries of new events into the queue.
+    async fn read_new(&mut self, k: usize) -> Result<(), journal::Error> {
+        let last = self.journal.last_seq();
+        let lane = &self.lanes[k];
+        if lane.read_to == last && last > 0 {
+            return Ok(());
+        }
+        let (name, after) = (lane.endpoint.name().to_owned(), lane.read_to);
+        let rows = self.ask(move |journal| journal.waiting(&name, after)).await?;
+        for row in &rows {
+            self.push(k, row);
+        }
+        let lane = &mut self.lanes[k];
+        lane.read_to = rows.last().map_or(last, |row| row.seq.max(last));
+        Ok(())
+    }
+
+    fn push(&mut self, k: usize, row: &Waiting) {
+        // The wall clock may have been set since the row was written: no wait grows beyond its schedule.
+        let wait = Duration::try_from(row.next_at.duration_since(self.clock.now())).unwrap_or(Duration::ZERO);
+        let due = self.clock.uptime() + wait.min(schedule::longest_wait(row.step));
+        self.lanes[k]
+            .queue
+            .push(&row.alert, row.seq, row.step, due, row.recorded_at);
+    }
+
+    async fn ask<T: Send + 'static>(
+        &self,
+        question: impl FnOnce(&Journal) -> Result<T, journal::Error> + Send + 'static,
+    ) -> Result<T, journal::Error> {
+        let journal = self.journal.clone();
+        match tokio::task::spawn_blocking(move || question(&journal)).await {
+            Ok(answer) => answer,
+            Err(error) => std::panic::resume_unwind(error.into_panic()),
+        }
+    }
+
+    fn start(&mut self, now: Duration) {
+        for (k, lane) in self.lanes.iter_mut().enumerate() {
+            while let Some(job) = lane.queue.take(now) {
+                let request = attempt(self.journal.clone(), lane.endpoint.clone(), job.seq, self.clock);
+                let id = self.requests.spawn(request).id();
+                self.under_way.insert(id, (k, job.seq));
+            }
+        }
+    }
+
+    fn settle(&mut self, ended: Result<(Id, Verdict), JoinError>) {
+        let (id, verdict) = ended.unwrap_or_else(|error| {
+            let verdict = Verdict::Failed {
+                failure: Failure::Broken,
+                retry_after: None,
+            };
+            (error.id(), verdict)
+        });
+        let Some((k, seq)) = self.under_way.remove(&id) else {
+            return;
+        };
+        let (at, now) = (self.clock.now(), self.clock.uptime());
+        let lane = &mut self.lanes[k];
+        let name = lane.endpoint.name();
+        let count = |outcome: &'static str| {
+            counter!("oapwatch_webhook_attempts_total", "endpoint" => name.to_owned(), "outcome" => outcome)
+                .increment(1);
+        };
+        let was_failing = lane.queue.is_failing();
+        let (next, error) = match verdict {
+            Verdict::Delivered => {
+                count("delivered");
+                lane.status.sent += 1;
+                lane.status.last_success = Some(at);
+                if was_failing {
+                    tracing::info!(
+                        endpoint = name,
+                        queued = lane.queue.len(),
+                        "the webhook receiver answers again"
+                    );
+                }
+                (lane.queue.sent(seq, now), String::new())
+            }
+            Verdict::Gone => {
+                count("gone");
+                let error = Failure::Status(reqwest::StatusCode::GONE).to_string();
+                tracing::warn!(
+                    endpoint = name,
+                    "the webhook receiver answered 410 Gone; nothing more is sent until it is enabled"
+                );
+                self.journal.disable(name, at, error.clone());
+                (lane.queue.gone(seq, now), error)
+            }
+            Verdict::Failed { failure, retry_after } => {
+                count("failed");
+                let error = failure.to_string();
+                match was_failing {
+                    true => tracing::debug!(endpoint = name, seq, %error, "a webhook delivery failed again"),
+                    false => {
+                        tracing::warn!(endpoint = name, seq, %error, "a webhook delivery failed; it is tried again")
+                    }
+                }
+                (lane.queue.failed(seq, retry_after, now, &mut self.rng), error)
+            }
+        };
+        if next != Next::Sent {
+            lane.status.last_failure = Some(at);
+            lane.status.last_error = Some(error.clone());
+        }
+        let outcome = match next {
+            Next::Sent => Outcome::Sent,
+            Next::Retry { step, wait } => {
+                let wait = SignedDuration::try_from(wait).unwrap_or(SignedDuration::MAX);
+                let next_at = at.saturating_add(wait).unwrap_or(Timestamp::MAX);
+                Outcome::Retry { step, next_at, error }
+            }
+            Next::Dead => {
+                count("given_up");
+                lane.status.failed += 1;
+                tracing::error!(endpoint = name, seq, %error, "a webhook delivery is given up; it can be replayed");
+                Outcome::Dead { error }
+            }
+        };
+        self.journal.attempted(Attempt {
+            seq,
+            endpoint: name.to_owned(),
+            at,
+            outcome,
+        });
+    }
+
+    async fn obey(&mut self, command: Command) {
+        match command {
+            Command::Enable { endpoint, done } => {
+                self.journal.enable(self.lanes[endpoint].endpoint.name()).await;
+                let now = self.clock.uptime();
+                self.lanes[endpoint].queue.enable(now);
+                self.show(now);
+                // Whoever asked may have gone away meanwhile.
+                let _ = done.send(());
+            }
+            Command::Replay { endpoint, seq, done } => {
+                let name = self.lanes[endpoint].endpoint.name().to_owned();
+                self.journal.replay(&name, seq, self.clock.now()).await;
+                let before = self.lanes[endpoint].queue.len();
+                match self.ask(move |journal| journal.waiting(&name, 0)).await {
+                    Ok(rows) => {
+                        // Later events come in by `read_new`, once.
+                        let read_to = self.lanes[endpoint].read_to;
+                        for row in rows.iter().filter(|row| row.seq <= read_to) {
+                            self.push(endpoint, row);
+                        }
+                    }
+                    Err(error) => tracing::warn!(%error, "the webhook outbox cannot be read"),
+                }
+                let lane = &mut self.lanes[endpoint];
+                let revived = (lane.queue.len() - before) as u64;
+                lane.status.failed = lane.status.failed.saturating_sub(revived);
+                self.show(self.clock.uptime());
+                let _ = done.send(revived);
+            }
+        }
+    }
+
+    /// Brings status and metrics up to date.
+    fn show(&mut self, now: Duration) {
+        let wall = self.clock.now();
+        for lane in &mut self.lanes {
+            let status = &mut lane.status;
+            status.state = match (lane.queue.is_disabled(), lane.queue.is_failing()) {
+                (true, _) => EndpointState::Disabled,
+                (false, true) => EndpointState::Failing,
+                (false, false) => EndpointState::Working,
+            };
+            status.queued = lane.queue.len() as u64;
+            status.oldest_queued = lane.queue.oldest();
+            status.next_attempt = lane.queue.wake_at().map(|at| {
+                let wait = SignedDuration::try_from(at.saturating_sub(now)).unwrap_or(SignedDuration::MAX);
+                wall.saturating_add(wait).unwrap_or(Timestamp::MAX)
+            });
+            let age = status
+                .oldest_queued
+                .map_or(0.0, |at| wall.duration_since(at).as_secs_f64().max(0.0));
+            let name = lane.endpoint.name();
+            gauge!("oapwatch_webhook_queued", "endpoint" => name.to_owned()).set(status.queued as f64);
+            gauge!("oapwatch_webhook_oldest_queued_seconds", "endpoint" => name.to_owned()).set(age);
+            gauge!("oapwatch_webhook_dead_letters", "endpoint" => name.to_owned()).set(status.failed as f64);
+        }
+        *self.shown.lock().unwrap_or_else(PoisonError::into_inner) =
+            self.lanes.iter().map(|lane| lane.status.clone()).collect();
+    }
+}
+
+async fn attempt(journal: Journal, endpoint: Arc<Endpoint>, seq: u64, clock: Clock) -> Verdict {
+    let id = format!("msg_{}_{seq}", journal.id());
+    let found = tokio::task::spawn_blocking(move || journal.event(seq)).await;
+    let failure = match found {
+        Ok(Ok(Some(event))) => return client::send(&endpoint, &id, &event, clock.now()).await,
+        Ok(Ok(None)) | Err(_) => Failure::Broken,
+        Ok(Err(error)) => Failure::Journal(error),
+    };
+    Verdict::Failed {
+        failure,
+        retry_after: None,
+    }
+}
