@@ -22,7 +22,9 @@ impl Frame {
     pub fn digest(&self) -> u64 {
         // FNV-1a over whole pixels (Fowler, Noll and Vo), with a rotation so that high bits reach low ones.
         self.pixels.iter().fold(0xcbf2_9ce4_8422_2325, |hash: u64, pixel| {
-            (hash ^ pixel.to_bits()).wrapping_mul(0x0000_0100_0000_01b3).rotate_left(29)
+            (hash ^ pixel.to_bits())
+                .wrapping_mul(0x0000_0100_0000_01b3)
+                .rotate_left(29)
         })
     }
 }

@@ -33,7 +33,11 @@ pub fn parse_line(line: &[u8], config: &Config) -> Result<Claim, LineError> {
         return Err(wrong("the line", "a JSON object", &object));
     }
     let names = &config.fields;
-    let time = time(&names.time, required(&object, &names.time, TIME)?, config.clock_offset_s)?;
+    let time = time(
+        &names.time,
+        required(&object, &names.time, TIME)?,
+        config.clock_offset_s,
+    )?;
     let user = user(&names.user, required(&object, &names.user, USER)?)?;
     let [x_m, y_m] = match &config.origin {
         None => [
@@ -167,8 +171,14 @@ mod tests {
 
     #[test]
     fn reads_the_contracts_line_and_its_short_form() {
-        let c = parse(r#"{"time":"2026-11-21T08:00:00.000Z","user":"u-17","x_m":12.5,"y_m":-80.0,"sigma_m":1.0,"state":"ended"}"#).unwrap();
-        assert_eq!((c.user.as_str(), c.x_m, c.y_m, c.sigma_m), ("u-17", 12.5, -80.0, Some(1.0)));
+        let c = parse(
+            r#"{"time":"2026-11-21T08:00:00.000Z","user":"u-17","x_m":12.5,"y_m":-80.0,"sigma_m":1.0,"state":"ended"}"#,
+        )
+        .unwrap();
+        assert_eq!(
+            (c.user.as_str(), c.x_m, c.y_m, c.sigma_m),
+            ("u-17", 12.5, -80.0, Some(1.0))
+        );
         assert_eq!(c.state, ClaimState::Ended);
         let c = parse(r#"{"time":"2026-11-21T08:00:00Z","user":"u","x_m":1,"y_m":2,"more":[]}"#).unwrap();
         assert_eq!((c.sigma_m, c.state), (None, ClaimState::Active));
@@ -181,9 +191,18 @@ mod tests {
             (r#"{"time":"yesterday","user":"u","x_m":1,"y_m":2}"#, "time"),
             (r#"{"time":"2026-11-21T08:00:00Z","user":"","x_m":1,"y_m":2}"#, "user"),
             (r#"{"time":"2026-11-21T08:00:00Z","user":"u","x_m":"1","y_m":2}"#, "x_m"),
-            (r#"{"time":"2026-11-21T08:00:00Z","user":"u","x_m":1,"y_m":1e300}"#, "y_m"),
-            (r#"{"time":"2026-11-21T08:00:00Z","user":"u","x_m":1,"y_m":2,"sigma_m":-1}"#, "sigma_m"),
-            (r#"{"time":"2026-11-21T08:00:00Z","user":"u","x_m":1,"y_m":2,"state":"gone"}"#, "state"),
+            (
+                r#"{"time":"2026-11-21T08:00:00Z","user":"u","x_m":1,"y_m":1e300}"#,
+                "y_m",
+            ),
+            (
+                r#"{"time":"2026-11-21T08:00:00Z","user":"u","x_m":1,"y_m":2,"sigma_m":-1}"#,
+                "sigma_m",
+            ),
+            (
+                r#"{"time":"2026-11-21T08:00:00Z","user":"u","x_m":1,"y_m":2,"state":"gone"}"#,
+                "state",
+            ),
         ] {
             let message = parse(line).unwrap_err().to_string();
             assert!(message.contains(&format!("`{field}`")), "{line}: {message}");

@@ -169,10 +169,7 @@ impl Store {
         match (after.checked_sub(1).map(|i| &claims[i]), claims.get(after)) {
             (Some(a), Some(b)) => {
                 let share = seconds(a.time, time) / seconds(a.time, b.time);
-                Some([
-                    a.x_m + share * (b.x_m - a.x_m),
-                    a.y_m + share * (b.y_m - a.y_m),
-                ])
+                Some([a.x_m + share * (b.x_m - a.x_m), a.y_m + share * (b.y_m - a.y_m)])
             }
             (Some(c), None) | (None, Some(c)) => Some([c.x_m, c.y_m]),
             (None, None) => None,
@@ -246,9 +243,7 @@ impl History {
         let mut recent = self.claims.iter().rev().filter(active).take(6);
         let (last, first) = (recent.next(), recent.last());
         let pace_m_s = match (first, last) {
-            (Some(a), Some(b)) => {
-                (b.x_m - a.x_m).hypot(b.y_m - a.y_m) / seconds(a.time, b.time).max(0.05)
-            }
+            (Some(a), Some(b)) => (b.x_m - a.x_m).hypot(b.y_m - a.y_m) / seconds(a.time, b.time).max(0.05),
             _ => 0.0,
         };
         let before = self.claims.len().checked_sub(2).map(|i| &self.claims[i]);

@@ -1,8 +1,61 @@
-use super::Outcome;
+use std::io::Write;
+
+use super::{Failure, Outcome};
+use crate::frames::v4l2::{Device, Sizes, devices};
 
 #[derive(Debug, clap::Args)]
-pub struct Args {}
+pub struct Args {
+    /// Also list formats that cannot be a source (colour, compressed)
+    #[arg(long)]
+    all: bool,
+}
 
-pub fn run(_args: Args) -> Outcome {
-    Err(super::Failure::other(anyhow::anyhow!("devices is not built yet")))
+pub fn run(args: Args) -> Outcome {
+    let found = devices().map_err(|e| Failure::other(anyhow::Error::new(e).context("/dev")))?;
+    let mut out = std::io::stdout().lock();
+    let printed = if found.is_empty() {
+        writeln!(out, "no V4L2 device: there is no /dev/video*")
+    } else {
+        found.iter().try_for_each(|(path, device)| match device {
+            Ok(device) => print(&mut out, &path.display().to_string(), device, args.all),
+            Err(error) => writeln!(out, "{}: {error}", path.display()),
+        })
+    };
+    printed.map_err(Failure::other)
+}
+
+fn print(out: &mut impl Write, path: &str, device: &Device, all: bool) -> std::io::Result<()> {
+    writeln!(out, "{path}: {} ({}, {})", device.card, device.driver, device.bus)?;
+    if !device.captures {
+        return writeln!(out, "  does not capture video by streaming");
+    }
+    let shown: Vec<_> = device.formats.iter().filter(|f| all || f.usable).collect();
+    for format in &shown {
+        let sizes: Vec<_> = format.sizes.iter().map(size).collect();
+        let sizes = match sizes.is_empty() {
+            true => "sizes not listed by the driver".to_owned(),
+            false => sizes.join(", "),
+        };
+        let usable = if format.usable { "" } else { " (cannot be a source)" };
+        writeln!(out, "  {:7} {sizes}{usable}  {}", format.name, format.description)?;
+    }
+    let hidden = device.formats.len() - shown.len();
+    match (shown.is_empty(), hidden) {
+        (_, 0) => Ok(()),
+        (true, n) => writeln!(
+            out,
+            "  no usable format (GREY, Y10, Y12, Y16, Y16_BE) among {n}; --all lists them"
+        ),
+        (false, n) => writeln!(out, "  and {n} formats that cannot be a source; --all lists them"),
+    }
+}
+
+fn size(size: &Sizes) -> String {
+    match size {
+        Sizes::One { width, height } => format!("{width}×{height}"),
+        Sizes::Range { min, max, step } => format!(
+            "{}×{} to {}×{} in steps of {}×{}",
+            min[0], min[1], max[0], max[1], step[0], step[1]
+        ),
+    }
 }

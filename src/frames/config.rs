@@ -12,6 +12,8 @@ pub struct Config {
     pub scene: Option<PathBuf>,
     /// V4L2: the device node.
     pub device: Option<PathBuf>,
+    /// V4L2: what to ask of the camera.
+    pub v4l2: super::v4l2::Config,
     /// Replay: the recording.
     pub frames: Option<PathBuf>,
     /// Replay: the time of frame 0. Frame k is at start + k/rate_hz whatever the speed.
@@ -49,6 +51,7 @@ impl Default for Config {
             kind: SourceKind::Simulator,
             scene: None,
             device: None,
+            v4l2: super::v4l2::Config::default(),
             frames: None,
             start: None,
             rate_hz: 10.0,

@@ -5,6 +5,7 @@ mod config;
 pub mod npy;
 mod replay;
 mod slot;
+pub mod v4l2;
 
 pub use capture::{Capture, Captured};
 pub use config::{Config, SourceKind};
@@ -67,6 +68,8 @@ pub enum Error {
     Missing { field: &'static str, kind: &'static str },
     #[error("source.kind = {kind:?} is not built yet")]
     NotBuilt { kind: &'static str },
+    #[error("optics.joules_per_count: needed for source.kind = \"v4l2\", whose frames are counts; found nothing")]
+    NoScale,
     #[error(transparent)]
     Npy(#[from] npy::Error),
 }
@@ -74,7 +77,7 @@ pub enum Error {
 impl Error {
     /// Whether the config is at fault, not what it points at.
     pub fn is_config(&self) -> bool {
-        matches!(self, Self::OutOfRange { .. } | Self::Missing { .. })
+        !matches!(self, Self::Npy(_))
     }
 }
 
@@ -82,7 +85,8 @@ impl Error {
 pub fn open(config: &Config, camera: &Camera) -> Result<Box<dyn FrameSource>, Error> {
     match config.kind {
         SourceKind::Replay => Ok(Box::new(Replay::open(config, camera.joules_per_count)?)),
-        SourceKind::Simulator | SourceKind::V4l2 => Err(Error::NotBuilt {
+        SourceKind::V4l2 => Ok(Box::new(v4l2::V4l2::new(config, camera)?)),
+        SourceKind::Simulator => Err(Error::NotBuilt {
             kind: config.kind.name(),
         }),
     }

@@ -222,7 +222,11 @@ impl Book {
         let stem = format!("{kind}-{}", now.strftime("%Y%m%dT%H%M%S%6fZ"));
         let taken = |id: &String| {
             let earlier = self.events.iter().map(|e| &e.alert.id);
-            self.open.values().map(|o| &o.alert.id).chain(earlier).any(|other| other == id)
+            self.open
+                .values()
+                .map(|o| &o.alert.id)
+                .chain(earlier)
+                .any(|other| other == id)
         };
         (0..)
             .map(|n| format!("{stem}-{n}"))

@@ -90,7 +90,8 @@ impl Motion {
 
 /// rᵀ S⁻¹ r; infinite when S is singular.
 pub(super) fn mahalanobis2(r: Vector2<f64>, s: Matrix2<f64>) -> f64 {
-    s.try_inverse().map_or(f64::INFINITY, |inverse| (r.transpose() * inverse * r)[0])
+    s.try_inverse()
+        .map_or(f64::INFINITY, |inverse| (r.transpose() * inverse * r)[0])
 }
 
 /// The larger eigenvalue of a symmetric 2 × 2 matrix.

@@ -14,7 +14,11 @@ pub(super) struct Thresholds {
 
 impl Thresholds {
     pub fn new(config: &Config, rate_hz: f64) -> Self {
-        let rate = if rate_hz.is_finite() { rate_hz.clamp(0.01, 1e4) } else { 10.0 };
+        let rate = if rate_hz.is_finite() {
+            rate_hz.clamp(0.01, 1e4)
+        } else {
+            10.0
+        };
         Self {
             tests_per_month: rate * MONTH_S,
             allowed: config.false_alerts_per_month / FAMILIES,

@@ -240,7 +240,9 @@ impl Tracks {
         let mut owner: Vec<Option<usize>> = vec![None; detections.len()];
         // Confirmed tracks choose first: a newcomer's wide gate must not take an old track's detection.
         for confirmed in [true, false] {
-            let rows: Vec<usize> = (0..self.all.len()).filter(|&i| self.all[i].confirmed == confirmed).collect();
+            let rows: Vec<usize> = (0..self.all.len())
+                .filter(|&i| self.all[i].confirmed == confirmed)
+                .collect();
             let columns: Vec<usize> = (0..detections.len()).filter(|&j| owner[j].is_none()).collect();
             let floor = Matrix2::identity() * GATE_FLOOR_M.powi(2);
             let matching = assign(rows.len(), columns.len(), GATE, |i, j| {
@@ -297,7 +299,8 @@ impl Track {
         match neighbour {
             Some(j) if self.confirmed => {
                 let d = &detections[j];
-                self.motion.update(d.position, d.cov + Matrix2::identity() * d.resolution_m.powi(2));
+                self.motion
+                    .update(d.position, d.cov + Matrix2::identity() * d.resolution_m.powi(2));
                 self.merged = true;
                 self.hit = false;
                 // Bounds a track that shadows another one: it lives a few times longer than one lost in the open.

@@ -275,9 +275,13 @@ impl Monitor {
         let book = &self.book;
         self.users.retain(|name, _| {
             present.contains(name.as_str())
-                || [AlertKind::PositionMismatch, AlertKind::UserUnseen, AlertKind::ClaimsStale]
-                    .iter()
-                    .any(|k| book.is_open(&Cause::User(*k, name.clone())))
+                || [
+                    AlertKind::PositionMismatch,
+                    AlertKind::UserUnseen,
+                    AlertKind::ClaimsStale,
+                ]
+                .iter()
+                .any(|k| book.is_open(&Cause::User(*k, name.clone())))
         });
     }
 
@@ -401,7 +405,11 @@ impl Monitor {
 
     fn unclaimed(&self, track: &Track, since: Timestamp, now: Timestamp) -> Finding {
         let lasted = seconds(since, now);
-        let severity = if lasted >= ESCALATE_S { Severity::Critical } else { Severity::Warning };
+        let severity = if lasted >= ESCALATE_S {
+            Severity::Critical
+        } else {
+            Severity::Warning
+        };
         let evidence = json!({
             "track": track.id,
             "seen_since": track.since,
@@ -430,7 +438,9 @@ impl Monitor {
         let level_unseen = self.thresholds.level(asserted.len() as f64);
         for (a, answer) in asserted.iter().zip(answers) {
             let name = a.claim.user.clone();
-            let Some(user) = self.users.get_mut(&name) else { continue };
+            let Some(user) = self.users.get_mut(&name) else {
+                continue;
+            };
             let mismatch = Cause::User(AlertKind::PositionMismatch, name.clone());
             let unseen = Cause::User(AlertKind::UserUnseen, name.clone());
             let track = answer.and_then(|id| self.tracks.get(id));
@@ -471,7 +481,9 @@ impl Monitor {
             }
             let Some(user) = self.users.get(&name) else { continue };
             let gone_s = user.unanswered_since.map_or(0.0, |t| seconds(t, now));
-            let claimed_since = user.unanswered_since.is_some_and(|t| a.claim.time > t || user.last_answered.is_none());
+            let claimed_since = user
+                .unanswered_since
+                .is_some_and(|t| a.claim.time > t || user.last_answered.is_none());
             let is_unseen = a.expected
                 && user.absence >= level_unseen
                 && gone_s >= self.config.decision_s
@@ -479,7 +491,11 @@ impl Monitor {
                 && self.claims_settled(now);
             let goes_on = self.book.is_open(&unseen) && a.expected && user.absence > 0.0;
             if is_unseen || goes_on {
-                let severity = if gone_s >= ESCALATE_S { Severity::Critical } else { Severity::Warning };
+                let severity = if gone_s >= ESCALATE_S {
+                    Severity::Critical
+                } else {
+                    Severity::Warning
+                };
                 let evidence = json!({
                     "unseen_s": gone_s,
                     "last_seen": user.last_answered,
@@ -525,14 +541,19 @@ impl Monitor {
         let limit = self.config.claims_stale_s.max(5.0 * period);
         match claims.quiet_s(now) {
             Some((came, made)) if came.max(made) > limit && self.expects_claims(asserted) => {
-                let severity = if came.max(made) > 6.0 * limit { Severity::Critical } else { Severity::Warning };
+                let severity = if came.max(made) > 6.0 * limit {
+                    Severity::Critical
+                } else {
+                    Severity::Warning
+                };
                 let evidence = json!({
                     "newest_came_s_ago": came,
                     "newest_made_s_ago": made,
                     "limit_s": limit,
                     "typical_period_s": period,
                 });
-                self.book.report(&stale, Finding::new(severity, evidence), now, self.frame);
+                self.book
+                    .report(&stale, Finding::new(severity, evidence), now, self.frame);
             }
             _ => self.book.absent(&stale, now),
         }
@@ -546,9 +567,11 @@ impl Monitor {
     fn report(&mut self, asserted: &[Asserted], frame: u64, now: Timestamp) -> Report {
         let events = self.book.take_events();
         let owner = |id: u64| {
-            asserted
-                .iter()
-                .find(|a| self.users.get(&a.claim.user).is_some_and(|u| u.track == Some(id) && u.unanswered_since.is_none()))
+            asserted.iter().find(|a| {
+                self.users
+                    .get(&a.claim.user)
+                    .is_some_and(|u| u.track == Some(id) && u.unanswered_since.is_none())
+            })
         };
         let emitters = self
             .tracks
@@ -582,7 +605,10 @@ impl Monitor {
             .collect();
         let unseen = asserted
             .iter()
-            .filter(|a| self.book.is_open(&Cause::User(AlertKind::UserUnseen, a.claim.user.clone())))
+            .filter(|a| {
+                self.book
+                    .is_open(&Cause::User(AlertKind::UserUnseen, a.claim.user.clone()))
+            })
             .map(|a| a.claim.user.clone())
             .collect();
         Report {

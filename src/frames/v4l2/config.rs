@@ -1,0 +1,53 @@
+use serde::{Deserialize, Serialize};
+
+use super::image::{PixelFormat, Region};
+
+/// `[source.v4l2]`: what to ask of the camera. What is left out stays as the driver has it.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Config {
+    /// "GREY", "Y10", "Y12", "Y16" or "Y16_BE"; the deepest on offer when left out.
+    pub pixel_format: Option<PixelFormat>,
+    /// [width, height] of the camera's image.
+    pub size: Option<[u32; 2]>,
+    /// [x, y, width, height] of the part that is the photodetector array, in camera pixels; the whole image when
+    /// left out. Its size must be a whole multiple of `optics.pixels`: blocks of camera pixels are summed.
+    pub roi: Option<[usize; 4]>,
+    /// Mirror x, for a camera whose first column is x_max.
+    pub flip_x: bool,
+    /// Mirror y, for a camera whose first row is y_max.
+    pub flip_y: bool,
+    /// Exposure time; automatic exposure is switched off.
+    pub exposure_us: Option<f64>,
+    /// Gain in the driver's own unit; automatic gain is switched off.
+    pub gain: Option<i64>,
+    /// A camera pixel at or above this count is saturated; the format's largest count when left out.
+    pub saturation_counts: Option<u16>,
+    /// Frames to pass over after each start, while the settings take hold.
+    pub settle_frames: u32,
+    /// Without a usable frame for this long, the device is opened anew.
+    pub stall_s: f64,
+}
+
+impl Config {
+    pub(super) fn region(&self) -> Option<Region> {
+        self.roi.map(|[x, y, width, height]| Region { x, y, width, height })
+    }
+}
+
+impl Default for Config {
+    fn default() -> Self {
+        Self {
+            pixel_format: None,
+            size: None,
+            roi: None,
+            flip_x: false,
+            flip_y: false,
+            exposure_us: None,
+            gain: None,
+            saturation_counts: None,
+            settle_frames: 2,
+            stall_s: 3.0,
+        }
+    }
+}

@@ -1,0 +1,61 @@
+//! What is plugged in.
+
+use std::io;
+use std::path::{Path, PathBuf};
+
+use super::image::{PixelFormat, fourcc_name};
+use super::sys::{Node, Sizes};
+
+/// A V4L2 node and what it offers.
+#[derive(Clone, Debug)]
+pub struct Device {
+    pub card: String,
+    pub driver: String,
+    pub bus: String,
+    /// Whether it can be a source at all: captures video, by streaming.
+    pub captures: bool,
+    pub formats: Vec<DeviceFormat>,
+}
+
+/// A pixel format on offer.
+#[derive(Clone, Debug)]
+pub struct DeviceFormat {
+    pub name: String,
+    pub description: String,
+    /// Whether `source.v4l2.pixel_format` can name it.
+    pub usable: bool,
+    pub sizes: Vec<Sizes>,
+}
+
+/// Every video node, in the order of their numbers, with what it offers or why it cannot be asked.
+pub fn devices() -> io::Result<Vec<(PathBuf, io::Result<Device>)>> {
+    let mut nodes: Vec<(u32, PathBuf)> = std::fs::read_dir("/dev")?
+        .filter_map(Result::ok)
+        .filter_map(|entry| {
+            let number = entry.file_name().to_str()?.strip_prefix("video")?.parse().ok()?;
+            Some((number, entry.path()))
+        })
+        .collect();
+    nodes.sort();
+    Ok(nodes.into_iter().map(|(_, path)| (path.clone(), ask(&path))).collect())
+}
+
+fn ask(path: &Path) -> io::Result<Device> {
+    let node = Node::open(path)?;
+    let capability = node.capability().clone();
+    let captures = capability.captures && capability.streams;
+    let offered = if captures { node.formats() } else { Vec::new() };
+    let formats = offered.into_iter().map(|offered| DeviceFormat {
+        name: fourcc_name(offered.fourcc),
+        description: offered.description,
+        usable: PixelFormat::from_fourcc(offered.fourcc).is_some(),
+        sizes: node.sizes(offered.fourcc),
+    });
+    Ok(Device {
+        captures,
+        formats: formats.collect(),
+        card: capability.card,
+        driver: capability.driver,
+        bus: capability.bus,
+    })
+}

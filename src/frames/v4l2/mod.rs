@@ -1,0 +1,302 @@
+//! A V4L2 device as a source that never gives up: whatever breaks, it is counted, the device is opened anew
+//! with back-off, and the monitor hears once a second that there is nothing to see.
+
+mod clock;
+mod config;
+mod devices;
+mod faults;
+mod image;
+mod session;
+mod sys;
+
+pub use config::Config;
+pub use devices::{Device, DeviceFormat, devices};
+pub use image::{Granted, Layout, LayoutError, PixelFormat, Region, to_joules};
+pub use sys::Sizes;
+
+use std::path::PathBuf;
+use std::time::{Duration, Instant};
+
+use jiff::{SignedDuration, Timestamp};
+use v4l::v4l_sys::V4L2_BUF_FLAG_ERROR;
+
+use super::{Error, FrameSource, Next};
+use crate::frame::Frame;
+use crate::optics::Camera;
+use clock::{Moment, Numbering, Stamped, exposed, is_monotonic};
+use faults::{Fault, Faults};
+use session::Session;
+use sys::{Format, Meta};
+
+/// Without a frame for this long (two intervals of a slower device), the monitor is told; and again after as
+/// long.
+const SILENCE: Duration = Duration::from_secs(1);
+const SHORTEST_RETRY: Duration = Duration::from_millis(20);
+const LONGEST_RETRY: Duration = Duration::from_secs(2);
+/// A clock set back by more than this is a clock that was wrong; by less, jitter.
+const CLOCK_STEP: SignedDuration = SignedDuration::from_secs(1);
+
+/// Frames of a V4L2 capture device.
+pub struct V4l2 {
+    device: PathBuf,
+    config: Config,
+    rate_hz: f64,
+    silence: Duration,
+    stall: Duration,
+    shape: (usize, usize),
+    joules_per_count: f64,
+    saturation_j: Option<f64>,
+    state: State,
+    faults: Faults,
+    numbering: Numbering,
+    last_format: Option<Format>,
+    last_time: Option<Timestamp>,
+    last_usable: Instant,
+    last_told: Instant,
+    retry: Duration,
+    /// Why there is nothing to see, for the monitor.
+    trouble: String,
+}
+
+enum State {
+    Closed { retry_at: Instant },
+    Open { session: Session, settling: u32 },
+}
+
+impl V4l2 {
+    /// Checks the config. The device itself is opened by the first wait, and waited for while it is not there.
+    pub fn new(source: &super::Config, camera: &Camera) -> Result<Self, Error> {
+        let missing = |field| Error::Missing { field, kind: "v4l2" };
+        let positive = |field, found: f64| match found.is_finite() && found > 0.0 {
+            true => Ok(found),
+            false => Err(Error::OutOfRange {
+                field,
+                expected: "a positive finite number",
+                found,
+            }),
+        };
+        let device = source.device.clone().ok_or(missing("device"))?;
+        let config = source.v4l2.clone();
+        let rate_hz = positive("rate_hz", source.rate_hz)?;
+        let seconds = |s: f64| Duration::try_from_secs_f64(s).unwrap_or(Duration::MAX);
+        let stall_s = positive("v4l2.stall_s", config.stall_s)?;
+        if let Some(exposure) = config.exposure_us {
+            positive("v4l2.exposure_us", exposure)?;
+        }
+        let now = Instant::now();
+        Ok(Self {
+            faults: Faults::new(device.display().to_string()),
+            trouble: format!("{} was not opened yet", device.display()),
+            device,
+            config,
+            rate_hz,
+            silence: SILENCE.max(seconds(2.0 / rate_hz)),
+            stall: seconds(stall_s.max(3.0 / rate_hz)),
+            shape: camera.shape(),
+            joules_per_count: camera.joules_per_count.ok_or(Error::NoScale)?,
+            saturation_j: camera.saturation_j,
+            state: State::Closed { retry_at: now },
+            numbering: Numbering::default(),
+            last_format: None,
+            last_time: None,
+            last_usable: now,
+            last_told: now,
+            retry: SHORTEST_RETRY,
+        })
+    }
+
+    fn close(&mut self, fault: Fault, why: impl std::fmt::Display) {
+        self.trouble = why.to_string();
+        self.faults.count(fault, why);
+        metrics::gauge!("oapwatch_source_connected").set(0.0);
+        self.state = State::Closed {
+            retry_at: Instant::now() + self.retry,
+        };
+        self.retry = (self.retry * 2).min(LONGEST_RETRY);
+    }
+
+    fn open(&mut self) {
+        match Session::start(&self.device, &self.config, self.rate_hz, self.shape, &mut self.faults) {
+            Ok(session) => {
+                let format = session.granted();
+                if let Some(before) = self.last_format.replace(format).filter(|before| *before != format) {
+                    self.faults
+                        .count(Fault::FormatChanged, format_args!("from {before:?} to {format:?}"));
+                }
+                self.numbering.restart();
+                self.last_usable = Instant::now();
+                metrics::counter!("oapwatch_source_opened_total").increment(1);
+                metrics::gauge!("oapwatch_source_connected").set(1.0);
+                let settling = self.config.settle_frames;
+                self.state = State::Open { session, settling };
+            }
+            Err(error) => self.close(error.fault(), error),
+        }
+    }
+
+    /// One step: something to give, or nothing after at most `patience`.
+    fn step(&mut self, patience: Duration) -> Option<Next> {
+        let (session, settling) = match &mut self.state {
+            State::Closed { retry_at } => {
+                let left = retry_at.saturating_duration_since(Instant::now());
+                if left.is_zero() {
+                    self.open();
+                } else {
+                    std::thread::sleep(left.min(patience));
+                }
+                return None;
+            }
+            State::Open { session, settling } => (session, settling),
+        };
+        if self.last_usable.elapsed() > self.stall {
+            let silent = self.last_usable.elapsed().as_secs_f64();
+            self.close(Fault::Stalled, format_args!("no usable frame for {silent:.1} s"));
+            return None;
+        }
+        match session.wait(patience) {
+            Ok(true) => {}
+            Ok(false) => return None,
+            Err(error) if error.kind() == std::io::ErrorKind::Interrupted => {
+                self.faults.count(Fault::Interrupted, "a signal interrupted the wait");
+                return None;
+            }
+            Err(error) => {
+                self.close(Fault::of(&error), format_args!("poll: {error}"));
+                return None;
+            }
+        }
+        let layout = session.layout();
+        let (started, exposure) = (session.started(), session.exposure());
+        let taken = session.next(|image, meta| (layout.decode(image), image.len(), *meta));
+        match taken {
+            Ok(Some((decoded, length, meta))) => {
+                let stale = is_monotonic(meta.flags) && meta.timestamp < started.monotonic;
+                if stale || *settling > 0 {
+                    *settling = settling.saturating_sub(1);
+                    self.numbering.number(meta.sequence);
+                    if stale {
+                        self.faults
+                            .count(Fault::StaleFrame, "a frame from before the stream was started");
+                    }
+                    return None;
+                }
+                Some(self.take(decoded, length, layout.bytes_needed(), meta, exposure))
+            }
+            // Readable without a buffer is how a stream says that it is in error; the next dequeue tells more.
+            Ok(None) => {
+                std::thread::sleep(Duration::from_millis(1).min(patience));
+                None
+            }
+            Err(error) if error.kind() == std::io::ErrorKind::Interrupted => {
+                self.faults.count(Fault::Interrupted, "a signal interrupted a dequeue");
+                None
+            }
+            Err(error) => {
+                self.close(Fault::of(&error), format_args!("dequeue: {error}"));
+                None
+            }
+        }
+    }
+
+    fn take(
+        &mut self,
+        decoded: Option<(ndarray::Array2<f64>, Option<ndarray::Array2<bool>>)>,
+        length: usize,
+        needed: usize,
+        meta: Meta,
+        exposure: Duration,
+    ) -> Next {
+        let (index, lost) = self.numbering.number(meta.sequence);
+        if lost > 0 {
+            metrics::counter!("oapwatch_source_frames_lost_total").increment(lost);
+            self.faults.count(
+                Fault::SequenceGap,
+                format_args!("{lost} frames lost before frame {index}"),
+            );
+        }
+        let time = self.time(&meta, exposure);
+        let flagged = meta.flags & V4L2_BUF_FLAG_ERROR != 0;
+        let (mut pixels, saturated) = match decoded {
+            Some(decoded) if !flagged => decoded,
+            _ => {
+                let (fault, reason) = match flagged {
+                    true => (Fault::ErrorFlag, format!("the driver flags frame {index} as corrupt")),
+                    false => (
+                        Fault::ShortFrame,
+                        format!("frame {index} has {length} bytes, expected {needed}"),
+                    ),
+                };
+                self.faults.count(fault, &reason);
+                self.last_told = Instant::now();
+                return Next::Unusable { index, time, reason };
+            }
+        };
+        let masked = to_joules(&mut pixels, saturated, self.joules_per_count, self.saturation_j);
+        self.last_usable = Instant::now();
+        self.last_told = self.last_usable;
+        self.retry = SHORTEST_RETRY;
+        let frame = Frame {
+            index,
+            time,
+            pixels,
+            masked,
+        };
+        Next::Frame(frame, Vec::new())
+    }
+
+    /// The frame's time, which grows from frame to frame unless the clock itself was set back.
+    fn time(&mut self, meta: &Meta, exposure: Duration) -> Timestamp {
+        let Stamped { mut time, fault } = exposed(meta.flags, meta.timestamp, exposure, Moment::now());
+        if let Some(fault) = fault {
+            self.faults.count(
+                fault,
+                format_args!(
+                    "stamp {:?}, flags {:#x}: the time of arrival is used",
+                    meta.timestamp, meta.flags
+                ),
+            );
+        }
+        if let Some(last) = self.last_time.filter(|last| time <= *last) {
+            let back = last.duration_since(time);
+            self.faults.count(
+                Fault::TimestampBackwards,
+                format_args!("{back:#} before the last frame"),
+            );
+            if back < CLOCK_STEP {
+                time = last.checked_add(SignedDuration::from_micros(1)).unwrap_or(last);
+            }
+        }
+        self.last_time = Some(time);
+        time
+    }
+}
+
+impl FrameSource for V4l2 {
+    fn next(&mut self, patience: Duration) -> Next {
+        let deadline = Instant::now() + patience;
+        loop {
+            let left = deadline.saturating_duration_since(Instant::now());
+            if let Some(next) = self.step(left) {
+                return next;
+            }
+            if self.last_told.elapsed() >= self.silence {
+                self.last_told = Instant::now();
+                let silent = self.last_usable.elapsed().as_secs_f64();
+                let reason = match self.state {
+                    State::Open { .. } => format!("no frame for {silent:.0} s"),
+                    State::Closed { .. } => format!("no device: {}", self.trouble),
+                };
+                let time = Timestamp::now();
+                self.last_time = Some(time);
+                return Next::Unusable {
+                    index: self.numbering.next(),
+                    time,
+                    reason,
+                };
+            }
+            if left.is_zero() {
+                return Next::Nothing;
+            }
+        }
+    }
+}
