@@ -1,11 +1,22 @@
 //! Floor 1: one frame → emitters with covariance. Uses `optics`, never `scene` (the simulator stays an
 //! independent judge) and never claims (an attacker writes those).
 
+mod basis;
 mod config;
 mod emitter;
+mod fit;
+mod ground;
+mod heatmap;
+mod ladder;
+mod linear;
+mod reading;
+mod screen;
+mod search;
+mod spot;
 
 pub use config::Config;
 pub use emitter::{Emitter, Estimate, Flags};
+pub use ladder::{ConfigError, DEFAULT, LADDER, Rung, build, rung};
 
 use crate::frame::Frame;
 

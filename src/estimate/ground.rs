@@ -1,0 +1,96 @@
+//! From a fitted model to positions on the ground, each with its covariance and flags.
+
+use super::fit::Model;
+use super::reading::Reading;
+use super::screen::Screened;
+use super::search::Search;
+use super::{Emitter, Estimate, Flags};
+use crate::optics::Camera;
+
+/// Unusable pixels this near, σ, are told to the reader.
+const NEAR: f64 = 3.0;
+/// From the edge, σ.
+const EDGE: f64 = 2.0;
+/// Two emitters this many standard deviations of their difference apart are two.
+const RESOLVED: f64 = 3.0;
+
+/// Turns `model` into what the frame holds.
+pub(super) fn locate(
+    search: &mut Search,
+    reading: &Reading,
+    model: &mut Model,
+    frame: &Screened,
+    camera: &Camera,
+    rung: &'static str,
+) -> Estimate {
+    let n = model.spots.len();
+    let p = model.parameters();
+    search.fitter.information(reading, model);
+    let freedom = (reading.numbers - p as f64).max(1.0);
+    let reduced_chi2 = model.deviance / freedom;
+    let is_poor = model.deviance > freedom + 5.0 * (2.0 * freedom).sqrt() + 5.0;
+    // A misfit widens the claim: the covariance speaks for what was found, not for what was hoped.
+    let inflation = if is_poor { reduced_chi2 } else { 1.0 };
+    let (bx, by) = (&search.fitter.bx, &search.fitter.by);
+    let (low, high) = ([bx.edges[0], by.edges[0]], [bx.edges[bx.n], by.edges[by.n]]);
+    let pitch = [bx.pitch(), by.pitch()];
+    let extent = (high[0] - low[0]).max(high[1] - low[1]);
+    let mut cov = Vec::new();
+    let is_regular = search.fitter.covariance(p, n, 12.0 / (extent * extent), &mut cov);
+    let block = |i: usize, j: usize| {
+        if is_regular {
+            [0, 1].map(|r| [0, 1].map(|c| cov[(3 * i + r) * p + 3 * j + c]))
+        } else {
+            let v = if i == j { extent * extent / 12.0 } else { 0.0 };
+            [[v, 0.0], [0.0, v]]
+        }
+    };
+    let sigma = camera.spot_sigma_m;
+    let emitters = (0..n)
+        .map(|i| {
+            let spot = model.spots[i];
+            let mut flags = Flags::empty();
+            flags.set(Flags::NO_CONVERGENCE, !model.converged);
+            flags.set(Flags::POOR_FIT, is_poor);
+            let near_edge = (0..2).any(|k| spot.u[k] < low[k] + EDGE || spot.u[k] > high[k] - EDGE);
+            flags.set(Flags::NEAR_EDGE, near_edge);
+            for bad in &frame.bad {
+                let centre = [bad.x, bad.y].map(|k| k as f64 + 0.5);
+                let d2: f64 = (0..2).map(|k| (low[k] + centre[k] * pitch[k] - spot.u[k]).powi(2)).sum();
+                if d2 < NEAR * NEAR {
+                    flags |= if bad.is_saturated { Flags::SATURATED } else { Flags::MASKED };
+                }
+            }
+            let own = block(i, i);
+            let is_merged = !is_regular
+                || (0..n).filter(|&j| j != i).any(|j| {
+                    let d = [0, 1].map(|k| spot.u[k] - model.spots[j].u[k]);
+                    let (other, cross) = (block(j, j), block(i, j));
+                    let s = [0, 1].map(|r| [0, 1].map(|c| own[r][c] + other[r][c] - cross[r][c] - cross[c][r]));
+                    let along: f64 = (0..2).map(|r| (0..2).map(|c| d[r] * s[r][c] * d[c]).sum::<f64>()).sum();
+                    let d2 = d[0] * d[0] + d[1] * d[1];
+                    d2 * d2 < RESOLVED * RESOLVED * inflation * along
+                });
+            flags.set(Flags::UNRESOLVED, is_merged);
+            let sensor_m = spot.u.map(|u| u * sigma);
+            let scale = sigma * sigma * inflation;
+            let [x_m, y_m] = camera.to_ground(sensor_m);
+            let energy_variance = if is_regular { cov[(3 * i + 2) * p + 3 * i + 2] } else { spot.a * spot.a };
+            Emitter {
+                x_m,
+                y_m,
+                cov_m2: camera.cov_to_ground(sensor_m, own.map(|r| r.map(|c| c * scale))),
+                energy_j: spot.a * camera.noise_std_j,
+                energy_std_j: (energy_variance * inflation).max(0.0).sqrt() * camera.noise_std_j,
+                sensor_m,
+                flags,
+            }
+        })
+        .collect();
+    Estimate {
+        emitters,
+        rung,
+        reduced_chi2,
+        saturated_share: frame.saturated as f64 / frame.pixels.len() as f64,
+    }
+}

@@ -1,0 +1,167 @@
+//! The analytic heatmap and its maxima: a matched filter on a fine grid, non-maximum suppression, sub-pixel peaks.
+
+use super::basis::Basis;
+use super::linear::{axpy, dot};
+
+/// Grid spacing, σ: a spot half-way between grid points loses 3 % of its response.
+const SPACING: f64 = 0.5;
+
+/// A maximum of the heatmap.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Peak {
+    /// Sub-pixel position, σ.
+    pub u: [f64; 2],
+    /// The grid point it stands on.
+    pub grid: [f64; 2],
+    /// Matched-filter response over its standard deviation.
+    pub significance: f64,
+    /// Energy a lone spot would have there, in units of the noise.
+    pub a: f64,
+}
+
+/// The matched filter: unit-norm spots on a grid, in the bases.
+pub(super) struct Heatmap {
+    grid: [Vec<f64>; 2],
+    /// (grid, stride), each row of unit norm over the full basis.
+    templates: [Vec<f64>; 2],
+    norms: [Vec<f64>; 2],
+    strides: [usize; 2],
+    /// Response over its standard deviation, (grid y, grid x).
+    map: Vec<f64>,
+    strip: Vec<f64>,
+    peaks: Vec<Peak>,
+}
+
+impl Heatmap {
+    pub fn new(bx: &Basis, by: &Basis) -> Self {
+        let axis = |b: &Basis| {
+            // Centres up to half a σ outside; beyond that only a fit can tell.
+            let (lo, hi) = (b.edges[0] - SPACING, b.edges[b.n] + SPACING);
+            let count = ((hi - lo) / SPACING).ceil() as usize + 1;
+            let grid: Vec<f64> = (0..count).map(|k| lo + (hi - lo) * k as f64 / (count - 1) as f64).collect();
+            let mut templates = vec![0.0; count * b.stride];
+            let mut norms = Vec::with_capacity(count);
+            let (mut scratch, mut atom) = (vec![0.0; 3 * b.n], vec![0.0; 3 * b.stride]);
+            for (k, row) in templates.chunks_exact_mut(b.stride).enumerate() {
+                b.atom(grid[k], 1.0, b.stride, &mut scratch, &mut atom);
+                let norm = dot(&atom[..b.stride], &atom[..b.stride]).sqrt().max(1e-12);
+                for (t, a) in row.iter_mut().zip(&atom) {
+                    *t = a / norm;
+                }
+                norms.push(norm);
+            }
+            (grid, templates, norms)
+        };
+        let ((gx, tx, wx), (gy, ty, wy)) = (axis(bx), axis(by));
+        Self {
+            grid: [gx, gy],
+            templates: [tx, ty],
+            norms: [wx, wy],
+            strides: [bx.stride, by.stride],
+            map: Vec::new(),
+            strip: Vec::new(),
+            peaks: Vec::new(),
+        }
+    }
+
+    /// Peaks of `residual` (my, mx) of at least `threshold` standard deviations, no two nearer than `radius` σ,
+    /// strongest first.
+    pub fn peaks(&mut self, residual: &[f64], mx: usize, my: usize, threshold: f64, radius: f64) -> &[Peak] {
+        pulp::Arch::new().dispatch(Filter {
+            heatmap: self,
+            residual,
+            mx,
+            my,
+        });
+        self.find(threshold, radius);
+        &self.peaks
+    }
+
+    #[inline(always)]
+    fn filter(&mut self, residual: &[f64], mx: usize, my: usize) {
+        let (nx, ny) = (self.grid[0].len(), self.grid[1].len());
+        self.map.resize(nx * ny, 0.0);
+        self.strip.resize(mx, 0.0);
+        for (row, out) in self.templates[1].chunks_exact(self.strides[1]).zip(self.map.chunks_exact_mut(nx)) {
+            self.strip.fill(0.0);
+            for c in 0..my {
+                if row[c] != 0.0 {
+                    axpy(row[c], &residual[c * mx..(c + 1) * mx], &mut self.strip);
+                }
+            }
+            for (o, column) in out.iter_mut().zip(self.templates[0].chunks_exact(self.strides[0])) {
+                *o = dot(&self.strip, &column[..mx]);
+            }
+        }
+    }
+
+    fn find(&mut self, threshold: f64, radius: f64) {
+        let (nx, ny) = (self.grid[0].len(), self.grid[1].len());
+        self.peaks.clear();
+        let at = |i: usize, j: usize| self.map[j * nx + i];
+        for j in 0..ny {
+            for i in 0..nx {
+                let value = at(i, j);
+                if value < threshold {
+                    continue;
+                }
+                let mut is_peak = true;
+                for b in j.saturating_sub(1)..=(j + 1).min(ny - 1) {
+                    for a in i.saturating_sub(1)..=(i + 1).min(nx - 1) {
+                        is_peak &= (a, b) == (i, j) || at(a, b) < value || (at(a, b) == value && (b, a) > (j, i));
+                    }
+                }
+                if !is_peak {
+                    continue;
+                }
+                let vertex = |lo: Option<f64>, hi: Option<f64>| match (lo, hi) {
+                    (Some(lo), Some(hi)) if lo + hi - 2.0 * value < 0.0 => {
+                        (0.5 * (lo - hi) / (lo + hi - 2.0 * value)).clamp(-0.5, 0.5)
+                    }
+                    _ => 0.0,
+                };
+                let dx = vertex(i.checked_sub(1).map(|a| at(a, j)), (i + 1 < nx).then(|| at(i + 1, j)));
+                let dy = vertex(j.checked_sub(1).map(|b| at(i, b)), (j + 1 < ny).then(|| at(i, j + 1)));
+                let step = |g: &[f64]| g[1] - g[0];
+                self.peaks.push(Peak {
+                    u: [
+                        self.grid[0][i] + dx * step(&self.grid[0]),
+                        self.grid[1][j] + dy * step(&self.grid[1]),
+                    ],
+                    grid: [self.grid[0][i], self.grid[1][j]],
+                    significance: value,
+                    a: value / (self.norms[0][i] * self.norms[1][j]),
+                });
+            }
+        }
+        self.peaks.sort_by(|a, b| b.significance.total_cmp(&a.significance));
+        let mut kept = 0;
+        for k in 0..self.peaks.len() {
+            let peak = self.peaks[k];
+            let is_alone = self.peaks[..kept].iter().all(|p| {
+                (p.u[0] - peak.u[0]).powi(2) + (p.u[1] - peak.u[1]).powi(2) >= radius * radius
+            });
+            if is_alone {
+                self.peaks[kept] = peak;
+                kept += 1;
+            }
+        }
+        self.peaks.truncate(kept);
+    }
+}
+
+struct Filter<'a> {
+    heatmap: &'a mut Heatmap,
+    residual: &'a [f64],
+    mx: usize,
+    my: usize,
+}
+
+impl pulp::NullaryFnOnce for Filter<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn call(self) {
+        self.heatmap.filter(self.residual, self.mx, self.my);
+    }
+}

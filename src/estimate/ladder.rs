@@ -1,0 +1,144 @@
+//! The ladder of estimators: what each rung does, and building one from a config.
+
+use super::basis::Basis;
+use super::fit::{Fitter, Model, Nuisances};
+use super::reading::Reading;
+use super::screen::Screened;
+use super::search::Search;
+use super::{Config, Error, Estimate, Estimator, ground};
+use crate::frame::Frame;
+use crate::optics::Camera;
+
+/// A rung of the ladder.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Rung {
+    /// What `[estimator] name` selects it by.
+    pub name: &'static str,
+    pub summary: &'static str,
+    method: Method,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Method {
+    Peak { is_subpixel: bool },
+    Greedy,
+}
+
+/// Every rung offered, cheapest first.
+pub const LADDER: &[Rung] = &[
+    Rung {
+        name: "peak",
+        summary: "maxima of the matched filter on its grid, after non-maximum suppression",
+        method: Method::Peak { is_subpixel: false },
+    },
+    Rung {
+        name: "subpixel-peak",
+        summary: "the same with a parabola through each maximum",
+        method: Method::Peak { is_subpixel: true },
+    },
+    Rung {
+        name: "greedy-fit",
+        summary: "residual peaks added one round at a time, all emitters refitted jointly",
+        method: Method::Greedy,
+    },
+];
+
+/// The rung used when none is named.
+pub const DEFAULT: &str = "greedy-fit";
+
+/// Why an `[estimator]` table describes no estimator.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum ConfigError {
+    #[error("estimator.name: no estimator {found:?}; did you mean {nearest:?}? There are {}", names())]
+    UnknownName { found: String, nearest: &'static str },
+    #[error("estimator.{field}: expected {expected}, found {found}")]
+    OutOfRange {
+        field: &'static str,
+        expected: &'static str,
+        found: f64,
+    },
+}
+
+fn names() -> String {
+    LADDER.iter().map(|r| r.name).collect::<Vec<_>>().join(", ")
+}
+
+/// The rung of that name.
+pub fn rung(name: &str) -> Result<&'static Rung, ConfigError> {
+    LADDER.iter().find(|r| r.name == name).ok_or_else(|| ConfigError::UnknownName {
+        found: name.to_owned(),
+        nearest: LADDER
+            .iter()
+            .map(|r| r.name)
+            .max_by(|a, b| strsim::jaro_winkler(name, a).total_cmp(&strsim::jaro_winkler(name, b)))
+            .unwrap_or(DEFAULT),
+    })
+}
+
+/// Builds the configured estimator for a camera.
+pub fn build(config: &Config, camera: &Camera) -> Result<Box<dyn Estimator>, ConfigError> {
+    let rung = rung(config.name.as_deref().unwrap_or(DEFAULT))?;
+    if let Some(budget) = config.budget_ms
+        && !(budget.is_finite() && budget > 0.0)
+    {
+        return Err(ConfigError::OutOfRange {
+            field: "budget_ms",
+            expected: "a positive finite number",
+            found: budget,
+        });
+    }
+    Ok(Box::new(Analytic::new(rung, camera)))
+}
+
+/// A rung without a learned part.
+struct Analytic {
+    rung: &'static Rung,
+    camera: Camera,
+    frame: Screened,
+    reading: Reading,
+    search: Search,
+}
+
+impl Analytic {
+    fn new(rung: &'static Rung, camera: &Camera) -> Self {
+        let bx = Basis::new(&camera.x, camera.spot_sigma_m);
+        let by = Basis::new(&camera.y, camera.spot_sigma_m);
+        Self {
+            rung,
+            camera: camera.clone(),
+            frame: Screened::default(),
+            reading: Reading::default(),
+            search: Search::new(Fitter::new(bx, by)),
+        }
+    }
+}
+
+impl Estimator for Analytic {
+    fn name(&self) -> &'static str {
+        self.rung.name
+    }
+
+    fn estimate(&mut self, frame: &Frame) -> Result<Estimate, Error> {
+        self.frame.load(frame, &self.camera)?;
+        let Self { search, reading, .. } = self;
+        reading.load(&self.frame, &search.fitter.bx, &search.fitter.by);
+        let nuisances = Nuisances::default();
+        let mut model = match self.rung.method {
+            Method::Peak { is_subpixel } => search.peaks(reading, is_subpixel),
+            Method::Greedy => search.greedy(reading, nuisances, 40),
+        };
+        Ok(ground::locate(search, reading, &mut model, &self.frame, &self.camera, self.rung.name))
+    }
+}
+
+impl Search {
+    fn peaks(&mut self, reading: &Reading, is_subpixel: bool) -> Model {
+        let mut model = Model::empty(Nuisances::default());
+        let peaks = self.heatmap.peaks(&reading.z, reading.mx, reading.my, self.price.sqrt(), 1.0);
+        model.spots.extend(peaks.iter().map(|p| super::fit::Spot {
+            u: if is_subpixel { p.u } else { p.grid },
+            a: p.a,
+        }));
+        model
+    }
+}

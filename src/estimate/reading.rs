@@ -1,0 +1,112 @@
+//! A frame in the two bases, ready to be fitted.
+
+use super::basis::Basis;
+use super::screen::Screened;
+
+/// What a frame may leave outside the basis, in units of the noise.
+const LOSS: f64 = 0.02;
+
+/// Coefficients of a screened frame and what the rest of it says about the noise.
+#[derive(Default)]
+pub(super) struct Reading {
+    /// Columns in use along each axis, and their next multiples of 4.
+    pub rank: [usize; 2],
+    pub mx: usize,
+    pub my: usize,
+    /// (my, mx) row-major.
+    pub z: Vec<f64>,
+    pub bad: Vec<BadPixel>,
+    /// Numbers that the fit explains: coefficients less what unusable pixels take away.
+    pub numbers: f64,
+    /// Mean square of what lies outside the basis, and how many numbers that is.
+    pub outside: (f64, f64),
+    rows: Vec<f64>,
+}
+
+/// An unusable pixel with the value it was filled with, which the fit takes out again exactly.
+#[derive(Clone, Copy)]
+pub(super) struct BadPixel {
+    pub x: usize,
+    pub y: usize,
+    pub value: f64,
+}
+
+impl Reading {
+    /// Compresses `frame`, Z = Uᵧᵀ Y Uₓ.
+    pub fn load(&mut self, frame: &Screened, bx: &Basis, by: &Basis) {
+        let (nx, ny) = (bx.n, by.n);
+        let brightest = frame.pixels.iter().fold(1.0f64, |a, &p| a.max(p));
+        // The brightest pixel bounds every amplitude: A ≤ peak / (largest pixel fraction)².
+        let fraction = |b: &Basis| (b.pitch() / (2.0 * std::f64::consts::PI).sqrt()).min(1.0);
+        let amplitude = brightest / (fraction(bx) * fraction(by));
+        let norm = |b: &Basis| (b.pitch() / (2.0 * std::f64::consts::PI.sqrt())).sqrt().min(1.0);
+        self.rank = [
+            bx.rank(LOSS / (amplitude * norm(by))),
+            by.rank(LOSS / (amplitude * norm(bx))),
+        ];
+        self.mx = self.rank[0].next_multiple_of(4).min(bx.stride);
+        self.my = self.rank[1].next_multiple_of(4).min(by.stride);
+        // Columns up to the multiple of 4 are there anyway: use them.
+        self.rank = [self.mx.min(bx.columns()), self.my.min(by.columns())];
+        let (mx, my) = (self.mx, self.my);
+        self.rows.clear();
+        self.rows.resize(ny * mx, 0.0);
+        for y in 0..ny {
+            let out = &mut self.rows[y * mx..(y + 1) * mx];
+            for (x, &p) in frame.pixels[y * nx..(y + 1) * nx].iter().enumerate() {
+                for (o, u) in out.iter_mut().zip(bx.row(x)) {
+                    *o += p * u;
+                }
+            }
+        }
+        self.z.clear();
+        self.z.resize(my * mx, 0.0);
+        for y in 0..ny {
+            let row = &self.rows[y * mx..(y + 1) * mx];
+            for (c, &u) in by.row(y)[..my].iter().enumerate() {
+                if u != 0.0 {
+                    for (z, r) in self.z[c * mx..(c + 1) * mx].iter_mut().zip(row) {
+                        *z += u * r;
+                    }
+                }
+            }
+        }
+        self.bad.clear();
+        self.bad.extend(frame.bad.iter().map(|b| BadPixel {
+            x: b.x,
+            y: b.y,
+            value: frame.pixels[b.y * nx + b.x],
+        }));
+        let leverage: f64 = self
+            .bad
+            .iter()
+            .map(|b| square(&bx.row(b.x)[..mx]) * square(&by.row(b.y)[..my]))
+            .sum();
+        let inside = (self.rank[0] * self.rank[1]) as f64;
+        self.numbers = inside - leverage;
+        let left = (nx * ny) as f64 - inside - (self.bad.len() as f64 - leverage);
+        self.outside = (0.0, left.max(0.0));
+    }
+
+    /// Fills `out` (Ny, Nx) with what the basis holds of the frame, Uᵧ Z Uₓᵀ.
+    pub fn expand(&mut self, bx: &Basis, by: &Basis, out: &mut Vec<f64>) {
+        let (mx, my) = (self.mx, self.my);
+        out.clear();
+        out.resize(bx.n * by.n, 0.0);
+        for y in 0..by.n {
+            let mut row = vec![0.0; mx];
+            for (c, &u) in by.row(y)[..my].iter().enumerate() {
+                for (r, z) in row.iter_mut().zip(&self.z[c * mx..(c + 1) * mx]) {
+                    *r += u * z;
+                }
+            }
+            for x in 0..bx.n {
+                out[y * bx.n + x] = row.iter().zip(bx.row(x)).map(|(r, u)| r * u).sum();
+            }
+        }
+    }
+}
+
+fn square(v: &[f64]) -> f64 {
+    v.iter().map(|a| a * a).sum()
+}
