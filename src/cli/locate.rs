@@ -1,4 +1,14 @@
-use super::Outcome;
+use std::io::Write;
+use std::time::Instant;
+
+use anyhow::Context;
+use serde::Serialize;
+
+use super::{Failure, Outcome};
+use crate::config::Config;
+use crate::estimate::{self, Emitter};
+use crate::frame::Frame;
+use crate::frames::npy;
 
 #[derive(Debug, clap::Args)]
 pub struct Args {
@@ -11,6 +21,63 @@ pub struct Args {
     frames: std::path::PathBuf,
 }
 
-pub fn run(_args: Args) -> Outcome {
-    Err(super::Failure::other(anyhow::anyhow!("locate is not built yet")))
+/// One line of the output.
+#[derive(Serialize)]
+struct Line<'a> {
+    frame: u64,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    emitters: Option<&'a [Emitter]>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    error: Option<String>,
+    latency_us: u64,
+}
+
+pub fn run(args: Args) -> Outcome {
+    let mut config = Config::load(&args.config).map_err(Failure::config)?;
+    if args.estimator.is_some() {
+        config.estimator.name = args.estimator;
+    }
+    let in_config = || args.config.display().to_string();
+    let camera = config
+        .optics
+        .camera()
+        .with_context(in_config)
+        .map_err(Failure::Config)?;
+    let mut estimator = estimate::build(&config.estimator, &camera)
+        .with_context(in_config)
+        .map_err(Failure::Config)?;
+    let frames = npy::Reader::open(&args.frames, camera.joules_per_count).map_err(Failure::input)?;
+    let start = config.source.start.unwrap_or(jiff::Timestamp::UNIX_EPOCH);
+    let mut out = std::io::BufWriter::new(std::io::stdout().lock());
+    for (index, pixels) in frames.enumerate() {
+        let pixels = match pixels {
+            Ok(pixels) => pixels,
+            Err(e) => {
+                out.flush().map_err(Failure::other)?;
+                return Err(Failure::input(e));
+            }
+        };
+        let frame = Frame {
+            index: index as u64,
+            time: start,
+            pixels,
+            masked: None,
+        };
+        let clock = Instant::now();
+        let estimate = estimator.estimate(&frame);
+        let latency_us = clock.elapsed().as_micros() as u64;
+        let (emitters, error) = match &estimate {
+            Ok(estimate) => (Some(estimate.emitters.as_slice()), None),
+            Err(e) => (None, Some(e.to_string())),
+        };
+        let line = Line {
+            frame: frame.index,
+            emitters,
+            error,
+            latency_us,
+        };
+        serde_json::to_writer(&mut out, &line).map_err(|e| Failure::other(std::io::Error::from(e)))?;
+        writeln!(out).map_err(Failure::other)?;
+    }
+    out.flush().map_err(Failure::other)
 }

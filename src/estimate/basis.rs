@@ -198,7 +198,11 @@ impl Basis {
         let s = self.stride;
         let rows = &self.table[k * 3 * s..(k + 2) * 3 * s];
         let (a0, a1, a2) = (&rows[..m], &rows[s..s + m], &rows[2 * s..2 * s + m]);
-        let (b0, b1, b2) = (&rows[3 * s..3 * s + m], &rows[4 * s..4 * s + m], &rows[5 * s..5 * s + m]);
+        let (b0, b1, b2) = (
+            &rows[3 * s..3 * s + m],
+            &rows[4 * s..4 * s + m],
+            &rows[5 * s..5 * s + m],
+        );
         let (f, rest) = out.split_at_mut(m);
         let (f1, f2) = rest.split_at_mut(m);
         let f2 = &mut f2[..m];

@@ -254,7 +254,11 @@ impl Fitter {
                 let next = self.subtract(reading, nuisances, true);
                 let drop = deviance - next;
                 if drop >= 0.0 {
-                    small_drops = if drop < SMALL_DROP && lambda < 1e-3 { small_drops + 1 } else { 0 };
+                    small_drops = if drop < SMALL_DROP && lambda < 1e-3 {
+                        small_drops + 1
+                    } else {
+                        0
+                    };
                     deviance = next;
                 }
                 drop >= 0.0
@@ -429,7 +433,11 @@ impl Fitter {
         residual.clear();
         residual.extend_from_slice(&reading.z);
         for i in 0..n + nuisances.background_atoms() {
-            let a = if i < n { atoms.spots[i].a } else { atoms.background[i - n] };
+            let a = if i < n {
+                atoms.spots[i].a
+            } else {
+                atoms.background[i - n]
+            };
             let fx = &atoms.x[i * 3 * mx..i * 3 * mx + mx];
             let fy = &atoms.y[i * 3 * my..i * 3 * my + my];
             for c in 0..my {
@@ -438,20 +446,34 @@ impl Fitter {
         }
         let mut deviance = dot(residual, residual);
         for bad in &reading.bad {
-            deviance -= self.residual_at(reading, bad.x, bad.y, bad.value, atoms, nuisances).powi(2);
+            deviance -= self
+                .residual_at(reading, bad.x, bad.y, bad.value, atoms, nuisances)
+                .powi(2);
         }
         deviance
     }
 
     /// What a pixel holds beyond the model.
     #[inline(always)]
-    fn residual_at(&self, reading: &Reading, x: usize, y: usize, value: f64, atoms: &Atoms, nuisances: Nuisances) -> f64 {
+    fn residual_at(
+        &self,
+        reading: &Reading,
+        x: usize,
+        y: usize,
+        value: f64,
+        atoms: &Atoms,
+        nuisances: Nuisances,
+    ) -> f64 {
         let (mx, my) = (reading.mx, reading.my);
         let (ux, uy) = (&self.bx.row(x)[..mx], &self.by.row(y)[..my]);
         let n = atoms.spots.len();
         let mut left = value;
         for i in 0..n + nuisances.background_atoms() {
-            let a = if i < n { atoms.spots[i].a } else { atoms.background[i - n] };
+            let a = if i < n {
+                atoms.spots[i].a
+            } else {
+                atoms.background[i - n]
+            };
             let fx = &atoms.x[i * 3 * mx..i * 3 * mx + mx];
             let fy = &atoms.y[i * 3 * my..i * 3 * my + my];
             left -= a * dot(ux, fx) * dot(uy, fy);
@@ -509,7 +531,8 @@ impl Fitter {
                         x00 * y00,
                     ];
                     for r in 0..3 {
-                        h[(3 * i + r) * p + 3 * j..(3 * i + r) * p + 3 * j + 3].copy_from_slice(&block[3 * r..3 * r + 3]);
+                        h[(3 * i + r) * p + 3 * j..(3 * i + r) * p + 3 * j + 3]
+                            .copy_from_slice(&block[3 * r..3 * r + 3]);
                     }
                 } else if j < n {
                     let row = &mut h[(2 * n + i) * p + 3 * j..(2 * n + i) * p + 3 * j + 3];
@@ -533,14 +556,27 @@ impl Fitter {
             );
             for c in 0..my {
                 axpy(ax * y(i, 0)[c], x(i, 2), &mut self.dense[0][c * mx..(c + 1) * mx]);
-                axpy(ay * y(i, 2)[c], x(i, 0), &mut self.dense[widths - 1][c * mx..(c + 1) * mx]);
+                axpy(
+                    ay * y(i, 2)[c],
+                    x(i, 0),
+                    &mut self.dense[widths - 1][c * mx..(c + 1) * mx],
+                );
             }
         }
         let g = &mut self.gradient;
         g.resize(p.max(g.len()), 0.0);
         self.strip.resize(2 * my.max(mx), 0.0);
         for i in 0..sources {
-            let s = project(&self.residual, mx, my, x(i, 0), x(i, 1), y(i, 0), y(i, 1), &mut self.strip);
+            let s = project(
+                &self.residual,
+                mx,
+                my,
+                x(i, 0),
+                x(i, 1),
+                y(i, 0),
+                y(i, 1),
+                &mut self.strip,
+            );
             if i < n {
                 let a = amplitude(i);
                 (g[3 * i], g[3 * i + 1], g[3 * i + 2]) = (a * s[1], a * s[2], s[0]);
@@ -548,7 +584,16 @@ impl Fitter {
                 g[2 * n + i] = s[0];
             }
             for w in 0..widths {
-                let s = project(&self.dense[w], mx, my, x(i, 0), x(i, 1), y(i, 0), y(i, 1), &mut self.strip);
+                let s = project(
+                    &self.dense[w],
+                    mx,
+                    my,
+                    x(i, 0),
+                    x(i, 1),
+                    y(i, 0),
+                    y(i, 1),
+                    &mut self.strip,
+                );
                 let row = &mut h[(first_width + w) * p..(first_width + w + 1) * p];
                 if i < n {
                     let a = amplitude(i);

@@ -56,9 +56,15 @@ pub(super) fn locate(
             flags.set(Flags::NEAR_EDGE, near_edge);
             for bad in &frame.bad {
                 let centre = [bad.x, bad.y].map(|k| k as f64 + 0.5);
-                let d2: f64 = (0..2).map(|k| (low[k] + centre[k] * pitch[k] - spot.u[k]).powi(2)).sum();
+                let d2: f64 = (0..2)
+                    .map(|k| (low[k] + centre[k] * pitch[k] - spot.u[k]).powi(2))
+                    .sum();
                 if d2 < NEAR * NEAR {
-                    flags |= if bad.is_saturated { Flags::SATURATED } else { Flags::MASKED };
+                    flags |= if bad.is_saturated {
+                        Flags::SATURATED
+                    } else {
+                        Flags::MASKED
+                    };
                 }
             }
             let own = block(i, i);
@@ -75,7 +81,11 @@ pub(super) fn locate(
             let sensor_m = spot.u.map(|u| u * sigma);
             let scale = sigma * sigma * inflation;
             let [x_m, y_m] = camera.to_ground(sensor_m);
-            let energy_variance = if is_regular { cov[(3 * i + 2) * p + 3 * i + 2] } else { spot.a * spot.a };
+            let energy_variance = if is_regular {
+                cov[(3 * i + 2) * p + 3 * i + 2]
+            } else {
+                spot.a * spot.a
+            };
             Emitter {
                 x_m,
                 y_m,

@@ -38,7 +38,9 @@ impl Heatmap {
             // Centres up to half a σ outside; beyond that only a fit can tell.
             let (lo, hi) = (b.edges[0] - SPACING, b.edges[b.n] + SPACING);
             let count = ((hi - lo) / SPACING).ceil() as usize + 1;
-            let grid: Vec<f64> = (0..count).map(|k| lo + (hi - lo) * k as f64 / (count - 1) as f64).collect();
+            let grid: Vec<f64> = (0..count)
+                .map(|k| lo + (hi - lo) * k as f64 / (count - 1) as f64)
+                .collect();
             let mut templates = vec![0.0; count * b.stride];
             let mut norms = Vec::with_capacity(count);
             let (mut scratch, mut atom) = (vec![0.0; 3 * b.n], vec![0.0; 3 * b.stride]);
@@ -82,7 +84,10 @@ impl Heatmap {
         let (nx, ny) = (self.grid[0].len(), self.grid[1].len());
         self.map.resize(nx * ny, 0.0);
         self.strip.resize(mx, 0.0);
-        for (row, out) in self.templates[1].chunks_exact(self.strides[1]).zip(self.map.chunks_exact_mut(nx)) {
+        for (row, out) in self.templates[1]
+            .chunks_exact(self.strides[1])
+            .zip(self.map.chunks_exact_mut(nx))
+        {
             self.strip.fill(0.0);
             for c in 0..my {
                 if row[c] != 0.0 {
@@ -138,9 +143,9 @@ impl Heatmap {
         let mut kept = 0;
         for k in 0..self.peaks.len() {
             let peak = self.peaks[k];
-            let is_alone = self.peaks[..kept].iter().all(|p| {
-                (p.u[0] - peak.u[0]).powi(2) + (p.u[1] - peak.u[1]).powi(2) >= radius * radius
-            });
+            let is_alone = self.peaks[..kept]
+                .iter()
+                .all(|p| (p.u[0] - peak.u[0]).powi(2) + (p.u[1] - peak.u[1]).powi(2) >= radius * radius);
             if is_alone {
                 self.peaks[kept] = peak;
                 kept += 1;

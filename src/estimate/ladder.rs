@@ -49,7 +49,10 @@ pub const DEFAULT: &str = "greedy-fit";
 /// Why an `[estimator]` table describes no estimator.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum ConfigError {
-    #[error("estimator.name: no estimator {found:?}; did you mean {nearest:?}? There are {}", names())]
+    #[error(
+        "estimator.name: no estimator {found:?}; did you mean {nearest:?}? There are {}",
+        names()
+    )]
     UnknownName { found: String, nearest: &'static str },
     #[error("estimator.{field}: expected {expected}, found {found}")]
     OutOfRange {
@@ -65,14 +68,17 @@ fn names() -> String {
 
 /// The rung of that name.
 pub fn rung(name: &str) -> Result<&'static Rung, ConfigError> {
-    LADDER.iter().find(|r| r.name == name).ok_or_else(|| ConfigError::UnknownName {
-        found: name.to_owned(),
-        nearest: LADDER
-            .iter()
-            .map(|r| r.name)
-            .max_by(|a, b| strsim::jaro_winkler(name, a).total_cmp(&strsim::jaro_winkler(name, b)))
-            .unwrap_or(DEFAULT),
-    })
+    LADDER
+        .iter()
+        .find(|r| r.name == name)
+        .ok_or_else(|| ConfigError::UnknownName {
+            found: name.to_owned(),
+            nearest: LADDER
+                .iter()
+                .map(|r| r.name)
+                .max_by(|a, b| strsim::jaro_winkler(name, a).total_cmp(&strsim::jaro_winkler(name, b)))
+                .unwrap_or(DEFAULT),
+        })
 }
 
 /// Builds the configured estimator for a camera.
@@ -127,14 +133,23 @@ impl Estimator for Analytic {
             Method::Peak { is_subpixel } => search.peaks(reading, is_subpixel),
             Method::Greedy => search.greedy(reading, nuisances, 40),
         };
-        Ok(ground::locate(search, reading, &mut model, &self.frame, &self.camera, self.rung.name))
+        Ok(ground::locate(
+            search,
+            reading,
+            &mut model,
+            &self.frame,
+            &self.camera,
+            self.rung.name,
+        ))
     }
 }
 
 impl Search {
     fn peaks(&mut self, reading: &Reading, is_subpixel: bool) -> Model {
         let mut model = Model::empty(Nuisances::default());
-        let peaks = self.heatmap.peaks(&reading.z, reading.mx, reading.my, self.price.sqrt(), 1.0);
+        let peaks = self
+            .heatmap
+            .peaks(&reading.z, reading.mx, reading.my, self.price.sqrt(), 1.0);
         model.spots.extend(peaks.iter().map(|p| super::fit::Spot {
             u: if is_subpixel { p.u } else { p.grid },
             a: p.a,

@@ -64,7 +64,7 @@ pub(super) fn solve(l: &[f64], n: usize, b: &mut [f64]) {
 /// Writes (L Lᵀ)⁻¹ into `out`, n × n.
 pub(super) fn invert(l: &[f64], n: usize, out: &mut [f64]) {
     out[..n * n].fill(0.0);
-    for (i, row) in out.chunks_exact_mut(n).take(n).enumerate() {
+    for (i, row) in out.chunks_exact_mut(n.max(1)).take(n).enumerate() {
         row[i] = 1.0;
         solve(l, n, row);
     }
@@ -79,7 +79,9 @@ mod tests {
         let n = 11;
         let a: Vec<f64> = (0..n * n).map(|k| ((k * 37 % 101) as f64 / 50.0) - 1.0).collect();
         let h: Vec<f64> = (0..n * n)
-            .map(|k| dot(&a[k / n * n..k / n * n + n], &a[k % n * n..k % n * n + n]) + if k / n == k % n { 0.1 } else { 0.0 })
+            .map(|k| {
+                dot(&a[k / n * n..k / n * n + n], &a[k % n * n..k % n * n + n]) + if k / n == k % n { 0.1 } else { 0.0 }
+            })
             .collect();
         let mut l = h.clone();
         assert!(cholesky(&mut l, n));

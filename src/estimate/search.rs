@@ -35,7 +35,9 @@ impl Search {
             residual.clear();
             residual.extend_from_slice(self.fitter.residual_of(reading, &mut model));
             self.fitter.clean(reading, nuisances, &mut residual);
-            let peaks = self.heatmap.peaks(&residual, reading.mx, reading.my, self.price.sqrt(), SEPARATION);
+            let peaks = self
+                .heatmap
+                .peaks(&residual, reading.mx, reading.my, self.price.sqrt(), SEPARATION);
             let Some(strongest) = peaks.first() else { break };
             if model.spots.len() >= MOST {
                 break;
