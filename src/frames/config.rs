@@ -10,13 +10,15 @@ pub struct Config {
     pub kind: SourceKind,
     /// Simulator: a scene file; the built-in scene when left out.
     pub scene: Option<PathBuf>,
+    /// Simulator: the same seed gives the same beams and noise.
+    pub seed: u64,
     /// V4L2: the device node.
     pub device: Option<PathBuf>,
     /// V4L2: what to ask of the camera.
     pub v4l2: super::v4l2::Config,
     /// Replay: the recording.
     pub frames: Option<PathBuf>,
-    /// Replay: the time of frame 0. Frame k is at start + k/rate_hz whatever the speed.
+    /// The time of frame 0. Replay: frame k is at start + k/rate_hz whatever the speed. Simulator: now when left out.
     pub start: Option<Timestamp>,
     /// Frames per second of the recording, or asked of the device.
     pub rate_hz: f64,
@@ -50,6 +52,7 @@ impl Default for Config {
         Self {
             kind: SourceKind::Simulator,
             scene: None,
+            seed: 0,
             device: None,
             v4l2: super::v4l2::Config::default(),
             frames: None,

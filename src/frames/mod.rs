@@ -4,12 +4,14 @@ mod capture;
 mod config;
 pub mod npy;
 mod replay;
+mod simulator;
 mod slot;
 pub mod v4l2;
 
 pub use capture::{Capture, Captured};
 pub use config::{Config, SourceKind};
 pub use replay::Replay;
+pub use simulator::Simulator;
 
 use std::path::Path;
 use std::time::Duration;
@@ -19,6 +21,7 @@ use jiff::Timestamp;
 use crate::claim::Claim;
 use crate::frame::Frame;
 use crate::optics::Camera;
+use crate::scene;
 
 /// A supply of frames with a thread of its own to block in.
 pub trait FrameSource: Send {
@@ -66,8 +69,17 @@ pub enum Error {
     },
     #[error("source.{field}: needed for kind = {kind:?}, found nothing")]
     Missing { field: &'static str, kind: &'static str },
-    #[error("source.kind = {kind:?} is not built yet")]
-    NotBuilt { kind: &'static str },
+    #[error(
+        "source.scene: the scene's array is {found_x} × {found_y} pixels, optics.pixels says {expected_x} × {expected_y}"
+    )]
+    SceneShape {
+        expected_x: usize,
+        expected_y: usize,
+        found_x: usize,
+        found_y: usize,
+    },
+    #[error(transparent)]
+    Scene(#[from] scene::Error),
     #[error("optics.joules_per_count: needed for source.kind = \"v4l2\", whose frames are counts; found nothing")]
     NoScale,
     #[error(transparent)]
@@ -86,8 +98,6 @@ pub fn open(config: &Config, camera: &Camera) -> Result<Box<dyn FrameSource>, Er
     match config.kind {
         SourceKind::Replay => Ok(Box::new(Replay::open(config, camera.joules_per_count)?)),
         SourceKind::V4l2 => Ok(Box::new(v4l2::V4l2::new(config, camera)?)),
-        SourceKind::Simulator => Err(Error::NotBuilt {
-            kind: config.kind.name(),
-        }),
+        SourceKind::Simulator => Ok(Box::new(Simulator::open(config, camera)?)),
     }
 }

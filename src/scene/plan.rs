@@ -184,7 +184,7 @@ impl Plan {
     }
 
     /// The claims that arrived after frame k − 1 and not after frame k.
-    fn claims(&self, k: u64) -> Vec<Claim> {
+    pub fn claims(&self, k: u64) -> Vec<Claim> {
         let after = if k == 0 { f64::NEG_INFINITY } else { self.seconds(k - 1) };
         let arrivals = self
             .network
