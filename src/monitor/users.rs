@@ -75,6 +75,7 @@ pub(super) struct User {
     /// Frames in a row with the beam outside what is tolerated.
     pub outside: u32,
     pub last_answered: Option<Timestamp>,
+    pub mismatched: bool,
     /// A beam elsewhere took the user's place when they vanished.
     pub displaced: bool,
 }

@@ -21,15 +21,21 @@ use crate::optics::Camera;
 /// Squared Mahalanobis distance within which a beam can answer a claim.
 const ANSWER_GATE: f64 = 25.0;
 /// What an assignment must gain before a claim is answered by another beam than before.
-const INCUMBENCY: f64 = 2.0;
+const INCUMBENCY: f64 = 4.0;
 /// Frames in a row that must show a beam outside before a single claim's evidence stands.
 const OUTSIDE_FRAMES: u32 = 3;
 /// A beam and an absence that began within this of each other have one cause, s.
 const COINCIDENCE_S: f64 = 1.5;
-/// At the start of a run claims may trickle in over this long after the first, s.
-const FIRST_CLAIMS_S: f64 = 1.3;
-/// Without any claim by then there is none to wait for, s.
-const NO_CLAIMS_S: f64 = 5.0;
+/// ln likelihood ratio from which a user counts as vanished: three frames in a row.
+const VANISHED: f64 = 6.9;
+/// Share of the time to decide that a beam waits for its claim; the rest is for frames that miss it.
+const PATIENCE: f64 = 0.85;
+/// At the start of a run every user's claim has come after this many claim periods.
+const FIRST_CLAIMS: f64 = 1.3;
+/// Without a second claim of anyone by then there is none to wait for, s.
+const NO_CLAIMS_S: f64 = 12.0;
+/// Claims that take longer to come in than this are not waited for, s.
+const LONGEST_DELAY_S: f64 = 3.0;
 /// Systematic error of the positions that does not average out, m.
 const SYSTEMATIC_M: f64 = 0.05;
 /// An alert that lasts this long is critical, s.
@@ -49,6 +55,9 @@ pub struct Monitor {
     shift: Vector2<f64>,
     first: Option<Timestamp>,
     first_claim: Option<Timestamp>,
+    /// Typical seconds between a user's claims, and from a claim's own time to its arrival.
+    period_s: Option<f64>,
+    delay_s: f64,
     time: Option<Timestamp>,
     frame: u64,
     /// Since when each track has had no claim, by track.
@@ -70,6 +79,8 @@ impl Monitor {
             shift: Vector2::zeros(),
             first: None,
             first_claim: None,
+            period_s: None,
+            delay_s: 0.0,
             time: None,
             frame: 0,
             alone: BTreeMap::new(),
@@ -94,6 +105,7 @@ impl Monitor {
             .filter_map(|a| self.users.get(&a.claim.user)?.last_answered)
             .filter(|t| seconds(*t, now) < 2.0 + self.sight.blind_s(now))
             .count();
+        self.learn_habits(&asserted, claims, now);
         if let Some(estimate) = self.sight.judge(&seen, lit) {
             let detections = Detection::of(estimate, &self.camera);
             self.tracks.step(now, &detections, dt);
@@ -308,17 +320,31 @@ impl Monitor {
         self.decide_users(asserted, &answers, claims, now);
     }
 
+    /// The log's habits, as medians over users: no single one can slow the monitor down.
+    fn learn_habits(&mut self, asserted: &[Asserted], claims: &Store, now: Timestamp) {
+        if self.first_claim.is_none() && claims.quiet_s(now).is_some() {
+            self.first_claim = Some(now);
+        }
+        if let Some(period) = median(asserted.iter().filter_map(|a| a.period_s)) {
+            self.period_s = Some(period);
+        }
+        let delay = median(asserted.iter().map(|a| seconds(a.claim.time, a.came)));
+        self.delay_s = delay.unwrap_or(0.0).clamp(0.0, LONGEST_DELAY_S);
+    }
+
     fn claims_settled(&self, now: Timestamp) -> bool {
         let Some(first) = self.first else { return false };
-        match self.first_claim {
-            Some(t) => seconds(t, now) >= FIRST_CLAIMS_S,
-            None => seconds(first, now) >= NO_CLAIMS_S,
+        match (self.first_claim, self.period_s) {
+            (Some(t), Some(period)) => {
+                seconds(t, now) >= (FIRST_CLAIMS * period + 2.0 * self.delay_s).min(NO_CLAIMS_S)
+            }
+            _ => seconds(first, now) >= NO_CLAIMS_S,
         }
     }
 
     fn decide_unclaimed(&mut self, asserted: &[Asserted], answers: &mut [Option<u64>], now: Timestamp) {
         let settled = self.claims_settled(now);
-        let patience = 0.7 * self.config.decision_s;
+        let patience = PATIENCE * self.config.decision_s + self.delay_s;
         let candidates: Vec<Track> = self
             .tracks
             .all
@@ -383,21 +409,22 @@ impl Monitor {
                 if self.book.is_open(&Cause::User(AlertKind::UserUnseen, name.clone())) {
                     return None;
                 }
-                let gap = seconds(self.users.get(name)?.unanswered_since?, since).abs();
-                (gap <= COINCIDENCE_S).then_some((i, gap))
+                let user = self.users.get(name)?;
+                let gap = seconds(user.unanswered_since?, since).abs();
+                (user.absence >= VANISHED && gap <= COINCIDENCE_S).then_some((i, gap))
             })
             .min_by(|a, b| a.1.total_cmp(&b.1))
             .map(|(i, _)| i)
     }
 
-    /// An open alert whose own track was lost near here: the same emitter.
+    /// An open alert near here whose own track was lost, or took the place of the beam that answered a claim: the same cause.
     fn lost_alert_near(&self, track: &Track) -> Option<Cause> {
         let p = track.motion.position();
         self.book.open().find_map(|(cause, alert)| {
             let Cause::Track(AlertKind::UnclaimedEmitter, id) = cause else {
                 return None;
             };
-            let lost = self.tracks.get(*id).is_none_or(|t| !t.hit);
+            let lost = !self.alone.contains_key(id) || self.tracks.get(*id).is_none_or(|t| !t.hit);
             let (x, y) = (alert.x_m?, alert.y_m?);
             (lost && (p - Vector2::new(x, y)).norm() < 10.0).then(|| cause.clone())
         })
@@ -444,16 +471,16 @@ impl Monitor {
             let mismatch = Cause::User(AlertKind::PositionMismatch, name.clone());
             let unseen = Cause::User(AlertKind::UserUnseen, name.clone());
             let track = answer.and_then(|id| self.tracks.get(id));
-            let excess = user.residuals.excess(tolerated, &floor);
-            let is_open = self.book.is_open(&mismatch);
-            let is_off = user.outside >= OUTSIDE_FRAMES || excess.surprise > level;
-            let is_back = user.outside == 0 && user.residuals.agree(2, tolerated);
-            if is_open && is_back {
+            if user.mismatched && user.outside == 0 && user.residuals.agree(2, tolerated) {
+                // What told of the mismatch is over and must not tell of another one.
                 user.residuals.forget();
+                user.mismatched = false;
                 user.displaced = false;
             }
+            let excess = user.residuals.excess(tolerated, &floor);
+            user.mismatched |= user.outside >= OUTSIDE_FRAMES || excess.surprise > level;
             match track {
-                Some(track) if !a.ended && (is_off || (is_open && !is_back)) => {
+                Some(track) if !a.ended && user.mismatched => {
                     let distance = (track.motion.position() - a.position).norm();
                     let severity = if user.displaced || distance > 2.0 * tolerated {
                         Severity::Critical
@@ -523,9 +550,6 @@ impl Monitor {
 
     /// The health of what we are given: frames and claims.
     fn watch_inputs(&mut self, asserted: &[Asserted], claims: &Store, now: Timestamp) {
-        if self.first_claim.is_none() && claims.quiet_s(now).is_some() {
-            self.first_claim = Some(now);
-        }
         let lost = Cause::Whole(AlertKind::SensorLost);
         let blind_s = self.sight.blind_s(now);
         if blind_s >= self.config.sensor_lost_s {
@@ -535,9 +559,7 @@ impl Monitor {
             self.book.absent(&lost, now);
         }
         let stale = Cause::Whole(AlertKind::ClaimsStale);
-        let mut periods: Vec<f64> = asserted.iter().filter_map(|a| a.period_s).collect();
-        periods.sort_by(f64::total_cmp);
-        let period = periods.get(periods.len() / 2).copied().unwrap_or(0.0);
+        let period = self.period_s.unwrap_or(0.0);
         let limit = self.config.claims_stale_s.max(5.0 * period);
         match claims.quiet_s(now) {
             Some((came, made)) if came.max(made) > limit && self.expects_claims(asserted) => {
@@ -620,6 +642,12 @@ impl Monitor {
             claims: asserted.iter().map(|a| a.claim.clone()).collect(),
         }
     }
+}
+
+fn median(values: impl Iterator<Item = f64>) -> Option<f64> {
+    let mut values: Vec<f64> = values.collect();
+    values.sort_by(f64::total_cmp);
+    values.get(values.len() / 2).copied()
 }
 
 fn claimed(a: &Asserted) -> Option<Value> {
