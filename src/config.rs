@@ -96,6 +96,9 @@ impl Config {
             &mut self.source.frames,
             &mut self.claims.log,
             &mut self.api.token_file,
+            &mut self.api.read_token_file,
+            &mut self.api.tls_cert_file,
+            &mut self.api.tls_key_file,
             &mut self.journal.path,
         ];
         for path in optional.into_iter().flatten() {

@@ -8,6 +8,7 @@
 
 pub mod claim;
 pub mod frame;
+pub mod metric;
 pub mod optics;
 
 pub mod assign;

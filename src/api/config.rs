@@ -4,12 +4,49 @@ use std::path::PathBuf;
 use serde::{Deserialize, Serialize};
 
 /// `[api]`.
-#[derive(Clone, Debug, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Config {
     pub listen: SocketAddr,
-    /// Bearer token; without one only loopback addresses may be listened on.
+    /// Bearer tokens with full access, one a line; without any only loopback addresses may be listened on.
     pub token_file: Option<PathBuf>,
+    /// Bearer tokens that may look but not change anything, one a line.
+    pub read_token_file: Option<PathBuf>,
+    /// PEM certificate chain; with `tls_key_file` the API speaks TLS only.
+    pub tls_cert_file: Option<PathBuf>,
+    /// PEM private key.
+    pub tls_key_file: Option<PathBuf>,
+    /// Origins of other web pages that may use the API (CORS), such as "https://ops.example.org".
+    pub allowed_origins: Vec<String>,
+    /// Names, beside localhost and plain addresses, that this host is called by when no token is asked for.
+    pub allowed_hosts: Vec<String>,
+    /// Connections open at a time, streams included.
+    pub max_connections: usize,
+    /// Requests a client address may make per second, on average.
+    pub requests_per_second: u32,
+}
+
+/// Why the API cannot be served as configured.
+#[derive(Debug, thiserror::Error)]
+pub enum ConfigError {
+    #[error(
+        "api.listen: {listen} can be reached from other machines, so api.token_file is needed; \
+         expected a token or a loopback address such as 127.0.0.1:8787"
+    )]
+    OpenToAll { listen: SocketAddr },
+    #[error("api.{missing}: expected a file, since api.{given} is set; found nothing")]
+    HalfTls {
+        given: &'static str,
+        missing: &'static str,
+    },
+    #[error("api.{field}: expected {expected}, found {found}")]
+    OutOfRange {
+        field: &'static str,
+        expected: &'static str,
+        found: u64,
+    },
+    #[error("api.allowed_origins: expected an origin such as \"https://ops.example.org\", found {found:?}")]
+    NoOrigin { found: String },
 }
 
 impl Default for Config {
@@ -17,6 +54,114 @@ impl Default for Config {
         Self {
             listen: SocketAddr::from(([127, 0, 0, 1], 8787)),
             token_file: None,
+            read_token_file: None,
+            tls_cert_file: None,
+            tls_key_file: None,
+            allowed_origins: Vec::new(),
+            allowed_hosts: Vec::new(),
+            max_connections: 2048,
+            requests_per_second: 200,
+        }
+    }
+}
+
+impl Config {
+    /// Checks what can be checked without opening a file or a port.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        let loopback = self.listen.ip().to_canonical().is_loopback();
+        if !loopback && self.token_file.is_none() && self.read_token_file.is_none() {
+            return Err(ConfigError::OpenToAll { listen: self.listen });
+        }
+        match (&self.tls_cert_file, &self.tls_key_file) {
+            (Some(_), None) => {
+                return Err(ConfigError::HalfTls {
+                    given: "tls_cert_file",
+                    missing: "tls_key_file",
+                });
+            }
+            (None, Some(_)) => {
+                return Err(ConfigError::HalfTls {
+                    given: "tls_key_file",
+                    missing: "tls_cert_file",
+                });
+            }
+            _ => {}
+        }
+        if self.max_connections == 0 {
+            return Err(ConfigError::OutOfRange {
+                field: "max_connections",
+                expected: "at least 1",
+                found: 0,
+            });
+        }
+        if self.requests_per_second == 0 {
+            return Err(ConfigError::OutOfRange {
+                field: "requests_per_second",
+                expected: "at least 1",
+                found: 0,
+            });
+        }
+        for origin in &self.allowed_origins {
+            let plain = url::Url::parse(origin).is_ok_and(|u| u.origin().ascii_serialization() == *origin);
+            if !plain {
+                return Err(ConfigError::NoOrigin { found: origin.clone() });
+            }
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn listening(addr: &str) -> Config {
+        Config {
+            listen: addr.parse().expect("an address"),
+            ..Config::default()
+        }
+    }
+
+    #[test]
+    fn beyond_loopback_only_with_a_token() {
+        for open in ["0.0.0.0:1", "[::]:1", "192.0.2.7:1", "[::ffff:192.0.2.7]:1"] {
+            let mut config = listening(open);
+            let message = config.validate().expect_err(open).to_string();
+            assert!(message.contains("api.token_file"), "{message}");
+            config.read_token_file = Some("tokens".into());
+            config.validate().expect("a token is given");
+        }
+        for closed in ["127.0.0.1:1", "127.9.9.9:1", "[::1]:1", "[::ffff:127.0.0.1]:1"] {
+            listening(closed).validate().expect(closed);
+        }
+    }
+
+    #[test]
+    fn certificate_and_key_go_together() {
+        let mut config = Config {
+            tls_cert_file: Some("cert.pem".into()),
+            ..Config::default()
+        };
+        let message = config.validate().expect_err("no key").to_string();
+        assert!(message.contains("tls_key_file"), "{message}");
+        config.tls_key_file = Some("key.pem".into());
+        config.validate().expect("both given");
+    }
+
+    #[test]
+    fn an_origin_is_scheme_and_host_only() {
+        for (origin, good) in [
+            ("https://ops.example.org", true),
+            ("http://127.0.0.1:3000", true),
+            ("https://ops.example.org/", false),
+            ("ops.example.org", false),
+            ("*", false),
+        ] {
+            let config = Config {
+                allowed_origins: vec![origin.into()],
+                ..Config::default()
+            };
+            assert_eq!(config.validate().is_ok(), good, "{origin}");
         }
     }
 }

@@ -1,5 +1,124 @@
-//! Floor 4: HTTP, WebSocket and the dashboard.
+//! Floor 4: what people and programs see: REST, WebSocket, server-sent events, metrics and the dashboard.
+//!
+//! The daemon builds a [`State`], publishes to its [`Feed`], answers [`Command`]s, and runs a [`Server`]. Nothing in
+//! here can make the compute thread wait.
 
+mod alerts;
+mod auth;
+mod claims;
+mod conditional;
 mod config;
+mod extract;
+mod feed;
+mod frame;
+mod guard;
+mod history;
+mod openapi;
+mod page;
+mod picture;
+mod positions;
+mod probes;
+mod problem;
+mod respond;
+mod server;
+mod snapshot;
+mod sse;
+mod state;
+mod stream;
+mod websocket;
 
-pub use config::Config;
+pub use auth::TokenError;
+pub use config::{Config, ConfigError};
+pub use feed::{Event, Feed};
+pub use server::{Error, Server};
+pub use snapshot::{
+    ClaimsStatus, FrameCounts, JournalStatus, Latency, Snapshot, SourceState, SourceStatus, Status, WebhookStatus,
+};
+pub use state::{Acknowledged, AlertQuery, AlertStore, Command, State, StoreError};
+
+use std::num::NonZeroU32;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use axum::Router;
+use axum::extract::{DefaultBodyLimit, MatchedPath, Request};
+use axum::http::{HeaderName, HeaderValue, Method, StatusCode, header};
+use axum::middleware::{Next, from_fn, from_fn_with_state};
+use axum::response::Response;
+use axum::routing::get;
+use tower_http::catch_panic::CatchPanicLayer;
+use tower_http::compression::CompressionLayer;
+use tower_http::cors::{AllowOrigin, CorsLayer};
+use tower_http::set_header::SetResponseHeaderLayer;
+use tower_http::timeout::TimeoutLayer;
+
+use crate::metric;
+
+/// The largest body read: about 20,000 claims.
+const MAX_BODY_BYTES: usize = 4 << 20;
+/// A request, body included, must have arrived and been answered within this time; streams excepted.
+const ANSWER_WITHIN: Duration = Duration::from_secs(20);
+
+/// All routes under all guards, the outermost last.
+fn router(state: State, config: &Config, tokens: Arc<auth::Tokens>) -> Router {
+    let (routes, description) = openapi::router();
+    let origins = Arc::new(guard::Origins::new(config, tokens.required()));
+    let per_second = NonZeroU32::new(config.requests_per_second).unwrap_or(NonZeroU32::MIN);
+    let rates = Arc::new(guard::Rates::new(per_second));
+    routes
+        .merge(openapi::serve(description))
+        .route("/", get(page::index))
+        .route("/page/{*path}", get(page::asset))
+        .fallback(|| async { StatusCode::NOT_FOUND })
+        .layer(DefaultBodyLimit::max(MAX_BODY_BYTES))
+        .layer(CompressionLayer::new().gzip(true))
+        .layer(from_fn_with_state(tokens, auth::check))
+        .layer(from_fn_with_state(origins, guard::origin))
+        .layer(cors(config))
+        .layer(from_fn_with_state(rates, guard::rate))
+        .layer(TimeoutLayer::with_status_code(StatusCode::REQUEST_TIMEOUT, ANSWER_WITHIN))
+        .layer(CatchPanicLayer::new())
+        .layer(from_fn(problem::for_every_error))
+        .layer(fixed(header::X_CONTENT_TYPE_OPTIONS, "nosniff"))
+        .layer(fixed(header::X_FRAME_OPTIONS, "DENY"))
+        .layer(fixed(header::REFERRER_POLICY, "no-referrer"))
+        .layer(fixed(HeaderName::from_static("cross-origin-opener-policy"), "same-origin"))
+        .layer(from_fn(measure))
+        .with_state(state)
+}
+
+fn fixed(name: HeaderName, value: &'static str) -> SetResponseHeaderLayer<HeaderValue> {
+    SetResponseHeaderLayer::if_not_present(name, HeaderValue::from_static(value))
+}
+
+/// Off unless origins are listed.
+fn cors(config: &Config) -> CorsLayer {
+    let origins: Vec<HeaderValue> = config.allowed_origins.iter().filter_map(|o| o.parse().ok()).collect();
+    if origins.is_empty() {
+        return CorsLayer::new();
+    }
+    CorsLayer::new()
+        .allow_origin(AllowOrigin::list(origins))
+        .allow_methods([Method::GET, Method::POST])
+        .allow_headers([header::AUTHORIZATION, header::CONTENT_TYPE, header::IF_NONE_MATCH])
+        .expose_headers([header::ETAG, header::LINK, header::RETRY_AFTER])
+        .max_age(Duration::from_secs(600))
+}
+
+/// Counts and times every request by its route's pattern, so that paths made up by clients make no new series.
+async fn measure(request: Request, next: Next) -> Response {
+    let started = Instant::now();
+    let pattern = request.extensions().get::<MatchedPath>().map(|p| p.as_str().to_owned());
+    let route = pattern.unwrap_or_else(|| "none".to_owned());
+    let method = match *request.method() {
+        Method::GET => "GET",
+        Method::POST => "POST",
+        Method::HEAD => "HEAD",
+        _ => "other",
+    };
+    let response = next.run(request).await;
+    let status = response.status().as_u16().to_string();
+    metrics::histogram!(metric::HTTP_DURATION, "route" => route.clone()).record(started.elapsed());
+    metrics::counter!(metric::HTTP_REQUESTS, "method" => method, "route" => route, "status" => status).increment(1);
+    response
+}

@@ -1,0 +1,175 @@
+use axum::extract::State as Shared;
+use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
+use axum::response::Response;
+use base64::Engine;
+use base64::prelude::BASE64_URL_SAFE_NO_PAD;
+use jiff::Timestamp;
+use serde::{Deserialize, Serialize};
+use tokio::sync::oneshot;
+
+use super::extract::{Path, Query, within};
+use super::problem::Problem;
+use super::state::{Acknowledged, AlertQuery, AlertStore, Command, State, StoreError};
+use super::{conditional, respond};
+use crate::monitor::{Alert, AlertKind, AlertState};
+
+const DEFAULT_LIMIT: usize = 100;
+const MAX_LIMIT: usize = 1000;
+
+#[derive(Debug, Deserialize, utoipa::IntoParams)]
+#[into_params(parameter_in = Query)]
+#[serde(deny_unknown_fields)]
+pub struct ListQuery {
+    state: Option<AlertState>,
+    kind: Option<AlertKind>,
+    /// Raised at this time or later
+    #[param(value_type = Option<String>, format = DateTime)]
+    since: Option<Timestamp>,
+    /// Alerts on a page, 100 when left out
+    #[param(minimum = 1, maximum = 1000)]
+    limit: Option<usize>,
+    /// `next_cursor` of the page before
+    cursor: Option<String>,
+}
+
+/// A page of alerts.
+#[derive(Debug, Serialize, utoipa::ToSchema)]
+pub struct Page {
+    /// Newest first.
+    alerts: Vec<Alert>,
+    /// What to give as `cursor` for the next page; null on the last.
+    next_cursor: Option<String>,
+}
+
+fn encode(alert: &Alert) -> String {
+    BASE64_URL_SAFE_NO_PAD.encode(format!("{} {}", alert.raised_at, alert.id))
+}
+
+fn decode(cursor: &str) -> Result<(Timestamp, String), Problem> {
+    let read = || {
+        let bytes = BASE64_URL_SAFE_NO_PAD.decode(cursor).ok()?;
+        let text = String::from_utf8(bytes).ok()?;
+        let (time, id) = text.split_once(' ')?;
+        Some((time.parse().ok()?, id.to_owned()))
+    };
+    read().ok_or_else(|| {
+        Problem::new(
+            StatusCode::BAD_REQUEST,
+            format!("cursor: expected the next_cursor of an earlier page, found {cursor:?}"),
+        )
+    })
+}
+
+/// Runs a read of the journal where blocking is allowed.
+pub(super) async fn read<T: Send + 'static>(
+    state: &State,
+    read: impl FnOnce(&dyn AlertStore) -> Result<T, StoreError> + Send + 'static,
+) -> Result<T, Problem> {
+    let alerts = state.alerts.clone();
+    let outcome = tokio::task::spawn_blocking(move || read(&*alerts)).await;
+    outcome.expect("a read does not panic").map_err(|e| {
+        tracing::error!("{e}");
+        Problem::later(StatusCode::SERVICE_UNAVAILABLE, 5, "the journal cannot be read at the moment")
+    })
+}
+
+/// Alerts, newest first
+#[utoipa::path(get, path = "/v1/alerts", tag = "alerts", params(ListQuery),
+    responses(
+        (status = 200, description = "A page of alerts; a Link header leads to the next", body = Page),
+        (status = 304, description = "Nothing new since the ETag given in If-None-Match"),
+        (status = 400, description = "A parameter cannot be read", body = Problem, content_type = "application/problem+json"),
+        (status = 503, description = "The journal cannot be read", body = Problem, content_type = "application/problem+json"),
+    ))]
+pub async fn list(
+    Shared(state): Shared<State>,
+    Query(query): Query<ListQuery>,
+    headers: HeaderMap,
+) -> Result<Response, Problem> {
+    let version = state.feed.last_event();
+    let limit = within("limit", query.limit.unwrap_or(DEFAULT_LIMIT), 1, MAX_LIMIT)?;
+    let wanted = AlertQuery {
+        state: query.state,
+        kind: query.kind,
+        since: query.since,
+        before: query.cursor.as_deref().map(decode).transpose()?,
+        limit: limit + 1,
+    };
+    let mut alerts = read(&state, move |store| store.list(&wanted)).await?;
+    let more = alerts.len() > limit;
+    alerts.truncate(limit);
+    let page = Page {
+        next_cursor: alerts.last().filter(|_| more).map(encode),
+        alerts,
+    };
+    let mut response = conditional::answer(&headers, version, || respond::json(&page));
+    if let Some(link) = page.next_cursor.as_deref().and_then(|c| next_link(&query, limit, c)) {
+        response.headers_mut().insert(header::LINK, link);
+    }
+    Ok(response)
+}
+
+fn next_link(query: &ListQuery, limit: usize, cursor: &str) -> Option<HeaderValue> {
+    let mut pairs = url::form_urlencoded::Serializer::new(String::new());
+    let name = |value: serde_json::Value| value.as_str().unwrap_or_default().to_owned();
+    if let Some(state) = query.state {
+        pairs.append_pair("state", &name(serde_json::json!(state)));
+    }
+    if let Some(kind) = query.kind {
+        pairs.append_pair("kind", &name(serde_json::json!(kind)));
+    }
+    if let Some(since) = query.since {
+        pairs.append_pair("since", &since.to_string());
+    }
+    pairs.append_pair("limit", &limit.to_string()).append_pair("cursor", cursor);
+    HeaderValue::from_str(&format!("</v1/alerts?{}>; rel=\"next\"", pairs.finish())).ok()
+}
+
+/// One alert
+#[utoipa::path(get, path = "/v1/alerts/{id}", tag = "alerts",
+    params(("id" = String, Path, description = "The alert's id")),
+    responses(
+        (status = 200, description = "The alert as it stands", body = Alert),
+        (status = 304, description = "Nothing new since the ETag given in If-None-Match"),
+        (status = 400, description = "The path cannot be read", body = Problem, content_type = "application/problem+json"),
+        (status = 404, description = "There is no such alert", body = Problem, content_type = "application/problem+json"),
+        (status = 503, description = "The journal cannot be read", body = Problem, content_type = "application/problem+json"),
+    ))]
+pub async fn get(
+    Shared(state): Shared<State>,
+    Path(id): Path<String>,
+    headers: HeaderMap,
+) -> Result<Response, Problem> {
+    let version = state.feed.last_event();
+    let wanted = id.clone();
+    let alert = read(&state, move |store| store.get(&wanted)).await?;
+    let alert = alert.ok_or_else(|| unknown(&id))?;
+    Ok(conditional::answer(&headers, version, || respond::json(&alert)))
+}
+
+fn unknown(id: &str) -> Problem {
+    Problem::not_found(format!("there is no alert {id:?}"))
+}
+
+/// Says that somebody has taken note of an alert
+#[utoipa::path(post, path = "/v1/alerts/{id}/acknowledge", tag = "alerts",
+    params(("id" = String, Path, description = "The alert's id")),
+    responses(
+        (status = 200, description = "The alert, acknowledged now or before", body = Alert),
+        (status = 400, description = "The path cannot be read", body = Problem, content_type = "application/problem+json"),
+        (status = 404, description = "There is no such alert", body = Problem, content_type = "application/problem+json"),
+        (status = 409, description = "The alert has cleared", body = Problem, content_type = "application/problem+json"),
+        (status = 503, description = "The monitor is too busy; come back", body = Problem, content_type = "application/problem+json"),
+    ))]
+pub async fn acknowledge(Shared(state): Shared<State>, Path(id): Path<String>) -> Result<Response, Problem> {
+    let (reply, answer) = oneshot::channel();
+    super::claims::send(&state, Command::Acknowledge { id: id.clone(), reply })?;
+    match answer.await.map_err(|_| super::claims::busy())? {
+        Acknowledged::Done(alert) => Ok(respond::json(&*alert)),
+        Acknowledged::Unknown => Err(unknown(&id)),
+        Acknowledged::AlreadyCleared => Err(Problem::new(
+            StatusCode::CONFLICT,
+            format!("alert {id:?} has cleared; only an alert that stands can be acknowledged"),
+        )),
+    }
+}

@@ -1,0 +1,264 @@
+//! What the compute thread publishes and every reader takes at its own pace.
+//!
+//! Readers pull: each has a cursor, and nothing is queued for it. A reader that falls behind loses positions
+//! (it gets the newest and a count of what it missed). Alert events it never loses: those that have left the
+//! ring are read back from the journal.
+
+use std::collections::VecDeque;
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock};
+
+use serde::Serialize;
+use tokio::sync::watch;
+
+use super::history::History;
+use super::snapshot::Snapshot;
+use crate::claim::Claim;
+use crate::monitor::{AlertEvent, Report};
+
+/// Positions kept for readers that are a moment late.
+const POSITIONS_KEPT: usize = 16;
+/// Alert events kept in memory; older ones come from the journal.
+const EVENTS_KEPT: usize = 1024;
+/// Claims drawn on the map at most; a log may hold 10,000 users elsewhere.
+const CLAIMS_SHOWN: usize = 500;
+
+/// A numbered alert event. Numbers are strictly increasing, also from one run of the daemon to the next.
+#[derive(Clone, Debug, PartialEq, Serialize, utoipa::ToSchema)]
+pub struct Event {
+    pub seq: u64,
+    #[serde(flatten)]
+    pub event: AlertEvent,
+}
+
+/// A numbered snapshot, with its JSON made once for all readers.
+#[derive(Debug)]
+pub struct Published {
+    pub seq: u64,
+    /// Counts snapshots, so that a reader can be told how many it missed.
+    ordinal: u64,
+    pub snapshot: Snapshot,
+    body: OnceLock<String>,
+}
+
+/// Where a reader stands.
+#[derive(Clone, Copy, Debug)]
+pub struct Cursor {
+    event_seq: u64,
+    ordinal: u64,
+}
+
+/// The next thing for a reader, in the order of `seq`.
+#[derive(Debug)]
+pub enum Next {
+    /// Nothing new.
+    Nothing,
+    Event(Arc<Event>),
+    Positions { latest: Arc<Published>, missed: u64 },
+    /// Events after `after`, up to and including `until`, are to be read from the journal.
+    Journal { after: u64, until: u64 },
+}
+
+/// Shared by the compute thread, which writes, and all readers.
+#[derive(Debug)]
+pub struct Feed {
+    ring: Mutex<Ring>,
+    head: watch::Sender<u64>,
+}
+
+#[derive(Debug)]
+struct Ring {
+    /// The last number given out.
+    last_seq: u64,
+    /// The last number made known; behind `last_seq` while the journal writes.
+    published: u64,
+    /// The last event that is no longer in `events`.
+    evicted: u64,
+    snapshots: u64,
+    positions: VecDeque<Arc<Published>>,
+    events: VecDeque<Arc<Event>>,
+    history: History,
+}
+
+#[derive(Serialize)]
+struct Body<'a> {
+    #[serde(flatten)]
+    report: &'a Report,
+    claims: Vec<&'a Claim>,
+    status: &'a super::snapshot::Status,
+}
+
+impl Published {
+    /// JSON object of the report, the claims in view and the status.
+    pub fn body(&self) -> &str {
+        self.body.get_or_init(|| {
+            let report = &self.snapshot.report;
+            let [half_x, half_y] = self.snapshot.status.field_of_view_m;
+            let near = |c: &&Claim| c.x_m.abs() <= 1.5 * half_x && c.y_m.abs() <= 1.5 * half_y;
+            let body = Body {
+                report,
+                claims: report.claims.iter().filter(near).take(CLAIMS_SHOWN).collect(),
+                status: &self.snapshot.status,
+            };
+            serde_json::to_string(&body).expect("a snapshot is plain data")
+        })
+    }
+}
+
+impl Feed {
+    /// `after` is the last number given to an event by an earlier run (0 if none); `now_us` the time in
+    /// microseconds since 1970. Starting from the larger keeps numbers increasing over restarts without
+    /// writing one to disk for each frame: fewer than a million messages a second are ever published.
+    pub fn new(after: u64, now_us: u64) -> Self {
+        let last_seq = after.max(now_us);
+        Self {
+            ring: Mutex::new(Ring {
+                last_seq,
+                published: last_seq,
+                evicted: after,
+                snapshots: 0,
+                positions: VecDeque::with_capacity(POSITIONS_KEPT),
+                events: VecDeque::new(),
+                history: History::new(),
+            }),
+            head: watch::Sender::new(last_seq),
+        }
+    }
+
+    fn ring(&self) -> MutexGuard<'_, Ring> {
+        self.ring.lock().unwrap_or_else(|poisoned| poisoned.into_inner())
+    }
+
+    /// Numbers events, for the journal to write before they are published.
+    pub fn number(&self, events: Vec<AlertEvent>) -> Vec<Event> {
+        let mut ring = self.ring();
+        let numbered = |event| {
+            ring.last_seq += 1;
+            Event {
+                seq: ring.last_seq,
+                event,
+            }
+        };
+        events.into_iter().map(numbered).collect()
+    }
+
+    /// Makes numbered events known. They must come in the order of their numbers.
+    pub fn publish_events(&self, events: Vec<Event>) {
+        let Some(seq) = events.last().map(|e| e.seq) else { return };
+        let mut ring = self.ring();
+        for event in events {
+            if ring.events.len() == EVENTS_KEPT
+                && let Some(oldest) = ring.events.pop_front()
+            {
+                ring.evicted = oldest.seq;
+            }
+            ring.events.push_back(Arc::new(event));
+        }
+        ring.published = seq;
+        drop(ring);
+        self.head.send_replace(seq);
+    }
+
+    /// Makes a snapshot known, after the events of its report.
+    pub fn publish(&self, snapshot: Snapshot) {
+        let mut ring = self.ring();
+        ring.last_seq += 1;
+        ring.snapshots += 1;
+        ring.history.record(&snapshot.report);
+        let published = Arc::new(Published {
+            seq: ring.last_seq,
+            ordinal: ring.snapshots,
+            snapshot,
+            body: OnceLock::new(),
+        });
+        if ring.positions.len() == POSITIONS_KEPT {
+            ring.positions.pop_front();
+        }
+        ring.positions.push_back(published);
+        let seq = ring.last_seq;
+        ring.published = seq;
+        drop(ring);
+        self.head.send_replace(seq);
+    }
+
+    /// Wakes when anything is published.
+    pub fn subscribe(&self) -> watch::Receiver<u64> {
+        self.head.subscribe()
+    }
+
+    pub fn latest(&self) -> Option<Arc<Published>> {
+        self.ring().positions.back().cloned()
+    }
+
+    /// Number of the last event published; the version of the list of alerts.
+    pub fn last_event(&self) -> u64 {
+        let ring = self.ring();
+        ring.events.back().map_or(ring.evicted, |e| e.seq)
+    }
+
+    /// Reads the positions of the past.
+    pub fn history<T>(&self, read: impl FnOnce(&History) -> T) -> T {
+        read(&self.ring().history)
+    }
+
+    /// A reader that starts now, or goes on after `after`. Returns the number it goes on from, whether that
+    /// is where it asked for, and the newest snapshot, which it is to be shown first.
+    pub fn join(&self, after: Option<u64>) -> Joined {
+        let ring = self.ring();
+        let known = after.filter(|a| *a <= ring.published);
+        let seq = known.unwrap_or(ring.published);
+        Joined {
+            seq,
+            resumed: known.is_some(),
+            latest: ring.positions.back().cloned(),
+            cursor: Cursor {
+                event_seq: seq,
+                ordinal: ring.snapshots,
+            },
+        }
+    }
+
+    /// The next thing after `cursor`, which moves past it.
+    pub fn next(&self, cursor: &mut Cursor) -> Next {
+        let ring = self.ring();
+        if cursor.event_seq < ring.evicted {
+            let after = std::mem::replace(&mut cursor.event_seq, ring.evicted);
+            return Next::Journal {
+                after,
+                until: ring.evicted,
+            };
+        }
+        let first = ring.events.partition_point(|e| e.seq <= cursor.event_seq);
+        let event = ring.events.get(first);
+        let late = ring.positions.front().is_none_or(|p| p.ordinal > cursor.ordinal + 1);
+        let positions = if late {
+            ring.positions.back().filter(|p| p.ordinal > cursor.ordinal)
+        } else {
+            let first = ring.positions.partition_point(|p| p.ordinal <= cursor.ordinal);
+            ring.positions.get(first)
+        };
+        match (event, positions) {
+            (Some(event), positions) if positions.is_none_or(|p| event.seq < p.seq) => {
+                cursor.event_seq = event.seq;
+                Next::Event(event.clone())
+            }
+            (_, Some(latest)) => {
+                let missed = latest.ordinal - cursor.ordinal - 1;
+                cursor.ordinal = latest.ordinal;
+                Next::Positions {
+                    latest: latest.clone(),
+                    missed,
+                }
+            }
+            (_, None) => Next::Nothing,
+        }
+    }
+}
+
+/// What a reader starts with.
+#[derive(Debug)]
+pub struct Joined {
+    pub seq: u64,
+    pub resumed: bool,
+    pub latest: Option<Arc<Published>>,
+    pub cursor: Cursor,
+}

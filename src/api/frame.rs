@@ -1,0 +1,108 @@
+use std::sync::Mutex;
+use std::time::{Duration, Instant};
+
+use axum::body::Bytes;
+use axum::extract::State as Shared;
+use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
+use axum::response::{IntoResponse, Response};
+use serde::Deserialize;
+
+use super::extract::{Query, within};
+use super::feed::Published;
+use super::problem::Problem;
+use super::state::State;
+use super::{conditional, picture, positions};
+
+/// A picture is drawn anew at most this often, however many viewers ask.
+const REDRAW: Duration = Duration::from_millis(100);
+/// Side of the picture when no scale is asked for, at least.
+const DEFAULT_SIDE: usize = 512;
+const MAX_SIDE: usize = 2048;
+
+#[derive(Debug, Deserialize, utoipa::IntoParams)]
+#[into_params(parameter_in = Query)]
+#[serde(deny_unknown_fields)]
+pub struct PictureQuery {
+    /// Picture pixels per sensor pixel; so that the picture has at least 512 a side when left out
+    #[param(minimum = 1, maximum = 64)]
+    scale: Option<usize>,
+    /// Whether detections are drawn; true when left out
+    detections: Option<bool>,
+}
+
+type Look = (usize, bool);
+
+/// Pictures of the latest frame, drawn once for all viewers.
+#[derive(Default)]
+pub struct Pictures(Mutex<Drawn>);
+
+#[derive(Default)]
+struct Drawn {
+    seq: u64,
+    at: Option<Instant>,
+    looks: Vec<(Look, Bytes)>,
+}
+
+impl Pictures {
+    fn get(&self, published: &Published, look: Look) -> Option<(u64, Bytes)> {
+        let drawn = self.0.lock().unwrap_or_else(|p| p.into_inner());
+        let fresh = drawn.seq == published.seq || drawn.at.is_some_and(|at| at.elapsed() < REDRAW);
+        let found = drawn.looks.iter().find(|(l, _)| *l == look).filter(|_| fresh)?;
+        Some((drawn.seq, found.1.clone()))
+    }
+
+    fn put(&self, seq: u64, look: Look, png: Bytes) {
+        let mut drawn = self.0.lock().unwrap_or_else(|p| p.into_inner());
+        if drawn.seq != seq {
+            *drawn = Drawn {
+                seq,
+                at: Some(Instant::now()),
+                looks: Vec::new(),
+            };
+        }
+        if drawn.looks.len() < 8 {
+            drawn.looks.push((look, png));
+        }
+    }
+}
+
+/// The latest frame as a picture, +x to the right and +y up, with its detections drawn
+#[utoipa::path(get, path = "/v1/frame.png", tag = "positions", params(PictureQuery),
+    responses(
+        (status = 200, description = "The picture", body = Vec<u8>, content_type = "image/png"),
+        (status = 304, description = "Nothing new since the ETag given in If-None-Match"),
+        (status = 400, description = "A parameter cannot be read", body = Problem, content_type = "application/problem+json"),
+        (status = 503, description = "There is no usable frame", body = Problem, content_type = "application/problem+json"),
+    ))]
+pub async fn frame_png(
+    Shared(state): Shared<State>,
+    Query(query): Query<PictureQuery>,
+    headers: HeaderMap,
+) -> Result<Response, Problem> {
+    let latest = positions::latest(&state)?;
+    let none = || Problem::later(StatusCode::SERVICE_UNAVAILABLE, 1, "the latest step had no usable frame");
+    let frame = latest.snapshot.frame.clone().ok_or_else(none)?;
+    let (ny, nx) = frame.pixels.dim();
+    let side = nx.max(ny).max(1);
+    let scale = match query.scale {
+        Some(scale) => within("scale", scale, 1, (MAX_SIDE / side).clamp(1, 64))?,
+        None => DEFAULT_SIDE.div_ceil(side).clamp(1, 64),
+    };
+    let look = (scale, query.detections.unwrap_or(true));
+    let (seq, png) = match state.pictures.get(&latest, look) {
+        Some(drawn) => drawn,
+        None => {
+            let published = latest.clone();
+            let draw = move || picture::png(&frame, &published.snapshot, look.0, look.1);
+            let drawn = tokio::task::spawn_blocking(draw).await.expect("drawing does not panic");
+            let png = drawn.map_err(|e| Problem::new(StatusCode::INTERNAL_SERVER_ERROR, e.to_string()))?;
+            let png = Bytes::from(png);
+            state.pictures.put(latest.seq, look, png.clone());
+            (latest.seq, png)
+        }
+    };
+    Ok(conditional::answer(&headers, seq, || {
+        let kind = HeaderValue::from_static("image/png");
+        ([(header::CONTENT_TYPE, kind)], png).into_response()
+    }))
+}

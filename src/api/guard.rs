@@ -1,0 +1,199 @@
+//! What a browser on this machine may be tricked into: another site's page that calls us by a name it controls (DNS
+//! rebinding) or sends requests across origins. And how often anyone may ask.
+
+use std::hash::{BuildHasher, RandomState};
+use std::net::{IpAddr, SocketAddr};
+use std::num::NonZeroU32;
+use std::sync::Arc;
+
+use axum::extract::{ConnectInfo, Request, State as Shared};
+use axum::http::{HeaderMap, Method, StatusCode, Uri, header};
+use axum::middleware::Next;
+use axum::response::{IntoResponse, Response};
+use governor::clock::{Clock, DefaultClock};
+use governor::{DefaultDirectRateLimiter, Quota, RateLimiter};
+
+use super::config::Config;
+use super::problem::Problem;
+use crate::metric;
+
+/// Clients share this many buckets by a keyed hash of their address, so that memory is bounded whoever asks.
+const BUCKETS: usize = 1024;
+
+/// Which names and origins are ours.
+pub struct Origins {
+    /// Whether a request's `Host` must be ours: when no token protects us.
+    check_host: bool,
+    hosts: Vec<String>,
+    origins: Vec<String>,
+}
+
+impl Origins {
+    pub fn new(config: &Config, token_required: bool) -> Self {
+        Self {
+            check_host: !token_required,
+            hosts: config.allowed_hosts.iter().map(|h| h.to_ascii_lowercase()).collect(),
+            origins: config.allowed_origins.clone(),
+        }
+    }
+
+    /// A plain address cannot be rebound; of names only those we know are ours.
+    fn knows_host(&self, host: &str) -> bool {
+        let name = host_name(host).to_ascii_lowercase();
+        let address = name.trim_start_matches('[').trim_end_matches(']');
+        address.parse::<IpAddr>().is_ok()
+            || name == "localhost"
+            || name.ends_with(".localhost")
+            || self.hosts.contains(&name)
+    }
+
+    fn knows_origin(&self, headers: &HeaderMap, host: Option<&str>) -> bool {
+        let Some(origin) = headers.get(header::ORIGIN) else { return true };
+        let Ok(origin) = origin.to_str() else { return false };
+        let own = origin.split_once("://").map(|(_, authority)| authority);
+        own.is_some() && own == host || self.origins.iter().any(|o| o == origin)
+    }
+}
+
+/// The host of `host[:port]`.
+fn host_name(authority: &str) -> &str {
+    match authority.rsplit_once(':') {
+        Some((name, port)) if port.bytes().all(|b| b.is_ascii_digit()) && !name.ends_with(':') => name,
+        _ => authority,
+    }
+}
+
+fn authority<'a>(uri: &'a Uri, headers: &'a HeaderMap) -> Option<&'a str> {
+    let named = headers.get(header::HOST).and_then(|h| h.to_str().ok());
+    uri.authority().map(|a| a.as_str()).or(named)
+}
+
+fn refuse(reason: &'static str, problem: Problem) -> Response {
+    metrics::counter!(metric::HTTP_REFUSED, "reason" => reason).increment(1);
+    problem.into_response()
+}
+
+/// Refuses names that are not ours, and changes and streams that another site's page asks for.
+pub async fn origin(Shared(ours): Shared<Arc<Origins>>, request: Request, next: Next) -> Response {
+    let headers = request.headers();
+    let host = authority(request.uri(), headers);
+    if let Some(host) = host.filter(|h| ours.check_host && !ours.knows_host(h)) {
+        let detail = format!("this server is not called {host:?}; if it should be, add it to api.allowed_hosts");
+        return refuse("host", Problem::new(StatusCode::MISDIRECTED_REQUEST, detail));
+    }
+    let reads = [Method::GET, Method::HEAD, Method::OPTIONS].contains(request.method());
+    let upgrade = headers.contains_key(header::UPGRADE);
+    if (!reads || upgrade) && !ours.knows_origin(headers, host) {
+        let detail = "a page of another origin may not do this; api.allowed_origins lists those that may";
+        return refuse("origin", Problem::new(StatusCode::FORBIDDEN, detail));
+    }
+    next.run(request).await
+}
+
+/// Request rates by client address.
+pub struct Rates {
+    buckets: Vec<DefaultDirectRateLimiter>,
+    hasher: RandomState,
+    clock: DefaultClock,
+}
+
+impl Rates {
+    pub fn new(per_second: NonZeroU32) -> Self {
+        let quota = Quota::per_second(per_second).allow_burst(per_second.saturating_mul(NonZeroU32::MIN.saturating_add(1)));
+        Self {
+            buckets: (0..BUCKETS).map(|_| RateLimiter::direct(quota)).collect(),
+            hasher: RandomState::new(),
+            clock: DefaultClock::default(),
+        }
+    }
+
+    /// Seconds to wait, if the client has asked too often. One IPv6 client has a whole /64.
+    fn excess(&self, client: IpAddr) -> Option<u64> {
+        let key = match client.to_canonical() {
+            IpAddr::V4(v4) => u128::from(u32::from(v4)),
+            IpAddr::V6(v6) => u128::from(v6) >> 64 << 64 | 1,
+        };
+        let bucket = &self.buckets[self.hasher.hash_one(key) as usize % BUCKETS];
+        let until = bucket.check().err()?;
+        Some(until.wait_time_from(self.clock.now()).as_secs() + 1)
+    }
+}
+
+pub async fn rate(
+    Shared(rates): Shared<Arc<Rates>>,
+    ConnectInfo(client): ConnectInfo<SocketAddr>,
+    request: Request,
+    next: Next,
+) -> Response {
+    match rates.excess(client.ip()) {
+        None => next.run(request).await,
+        Some(seconds) => {
+            let detail = "more requests than api.requests_per_second allows";
+            refuse("rate", Problem::later(StatusCode::TOO_MANY_REQUESTS, seconds, detail))
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_our_names_and_plain_addresses_are_hosts() {
+        let config = Config {
+            allowed_hosts: vec!["UAV.local".into()],
+            ..Config::default()
+        };
+        let ours = Origins::new(&config, false);
+        for (host, known) in [
+            ("localhost:8787", true),
+            ("LOCALHOST", true),
+            ("watch.localhost:1", true),
+            ("127.0.0.1:8787", true),
+            ("[::1]:8787", true),
+            ("[::1]", true),
+            ("10.1.2.3", true),
+            ("uav.local:8787", true),
+            ("evil.example:8787", false),
+            ("localhost.evil.example", false),
+            ("127.0.0.1.evil.example", false),
+            ("", false),
+        ] {
+            assert_eq!(ours.knows_host(host), known, "{host}");
+        }
+    }
+
+    #[test]
+    fn an_origin_is_ours_when_it_is_the_host_or_listed() {
+        let config = Config {
+            allowed_origins: vec!["https://ops.example.org".into()],
+            ..Config::default()
+        };
+        let ours = Origins::new(&config, true);
+        for (origin, known) in [
+            (None, true),
+            (Some("http://127.0.0.1:8787"), true),
+            (Some("https://ops.example.org"), true),
+            (Some("http://127.0.0.1:9"), false),
+            (Some("https://evil.example"), false),
+            (Some("null"), false),
+        ] {
+            let mut headers = HeaderMap::new();
+            if let Some(origin) = origin {
+                headers.insert(header::ORIGIN, origin.parse().expect("a header"));
+            }
+            assert_eq!(ours.knows_origin(&headers, Some("127.0.0.1:8787")), known, "{origin:?}");
+        }
+    }
+
+    #[test]
+    fn a_client_that_asks_too_often_is_told_to_wait_and_others_are_not() {
+        let rates = Rates::new(NonZeroU32::new(5).expect("not zero"));
+        let client: IpAddr = "192.0.2.1".parse().expect("an address");
+        let let_through = (0..50).filter(|_| rates.excess(client).is_none()).count();
+        assert!((10..=12).contains(&let_through), "{let_through}");
+        let others = (1..=100u8).map(|k| IpAddr::from([198, 51, 100, k]));
+        let served = others.filter(|o| rates.excess(*o).is_none()).count();
+        assert!(served >= 99, "{served} of 100 others; one may share the bucket");
+    }
+}

@@ -1,0 +1,56 @@
+use axum::Json;
+use axum::Router;
+use axum::routing::get;
+use utoipa::openapi::security::{HttpAuthScheme, HttpBuilder, SecurityScheme};
+use utoipa::{Modify, OpenApi};
+use utoipa_axum::router::OpenApiRouter;
+use utoipa_axum::routes;
+
+use super::state::State;
+use super::{alerts, claims, frame, positions, probes, sse, websocket};
+
+#[derive(OpenApi)]
+#[openapi(
+    info(title = "oapwatch", description = "Positions and alerts of a UAV-mounted optical access point's monitor."),
+    modifiers(&Bearer),
+    security(("bearer" = [])),
+)]
+struct Described;
+
+struct Bearer;
+
+impl Modify for Bearer {
+    fn modify(&self, openapi: &mut utoipa::openapi::OpenApi) {
+        let scheme = HttpBuilder::new()
+            .scheme(HttpAuthScheme::Bearer)
+            .description(Some("Asked for when token files are configured. Read-only tokens may only GET."))
+            .build();
+        let components = openapi.components.get_or_insert_default();
+        components.add_security_scheme("bearer", SecurityScheme::Http(scheme));
+    }
+}
+
+/// The routes, and their description made from the same code.
+pub fn router() -> (Router<State>, utoipa::openapi::OpenApi) {
+    OpenApiRouter::with_openapi(Described::openapi())
+        .routes(routes!(positions::positions))
+        .routes(routes!(positions::user_position))
+        .routes(routes!(positions::history))
+        .routes(routes!(positions::status))
+        .routes(routes!(alerts::list))
+        .routes(routes!(alerts::get))
+        .routes(routes!(alerts::acknowledge))
+        .routes(routes!(claims::post))
+        .routes(routes!(frame::frame_png))
+        .routes(routes!(websocket::websocket))
+        .routes(routes!(sse::events))
+        .routes(routes!(probes::healthz))
+        .routes(routes!(probes::readyz))
+        .routes(routes!(probes::metrics))
+        .split_for_parts()
+}
+
+/// Serves the description.
+pub fn serve(description: utoipa::openapi::OpenApi) -> Router<State> {
+    Router::new().route("/openapi.json", get(move || async move { Json(description) }))
+}

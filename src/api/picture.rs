@@ -1,0 +1,111 @@
+//! A frame as a picture: the pixels in a perceptually even colour map, marks by shape and by colours that
+//! colour-blind readers can tell apart (Okabe and Ito, 2008).
+
+use image::{ImageEncoder, Rgb, RgbImage};
+
+use super::snapshot::Snapshot;
+use crate::frame::Frame;
+use crate::monitor::PositionStatus;
+
+/// Dark blue through magenta to light yellow, evenly spaced; lightness rises evenly.
+const COLOURS: [[f64; 3]; 6] = [
+    [4.0, 5.0, 20.0],
+    [51.0, 18.0, 93.0],
+    [129.0, 37.0, 108.0],
+    [206.0, 68.0, 76.0],
+    [247.0, 143.0, 40.0],
+    [250.0, 251.0, 170.0],
+];
+const UNUSABLE: Rgb<u8> = Rgb([0, 110, 110]);
+
+/// PNG of a frame, `scale` picture pixels a sensor pixel; row 0 (y_min) is at the bottom.
+pub fn png(frame: &Frame, snapshot: &Snapshot, scale: usize, detections: bool) -> Result<Vec<u8>, image::ImageError> {
+    let (ny, nx) = frame.pixels.dim();
+    let (low, high) = range(frame);
+    let mut picture = RgbImage::from_fn((nx * scale) as u32, (ny * scale) as u32, |px, py| {
+        let column = px as usize / scale;
+        let row = ny - 1 - py as usize / scale;
+        let value = frame.pixels[[row, column]];
+        let masked = frame.masked.as_ref().is_some_and(|m| m[[row, column]]);
+        if masked || !value.is_finite() {
+            UNUSABLE
+        } else {
+            colour((value - low) / (high - low))
+        }
+    });
+    if detections {
+        let camera = &snapshot.camera;
+        for emitter in &snapshot.report.emitters {
+            let [x, y] = camera.to_sensor([emitter.x_m, emitter.y_m]);
+            let px = (x - camera.x.min_m) / camera.x.pitch_m * scale as f64;
+            let py = (ny as f64 - (y - camera.y.min_m) / camera.y.pitch_m) * scale as f64;
+            mark(&mut picture, [px, py], emitter.status);
+        }
+    }
+    let mut out = Vec::new();
+    let encoder = image::codecs::png::PngEncoder::new(&mut out);
+    encoder.write_image(&picture, picture.width(), picture.height(), image::ExtendedColorType::Rgb8)?;
+    Ok(out)
+}
+
+/// Values shown darkest and lightest: the median, so that noise is dark, and the brightest pixel.
+fn range(frame: &Frame) -> (f64, f64) {
+    let mut values: Vec<f64> = frame.pixels.iter().copied().filter(|v| v.is_finite()).collect();
+    if values.is_empty() {
+        return (0.0, 1.0);
+    }
+    let middle = values.len() / 2;
+    let high = values.iter().copied().fold(f64::MIN, f64::max);
+    let (_, low, _) = values.select_nth_unstable_by(middle, f64::total_cmp);
+    (*low, if high > *low { high } else { *low + 1.0 })
+}
+
+/// Square-root stretch: weak beams beside strong ones stay visible.
+fn colour(share: f64) -> Rgb<u8> {
+    let place = share.clamp(0.0, 1.0).sqrt() * (COLOURS.len() - 1) as f64;
+    let k = (place as usize).min(COLOURS.len() - 2);
+    let t = place - k as f64;
+    Rgb(std::array::from_fn(|c| (COLOURS[k][c] * (1.0 - t) + COLOURS[k + 1][c] * t).round() as u8))
+}
+
+/// Distance, in picture pixels, of a point from the outline of a mark.
+fn outline(status: PositionStatus, dx: f64, dy: f64) -> f64 {
+    let radius = 11.0;
+    let circle = (dx.hypot(dy) - radius).abs();
+    match status {
+        PositionStatus::Verified => circle,
+        PositionStatus::Pending if (dy.atan2(dx) * 4.0 / std::f64::consts::PI).rem_euclid(2.0) < 1.0 => circle,
+        PositionStatus::Pending => f64::INFINITY,
+        PositionStatus::Mismatch => (dx.abs() + dy.abs() - 1.3 * radius).abs() * std::f64::consts::FRAC_1_SQRT_2,
+        PositionStatus::Unclaimed => {
+            let square = (dx.abs().max(dy.abs()) - radius).abs();
+            let inside = dx.abs().max(dy.abs()) < radius + 6.0 && dx.abs().max(dy.abs()) > radius - 5.0;
+            let diagonal = (dx.abs() - dy.abs()).abs() * std::f64::consts::FRAC_1_SQRT_2;
+            if inside { square.min(diagonal) } else { square }
+        }
+    }
+}
+
+fn mark(picture: &mut RgbImage, [cx, cy]: [f64; 2], status: PositionStatus) {
+    let ink = match status {
+        PositionStatus::Verified => Rgb([86, 180, 233]),
+        PositionStatus::Pending => Rgb([255, 255, 255]),
+        PositionStatus::Mismatch => Rgb([240, 228, 66]),
+        PositionStatus::Unclaimed => Rgb([255, 80, 60]),
+    };
+    let reach = 20;
+    for py in (cy as i64 - reach)..=(cy as i64 + reach) {
+        for px in (cx as i64 - reach)..=(cx as i64 + reach) {
+            let (Ok(x), Ok(y)) = (u32::try_from(px), u32::try_from(py)) else { continue };
+            if x >= picture.width() || y >= picture.height() {
+                continue;
+            }
+            let distance = outline(status, px as f64 + 0.5 - cx, py as f64 + 0.5 - cy);
+            if distance < 1.2 {
+                picture.put_pixel(x, y, ink);
+            } else if distance < 2.4 {
+                picture.put_pixel(x, y, Rgb([0, 0, 0]));
+            }
+        }
+    }
+}

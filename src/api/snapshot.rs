@@ -1,0 +1,120 @@
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use jiff::Timestamp;
+use serde::Serialize;
+
+use crate::frame::Frame;
+use crate::monitor::{AlertKind, Report};
+use crate::optics::Camera;
+
+/// Everything the outside may see of one step. Built by the daemon, shared by all readers.
+#[derive(Clone, Debug)]
+pub struct Snapshot {
+    pub report: Report,
+    /// The pixels the report was made from; `None` when the step had no usable frame.
+    pub frame: Option<Arc<Frame>>,
+    pub camera: Arc<Camera>,
+    pub status: Status,
+}
+
+/// How the monitor itself is doing.
+#[derive(Clone, Debug, Serialize, utoipa::ToSchema)]
+pub struct Status {
+    pub version: &'static str,
+    #[schema(value_type = String, format = DateTime)]
+    pub started_at: Timestamp,
+    pub source: SourceStatus,
+    pub frames: FrameCounts,
+    pub latency: Latency,
+    pub claims: ClaimsStatus,
+    pub journal: JournalStatus,
+    pub webhooks: Vec<WebhookStatus>,
+    pub estimator: String,
+    /// Alerts not cleared, by kind.
+    pub alerts_open: BTreeMap<AlertKind, u64>,
+    /// Half-widths of the watched area on the ground, m.
+    pub field_of_view_m: [f64; 2],
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, utoipa::ToSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum SourceState {
+    /// No frame has arrived yet.
+    Starting,
+    Running,
+    /// Frames arrive but none can be used: the sensor is blinded, frozen or broken.
+    Blind,
+    /// No frames arrive.
+    Lost,
+    /// The recording came to its end.
+    Ended,
+}
+
+#[derive(Clone, Debug, Serialize, utoipa::ToSchema)]
+pub struct SourceStatus {
+    /// "simulator", "v4l2" or "replay".
+    pub kind: String,
+    pub state: SourceState,
+    /// Frames per second, over the last seconds.
+    pub rate_hz: f64,
+    #[schema(value_type = Option<String>, format = DateTime)]
+    pub last_good_frame_at: Option<Timestamp>,
+    /// Why the latest frame could not be used.
+    pub fault: Option<String>,
+}
+
+#[derive(Clone, Copy, Debug, Default, Serialize, utoipa::ToSchema)]
+pub struct FrameCounts {
+    pub captured: u64,
+    pub dropped: u64,
+    pub unusable: u64,
+}
+
+/// Time from a frame's arrival to its report, over the last frames.
+#[derive(Clone, Copy, Debug, Default, Serialize, utoipa::ToSchema)]
+pub struct Latency {
+    pub last_us: u64,
+    pub median_us: u64,
+    pub p99_us: u64,
+}
+
+#[derive(Clone, Debug, Default, Serialize, utoipa::ToSchema)]
+pub struct ClaimsStatus {
+    /// The log that is followed, if any.
+    pub log: Option<String>,
+    pub accepted: u64,
+    pub malformed: u64,
+    /// Users with an active claim.
+    pub users: u64,
+    #[schema(value_type = Option<String>, format = DateTime)]
+    pub last_at: Option<Timestamp>,
+}
+
+#[derive(Clone, Debug, Serialize, utoipa::ToSchema)]
+pub struct JournalStatus {
+    /// Whether alerts reach the disk.
+    pub healthy: bool,
+    /// "memory" when no file is configured.
+    pub place: String,
+    pub fault: Option<String>,
+}
+
+/// One webhook endpoint, without its secret and without the query of its URL.
+#[derive(Clone, Debug, Serialize, utoipa::ToSchema)]
+pub struct WebhookStatus {
+    pub url: String,
+    pub queued: u64,
+    pub delivered: u64,
+    pub failed: u64,
+    /// The receiver answered 410 and is left alone.
+    pub disabled: bool,
+    pub last_error: Option<String>,
+}
+
+impl SourceStatus {
+    /// Whether good frames flow.
+    pub fn flows(&self) -> bool {
+        self.state == SourceState::Running
+    }
+}

@@ -1,0 +1,94 @@
+//! Names of all metrics, by Prometheus conventions: base units, `_total` on counters, no user ids as labels.
+//! Rooms count with the `metrics` macros under these names; what a name means is described here and nowhere else.
+
+use metrics::Unit;
+use metrics_exporter_prometheus::{BuildError, Matcher, PrometheusBuilder, PrometheusRecorder};
+
+pub const FRAMES_CAPTURED: &str = "oapwatch_frames_captured_total";
+pub const FRAMES_DROPPED: &str = "oapwatch_frames_dropped_total";
+pub const FRAMES_UNUSABLE: &str = "oapwatch_frames_unusable_total";
+pub const LAST_GOOD_FRAME: &str = "oapwatch_last_good_frame_timestamp_seconds";
+/// Label `stage`: one of [`STAGES`].
+pub const STAGE_DURATION: &str = "oapwatch_stage_duration_seconds";
+/// From the end of the exposure to the published report.
+pub const FRAME_LATENCY: &str = "oapwatch_frame_latency_seconds";
+/// Label `status`: verified, mismatch, unclaimed, pending.
+pub const EMITTERS: &str = "oapwatch_emitters";
+pub const USERS_UNSEEN: &str = "oapwatch_users_unseen";
+/// Label `kind`.
+pub const ALERTS_RAISED: &str = "oapwatch_alerts_raised_total";
+/// Label `kind`.
+pub const ALERTS_OPEN: &str = "oapwatch_alerts_open";
+/// Label `outcome`: accepted, malformed, refused.
+pub const CLAIMS: &str = "oapwatch_claims_total";
+pub const CLAIMS_LAST: &str = "oapwatch_claims_last_timestamp_seconds";
+/// Label `outcome`: delivered, failed, disabled.
+pub const WEBHOOK_DELIVERIES: &str = "oapwatch_webhook_deliveries_total";
+pub const WEBHOOKS_QUEUED: &str = "oapwatch_webhook_queued";
+pub const WEBHOOK_OLDEST: &str = "oapwatch_webhook_oldest_queued_age_seconds";
+pub const JOURNAL_SIZE: &str = "oapwatch_journal_size_bytes";
+pub const JOURNAL_ERRORS: &str = "oapwatch_journal_errors_total";
+/// 1 while alerts reach the disk.
+pub const JOURNAL_HEALTHY: &str = "oapwatch_journal_healthy";
+/// Labels `method`, `route` (the pattern, never the path) and `status`.
+pub const HTTP_REQUESTS: &str = "oapwatch_http_requests_total";
+/// Label `route`.
+pub const HTTP_DURATION: &str = "oapwatch_http_request_duration_seconds";
+pub const HTTP_CONNECTIONS: &str = "oapwatch_http_connections";
+/// Label `reason`: connections, rate, token, host.
+pub const HTTP_REFUSED: &str = "oapwatch_http_refused_total";
+/// Label `protocol`: websocket, sse.
+pub const STREAM_CLIENTS: &str = "oapwatch_stream_clients";
+pub const STREAM_POSITIONS_MISSED: &str = "oapwatch_stream_positions_missed_total";
+/// Always 1; label `version`.
+pub const BUILD_INFO: &str = "oapwatch_build_info";
+
+/// Values of the label `stage`, in the order of the chain.
+pub const STAGES: [&str; 4] = ["estimate", "monitor", "journal", "publish"];
+
+const LATENCY_BUCKETS: [f64; 14] = [
+    50e-6, 100e-6, 250e-6, 500e-6, 1e-3, 2.5e-3, 5e-3, 10e-3, 25e-3, 50e-3, 100e-3, 250e-3, 1.0, 5.0,
+];
+
+/// The process's recorder. Install it once (`metrics::set_global_recorder`) and then call [`describe`].
+pub fn recorder() -> Result<PrometheusRecorder, BuildError> {
+    Ok(PrometheusBuilder::new()
+        .set_buckets_for_metric(Matcher::Suffix("_seconds".into()), &LATENCY_BUCKETS)?
+        .build_recorder())
+}
+
+/// Gives every metric its help text, and counters that must not be absent their zero.
+pub fn describe() {
+    use metrics::{counter, describe_counter as c, describe_gauge as g, describe_histogram as h, gauge};
+
+    c!(FRAMES_CAPTURED, "Frames the source delivered.");
+    c!(FRAMES_DROPPED, "Frames replaced by a newer one before they were looked at.");
+    c!(FRAMES_UNUSABLE, "Frames that could not be used: wrong shape, error-flagged, no usable pixel.");
+    g!(LAST_GOOD_FRAME, Unit::Seconds, "Unix time of the last frame that gave a result.");
+    h!(STAGE_DURATION, Unit::Seconds, "Time a frame spends in each stage.");
+    h!(FRAME_LATENCY, Unit::Seconds, "Time from a frame's arrival to its published report.");
+    g!(EMITTERS, "Beams seen in the latest frame, by status.");
+    g!(USERS_UNSEEN, "Active users in view that no beam answers for.");
+    c!(ALERTS_RAISED, "Alerts raised, by kind.");
+    g!(ALERTS_OPEN, "Alerts not yet cleared, by kind.");
+    c!(CLAIMS, "Claims received, by outcome.");
+    g!(CLAIMS_LAST, Unit::Seconds, "Unix time of the newest claim accepted.");
+    c!(WEBHOOK_DELIVERIES, "Webhook delivery attempts, by outcome.");
+    g!(WEBHOOKS_QUEUED, "Webhook deliveries that wait.");
+    g!(WEBHOOK_OLDEST, Unit::Seconds, "Age of the oldest webhook delivery that waits.");
+    g!(JOURNAL_SIZE, Unit::Bytes, "Size of the journal on disk.");
+    c!(JOURNAL_ERRORS, "Writes to the journal that failed.");
+    g!(JOURNAL_HEALTHY, "1 while alerts reach the disk, else 0.");
+    c!(HTTP_REQUESTS, "Requests answered, by method, route and status.");
+    h!(HTTP_DURATION, Unit::Seconds, "Time to answer a request, by route.");
+    g!(HTTP_CONNECTIONS, "Open connections.");
+    c!(HTTP_REFUSED, "Connections and requests turned away, by reason.");
+    g!(STREAM_CLIENTS, "Open streams, by protocol.");
+    c!(STREAM_POSITIONS_MISSED, "Position messages that slow readers lost.");
+    g!(BUILD_INFO, "The running version; always 1.");
+
+    for name in [FRAMES_CAPTURED, FRAMES_DROPPED, FRAMES_UNUSABLE, STREAM_POSITIONS_MISSED, JOURNAL_ERRORS] {
+        counter!(name).increment(0);
+    }
+    gauge!(BUILD_INFO, "version" => env!("CARGO_PKG_VERSION")).set(1.0);
+}

@@ -1,0 +1,4 @@
+//! The API from outside, over real connections.
+
+mod fake;
+mod rest;
