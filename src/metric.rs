@@ -9,9 +9,9 @@ pub const FRAMES_DROPPED: &str = "oapwatch_frames_dropped_total";
 pub const FRAMES_UNUSABLE: &str = "oapwatch_frames_unusable_total";
 pub const LAST_GOOD_FRAME: &str = "oapwatch_last_good_frame_timestamp_seconds";
 /// Label `stage`: one of [`STAGES`].
-pub const STAGE_DURATION: &str = "oapwatch_stage_duration_seconds";
+pub const STAGE_SECONDS: &str = "oapwatch_stage_duration_seconds";
 /// From the end of the exposure to the published report.
-pub const FRAME_LATENCY: &str = "oapwatch_frame_latency_seconds";
+pub const FRAME_SECONDS: &str = "oapwatch_frame_latency_seconds";
 /// Label `status`: verified, mismatch, unclaimed, pending.
 pub const EMITTERS: &str = "oapwatch_emitters";
 pub const USERS_UNSEEN: &str = "oapwatch_users_unseen";
@@ -33,7 +33,7 @@ pub const JOURNAL_HEALTHY: &str = "oapwatch_journal_healthy";
 /// Labels `method`, `route` (the pattern, never the path) and `status`.
 pub const HTTP_REQUESTS: &str = "oapwatch_http_requests_total";
 /// Label `route`.
-pub const HTTP_DURATION: &str = "oapwatch_http_request_duration_seconds";
+pub const HTTP_SECONDS: &str = "oapwatch_http_request_duration_seconds";
 pub const HTTP_CONNECTIONS: &str = "oapwatch_http_connections";
 /// Label `reason`: connections, rate, token, host.
 pub const HTTP_REFUSED: &str = "oapwatch_http_refused_total";
@@ -62,11 +62,25 @@ pub fn describe() {
     use metrics::{counter, describe_counter as c, describe_gauge as g, describe_histogram as h, gauge};
 
     c!(FRAMES_CAPTURED, "Frames the source delivered.");
-    c!(FRAMES_DROPPED, "Frames replaced by a newer one before they were looked at.");
-    c!(FRAMES_UNUSABLE, "Frames that could not be used: wrong shape, error-flagged, no usable pixel.");
-    g!(LAST_GOOD_FRAME, Unit::Seconds, "Unix time of the last frame that gave a result.");
-    h!(STAGE_DURATION, Unit::Seconds, "Time a frame spends in each stage.");
-    h!(FRAME_LATENCY, Unit::Seconds, "Time from a frame's arrival to its published report.");
+    c!(
+        FRAMES_DROPPED,
+        "Frames replaced by a newer one before they were looked at."
+    );
+    c!(
+        FRAMES_UNUSABLE,
+        "Frames that could not be used: wrong shape, error-flagged, no usable pixel."
+    );
+    g!(
+        LAST_GOOD_FRAME,
+        Unit::Seconds,
+        "Unix time of the last frame that gave a result."
+    );
+    h!(STAGE_SECONDS, Unit::Seconds, "Time a frame spends in each stage.");
+    h!(
+        FRAME_SECONDS,
+        Unit::Seconds,
+        "Time from a frame's arrival to its published report."
+    );
     g!(EMITTERS, "Beams seen in the latest frame, by status.");
     g!(USERS_UNSEEN, "Active users in view that no beam answers for.");
     c!(ALERTS_RAISED, "Alerts raised, by kind.");
@@ -75,19 +89,29 @@ pub fn describe() {
     g!(CLAIMS_LAST, Unit::Seconds, "Unix time of the newest claim accepted.");
     c!(WEBHOOK_DELIVERIES, "Webhook delivery attempts, by outcome.");
     g!(WEBHOOKS_QUEUED, "Webhook deliveries that wait.");
-    g!(WEBHOOK_OLDEST, Unit::Seconds, "Age of the oldest webhook delivery that waits.");
+    g!(
+        WEBHOOK_OLDEST,
+        Unit::Seconds,
+        "Age of the oldest webhook delivery that waits."
+    );
     g!(JOURNAL_SIZE, Unit::Bytes, "Size of the journal on disk.");
     c!(JOURNAL_ERRORS, "Writes to the journal that failed.");
     g!(JOURNAL_HEALTHY, "1 while alerts reach the disk, else 0.");
     c!(HTTP_REQUESTS, "Requests answered, by method, route and status.");
-    h!(HTTP_DURATION, Unit::Seconds, "Time to answer a request, by route.");
+    h!(HTTP_SECONDS, Unit::Seconds, "Time to answer a request, by route.");
     g!(HTTP_CONNECTIONS, "Open connections.");
     c!(HTTP_REFUSED, "Connections and requests turned away, by reason.");
     g!(STREAM_CLIENTS, "Open streams, by protocol.");
     c!(STREAM_POSITIONS_MISSED, "Position messages that slow readers lost.");
     g!(BUILD_INFO, "The running version; always 1.");
 
-    for name in [FRAMES_CAPTURED, FRAMES_DROPPED, FRAMES_UNUSABLE, STREAM_POSITIONS_MISSED, JOURNAL_ERRORS] {
+    for name in [
+        FRAMES_CAPTURED,
+        FRAMES_DROPPED,
+        FRAMES_UNUSABLE,
+        STREAM_POSITIONS_MISSED,
+        JOURNAL_ERRORS,
+    ] {
         counter!(name).increment(0);
     }
     gauge!(BUILD_INFO, "version" => env!("CARGO_PKG_VERSION")).set(1.0);

@@ -1,16 +1,15 @@
 use axum::extract::State as Shared;
 use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
 use axum::response::Response;
-use base64::Engine;
-use base64::prelude::BASE64_URL_SAFE_NO_PAD;
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 use tokio::sync::oneshot;
 
 use super::extract::{Path, Query, within};
 use super::problem::Problem;
-use super::state::{Acknowledged, AlertQuery, AlertStore, Command, State, StoreError};
+use super::state::{Acknowledged, Command, State};
 use super::{conditional, respond};
+use crate::journal::{self, Cursor, Filter, Journal};
 use crate::monitor::{Alert, AlertKind, AlertState};
 
 const DEFAULT_LIMIT: usize = 100;
@@ -41,35 +40,25 @@ pub struct Page {
     next_cursor: Option<String>,
 }
 
-fn encode(alert: &Alert) -> String {
-    BASE64_URL_SAFE_NO_PAD.encode(format!("{} {}", alert.raised_at, alert.id))
-}
-
-fn decode(cursor: &str) -> Result<(Timestamp, String), Problem> {
-    let read = || {
-        let bytes = BASE64_URL_SAFE_NO_PAD.decode(cursor).ok()?;
-        let text = String::from_utf8(bytes).ok()?;
-        let (time, id) = text.split_once(' ')?;
-        Some((time.parse().ok()?, id.to_owned()))
-    };
-    read().ok_or_else(|| {
-        Problem::new(
-            StatusCode::BAD_REQUEST,
-            format!("cursor: expected the next_cursor of an earlier page, found {cursor:?}"),
-        )
-    })
+fn cursor(text: &str) -> Result<Cursor, Problem> {
+    text.parse()
+        .map_err(|e: journal::Error| Problem::new(StatusCode::BAD_REQUEST, format!("cursor: {e}")))
 }
 
 /// Runs a read of the journal where blocking is allowed.
 pub(super) async fn read<T: Send + 'static>(
     state: &State,
-    read: impl FnOnce(&dyn AlertStore) -> Result<T, StoreError> + Send + 'static,
+    read: impl FnOnce(&Journal) -> Result<T, journal::Error> + Send + 'static,
 ) -> Result<T, Problem> {
-    let alerts = state.alerts.clone();
-    let outcome = tokio::task::spawn_blocking(move || read(&*alerts)).await;
+    let journal = state.journal.clone();
+    let outcome = tokio::task::spawn_blocking(move || read(&journal)).await;
     outcome.expect("a read does not panic").map_err(|e| {
-        tracing::error!("{e}");
-        Problem::later(StatusCode::SERVICE_UNAVAILABLE, 5, "the journal cannot be read at the moment")
+        tracing::error!("the journal cannot be read: {e}");
+        Problem::later(
+            StatusCode::SERVICE_UNAVAILABLE,
+            5,
+            "the journal cannot be read at the moment",
+        )
     })
 }
 
@@ -88,19 +77,16 @@ pub async fn list(
 ) -> Result<Response, Problem> {
     let version = state.feed.last_event();
     let limit = within("limit", query.limit.unwrap_or(DEFAULT_LIMIT), 1, MAX_LIMIT)?;
-    let wanted = AlertQuery {
+    let filter = Filter {
         state: query.state,
         kind: query.kind,
         since: query.since,
-        before: query.cursor.as_deref().map(decode).transpose()?,
-        limit: limit + 1,
+        after: query.cursor.as_deref().map(cursor).transpose()?,
     };
-    let mut alerts = read(&state, move |store| store.list(&wanted)).await?;
-    let more = alerts.len() > limit;
-    alerts.truncate(limit);
+    let found = read(&state, move |journal| journal.alerts(&filter, limit)).await?;
     let page = Page {
-        next_cursor: alerts.last().filter(|_| more).map(encode),
-        alerts,
+        next_cursor: found.next.map(|c| c.to_string()),
+        alerts: found.alerts,
     };
     let mut response = conditional::answer(&headers, version, || respond::json(&page));
     if let Some(link) = page.next_cursor.as_deref().and_then(|c| next_link(&query, limit, c)) {
@@ -121,7 +107,9 @@ fn next_link(query: &ListQuery, limit: usize, cursor: &str) -> Option<HeaderValu
     if let Some(since) = query.since {
         pairs.append_pair("since", &since.to_string());
     }
-    pairs.append_pair("limit", &limit.to_string()).append_pair("cursor", cursor);
+    pairs
+        .append_pair("limit", &limit.to_string())
+        .append_pair("cursor", cursor);
     HeaderValue::from_str(&format!("</v1/alerts?{}>; rel=\"next\"", pairs.finish())).ok()
 }
 
@@ -142,7 +130,7 @@ pub async fn get(
 ) -> Result<Response, Problem> {
     let version = state.feed.last_event();
     let wanted = id.clone();
-    let alert = read(&state, move |store| store.get(&wanted)).await?;
+    let alert = read(&state, move |journal| journal.alert(&wanted)).await?;
     let alert = alert.ok_or_else(|| unknown(&id))?;
     Ok(conditional::answer(&headers, version, || respond::json(&alert)))
 }

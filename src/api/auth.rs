@@ -55,7 +55,10 @@ fn read(files: &[(&'static str, PathBuf, Access)]) -> Result<Vec<([u8; 32], Acce
             path: path.clone(),
             source,
         })?;
-        let lines = text.lines().map(str::trim).filter(|l| !l.is_empty() && !l.starts_with('#'));
+        let lines = text
+            .lines()
+            .map(str::trim)
+            .filter(|l| !l.is_empty() && !l.starts_with('#'));
         let before = all.len();
         all.extend(lines.map(|token| (digest(token.as_bytes()), *access)));
         if all.len() == before {
@@ -74,7 +77,10 @@ fn warn_of_readers(path: &Path) {
     let Ok(meta) = std::fs::metadata(path) else { return };
     let mode = meta.permissions().mode() & 0o777;
     if mode & 0o077 != 0 {
-        tracing::warn!("{}: mode {mode:03o} lets others read this secret; 600 is right", path.display());
+        tracing::warn!(
+            "{}: mode {mode:03o} lets others read this secret; 600 is right",
+            path.display()
+        );
     }
 }
 
@@ -129,7 +135,9 @@ impl Tokens {
 fn presented(headers: &HeaderMap, websocket: bool) -> Option<Vec<u8>> {
     if let Some(value) = headers.get(header::AUTHORIZATION) {
         let (scheme, token) = value.to_str().ok()?.split_once(' ')?;
-        return scheme.eq_ignore_ascii_case("bearer").then(|| token.trim().as_bytes().to_owned());
+        return scheme
+            .eq_ignore_ascii_case("bearer")
+            .then(|| token.trim().as_bytes().to_owned());
     }
     if !websocket {
         return None;

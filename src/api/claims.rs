@@ -43,7 +43,11 @@ impl Intake {
 }
 
 pub(super) fn busy() -> Problem {
-    Problem::later(StatusCode::SERVICE_UNAVAILABLE, 1, "the monitor is too busy to take this now")
+    Problem::later(
+        StatusCode::SERVICE_UNAVAILABLE,
+        1,
+        "the monitor is too busy to take this now",
+    )
 }
 
 /// Hands a command to the compute thread; a full queue is overload.
@@ -80,7 +84,9 @@ fn parse(body: &[u8], intake: &mut Intake) -> Vec<(usize, Claim)> {
 
 /// Claims come as JSON or NDJSON. Clients that say nothing, or name no more than curl does by itself, are believed.
 fn check_media_type(headers: &HeaderMap) -> Result<(), Problem> {
-    let Some(value) = headers.get(header::CONTENT_TYPE) else { return Ok(()) };
+    let Some(value) = headers.get(header::CONTENT_TYPE) else {
+        return Ok(());
+    };
     let named = value.to_str().unwrap_or_default();
     let essence = named.split(';').next().unwrap_or_default().trim().to_ascii_lowercase();
     let taken = [

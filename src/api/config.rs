@@ -35,10 +35,7 @@ pub enum ConfigError {
     )]
     OpenToAll { listen: SocketAddr },
     #[error("api.{missing}: expected a file, since api.{given} is set; found nothing")]
-    HalfTls {
-        given: &'static str,
-        missing: &'static str,
-    },
+    HalfTls { given: &'static str, missing: &'static str },
     #[error("api.{field}: expected {expected}, found {found}")]
     OutOfRange {
         field: &'static str,

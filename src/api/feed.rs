@@ -7,12 +7,14 @@
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock};
 
+use jiff::Timestamp;
 use serde::Serialize;
 use tokio::sync::watch;
 
 use super::history::History;
 use super::snapshot::Snapshot;
 use crate::claim::Claim;
+use crate::journal::Recorded;
 use crate::monitor::{AlertEvent, Report};
 
 /// Positions kept for readers that are a moment late.
@@ -21,14 +23,6 @@ const POSITIONS_KEPT: usize = 16;
 const EVENTS_KEPT: usize = 1024;
 /// Claims drawn on the map at most; a log may hold 10,000 users elsewhere.
 const CLAIMS_SHOWN: usize = 500;
-
-/// A numbered alert event. Numbers are strictly increasing, also from one run of the daemon to the next.
-#[derive(Clone, Debug, PartialEq, Serialize, utoipa::ToSchema)]
-pub struct Event {
-    pub seq: u64,
-    #[serde(flatten)]
-    pub event: AlertEvent,
-}
 
 /// A numbered snapshot, with its JSON made once for all readers.
 #[derive(Debug)]
@@ -52,10 +46,16 @@ pub struct Cursor {
 pub enum Next {
     /// Nothing new.
     Nothing,
-    Event(Arc<Event>),
-    Positions { latest: Arc<Published>, missed: u64 },
+    Event(Arc<Recorded>),
+    Positions {
+        latest: Arc<Published>,
+        missed: u64,
+    },
     /// Events after `after`, up to and including `until`, are to be read from the journal.
-    Journal { after: u64, until: u64 },
+    Journal {
+        after: u64,
+        until: u64,
+    },
 }
 
 /// Shared by the compute thread, which writes, and all readers.
@@ -75,7 +75,7 @@ struct Ring {
     evicted: u64,
     snapshots: u64,
     positions: VecDeque<Arc<Published>>,
-    events: VecDeque<Arc<Event>>,
+    events: VecDeque<Arc<Recorded>>,
     history: History,
 }
 
@@ -128,13 +128,14 @@ impl Feed {
         self.ring.lock().unwrap_or_else(|poisoned| poisoned.into_inner())
     }
 
-    /// Numbers events, for the journal to write before they are published.
-    pub fn number(&self, events: Vec<AlertEvent>) -> Vec<Event> {
+    /// Numbers events of `at` (the frames' clock), for the journal to write before they are published.
+    pub fn number(&self, events: Vec<AlertEvent>, at: Timestamp) -> Vec<Recorded> {
         let mut ring = self.ring();
         let numbered = |event| {
             ring.last_seq += 1;
-            Event {
+            Recorded {
                 seq: ring.last_seq,
+                at,
                 event,
             }
         };
@@ -142,8 +143,10 @@ impl Feed {
     }
 
     /// Makes numbered events known. They must come in the order of their numbers.
-    pub fn publish_events(&self, events: Vec<Event>) {
-        let Some(seq) = events.last().map(|e| e.seq) else { return };
+    pub fn publish_events(&self, events: Vec<Recorded>) {
+        let Some(seq) = events.last().map(|e| e.seq) else {
+            return;
+        };
         let mut ring = self.ring();
         for event in events {
             if ring.events.len() == EVENTS_KEPT

@@ -80,7 +80,13 @@ pub async fn frame_png(
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
     let latest = positions::latest(&state)?;
-    let none = || Problem::later(StatusCode::SERVICE_UNAVAILABLE, 1, "the latest step had no usable frame");
+    let none = || {
+        Problem::later(
+            StatusCode::SERVICE_UNAVAILABLE,
+            1,
+            "the latest step had no usable frame",
+        )
+    };
     let frame = latest.snapshot.frame.clone().ok_or_else(none)?;
     let (ny, nx) = frame.pixels.dim();
     let side = nx.max(ny).max(1);

@@ -48,7 +48,9 @@ impl Origins {
     }
 
     fn knows_origin(&self, headers: &HeaderMap, host: Option<&str>) -> bool {
-        let Some(origin) = headers.get(header::ORIGIN) else { return true };
+        let Some(origin) = headers.get(header::ORIGIN) else {
+            return true;
+        };
         let Ok(origin) = origin.to_str() else { return false };
         let own = origin.split_once("://").map(|(_, authority)| authority);
         own.is_some() && own == host || self.origins.iter().any(|o| o == origin)
@@ -99,7 +101,8 @@ pub struct Rates {
 
 impl Rates {
     pub fn new(per_second: NonZeroU32) -> Self {
-        let quota = Quota::per_second(per_second).allow_burst(per_second.saturating_mul(NonZeroU32::MIN.saturating_add(1)));
+        let quota =
+            Quota::per_second(per_second).allow_burst(per_second.saturating_mul(NonZeroU32::MIN.saturating_add(1)));
         Self {
             buckets: (0..BUCKETS).map(|_| RateLimiter::direct(quota)).collect(),
             hasher: RandomState::new(),

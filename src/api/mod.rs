@@ -29,12 +29,10 @@ mod websocket;
 
 pub use auth::TokenError;
 pub use config::{Config, ConfigError};
-pub use feed::{Event, Feed};
+pub use feed::Feed;
 pub use server::{Error, Server};
-pub use snapshot::{
-    ClaimsStatus, FrameCounts, JournalStatus, Latency, Snapshot, SourceState, SourceStatus, Status, WebhookStatus,
-};
-pub use state::{Acknowledged, AlertQuery, AlertStore, Command, State, StoreError};
+pub use snapshot::{ClaimsStatus, FrameCounts, JournalStatus, Latency, Snapshot, SourceState, SourceStatus, Status};
+pub use state::{Acknowledged, Command, State};
 
 use std::num::NonZeroU32;
 use std::sync::Arc;
@@ -76,13 +74,19 @@ fn router(state: State, config: &Config, tokens: Arc<auth::Tokens>) -> Router {
         .layer(from_fn_with_state(origins, guard::origin))
         .layer(cors(config))
         .layer(from_fn_with_state(rates, guard::rate))
-        .layer(TimeoutLayer::with_status_code(StatusCode::REQUEST_TIMEOUT, ANSWER_WITHIN))
+        .layer(TimeoutLayer::with_status_code(
+            StatusCode::REQUEST_TIMEOUT,
+            ANSWER_WITHIN,
+        ))
         .layer(CatchPanicLayer::new())
         .layer(from_fn(problem::for_every_error))
         .layer(fixed(header::X_CONTENT_TYPE_OPTIONS, "nosniff"))
         .layer(fixed(header::X_FRAME_OPTIONS, "DENY"))
         .layer(fixed(header::REFERRER_POLICY, "no-referrer"))
-        .layer(fixed(HeaderName::from_static("cross-origin-opener-policy"), "same-origin"))
+        .layer(fixed(
+            HeaderName::from_static("cross-origin-opener-policy"),
+            "same-origin",
+        ))
         .layer(from_fn(measure))
         .with_state(state)
 }
@@ -118,7 +122,7 @@ async fn measure(request: Request, next: Next) -> Response {
     };
     let response = next.run(request).await;
     let status = response.status().as_u16().to_string();
-    metrics::histogram!(metric::HTTP_DURATION, "route" => route.clone()).record(started.elapsed());
+    metrics::histogram!(metric::HTTP_SECONDS, "route" => route.clone()).record(started.elapsed());
     metrics::counter!(metric::HTTP_REQUESTS, "method" => method, "route" => route, "status" => status).increment(1);
     response
 }

@@ -44,7 +44,12 @@ pub fn png(frame: &Frame, snapshot: &Snapshot, scale: usize, detections: bool) -
     }
     let mut out = Vec::new();
     let encoder = image::codecs::png::PngEncoder::new(&mut out);
-    encoder.write_image(&picture, picture.width(), picture.height(), image::ExtendedColorType::Rgb8)?;
+    encoder.write_image(
+        &picture,
+        picture.width(),
+        picture.height(),
+        image::ExtendedColorType::Rgb8,
+    )?;
     Ok(out)
 }
 
@@ -65,7 +70,9 @@ fn colour(share: f64) -> Rgb<u8> {
     let place = share.clamp(0.0, 1.0).sqrt() * (COLOURS.len() - 1) as f64;
     let k = (place as usize).min(COLOURS.len() - 2);
     let t = place - k as f64;
-    Rgb(std::array::from_fn(|c| (COLOURS[k][c] * (1.0 - t) + COLOURS[k + 1][c] * t).round() as u8))
+    Rgb(std::array::from_fn(|c| {
+        (COLOURS[k][c] * (1.0 - t) + COLOURS[k + 1][c] * t).round() as u8
+    }))
 }
 
 /// Distance, in picture pixels, of a point from the outline of a mark.
@@ -96,7 +103,9 @@ fn mark(picture: &mut RgbImage, [cx, cy]: [f64; 2], status: PositionStatus) {
     let reach = 20;
     for py in (cy as i64 - reach)..=(cy as i64 + reach) {
         for px in (cx as i64 - reach)..=(cx as i64 + reach) {
-            let (Ok(x), Ok(y)) = (u32::try_from(px), u32::try_from(py)) else { continue };
+            let (Ok(x), Ok(y)) = (u32::try_from(px), u32::try_from(py)) else {
+                continue;
+            };
             if x >= picture.width() || y >= picture.height() {
                 continue;
             }

@@ -28,7 +28,9 @@ pub(super) fn latest(state: &State) -> Result<std::sync::Arc<Published>, Problem
     ))]
 pub async fn positions(Shared(state): Shared<State>, headers: HeaderMap) -> Result<Response, Problem> {
     let latest = latest(&state)?;
-    Ok(conditional::answer(&headers, latest.seq, || respond::json(&latest.snapshot.report)))
+    Ok(conditional::answer(&headers, latest.seq, || {
+        respond::json(&latest.snapshot.report)
+    }))
 }
 
 /// Where one user is and where they say they are
@@ -71,7 +73,9 @@ pub async fn user_position(
     ))]
 pub async fn status(Shared(state): Shared<State>, headers: HeaderMap) -> Result<Response, Problem> {
     let latest = latest(&state)?;
-    Ok(conditional::answer(&headers, latest.seq, || respond::json(&latest.snapshot.status)))
+    Ok(conditional::answer(&headers, latest.seq, || {
+        respond::json(&latest.snapshot.status)
+    }))
 }
 
 #[derive(Debug, Deserialize, utoipa::IntoParams)]

@@ -76,7 +76,10 @@ impl Server {
             _ => None,
         };
         if tls.is_none() && !config.listen.ip().to_canonical().is_loopback() {
-            tracing::warn!("the API listens on {} without TLS: tokens travel in the clear", config.listen);
+            tracing::warn!(
+                "the API listens on {} without TLS: tokens travel in the clear",
+                config.listen
+            );
         }
         Ok(Self { config, tokens, tls })
     }
@@ -223,7 +226,9 @@ impl<S> Accept<TcpStream, S> for Limited {
             return std::future::ready(Err(io::ErrorKind::ConnectionRefused.into()));
         };
         let socket = socket2::SockRef::from(&stream);
-        let prepared = socket.set_send_buffer_size(SEND_BUFFER).and(socket.set_tcp_nodelay(true));
+        let prepared = socket
+            .set_send_buffer_size(SEND_BUFFER)
+            .and(socket.set_tcp_nodelay(true));
         if let Err(e) = prepared {
             return std::future::ready(Err(e));
         }

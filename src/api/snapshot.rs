@@ -6,6 +6,7 @@ use serde::Serialize;
 
 use crate::frame::Frame;
 use crate::monitor::{AlertKind, Report};
+use crate::notify::EndpointStatus;
 use crate::optics::Camera;
 
 /// Everything the outside may see of one step. Built by the daemon, shared by all readers.
@@ -29,7 +30,7 @@ pub struct Status {
     pub latency: Latency,
     pub claims: ClaimsStatus,
     pub journal: JournalStatus,
-    pub webhooks: Vec<WebhookStatus>,
+    pub webhooks: Vec<EndpointStatus>,
     pub estimator: String,
     /// Alerts not cleared, by kind.
     pub alerts_open: BTreeMap<AlertKind, u64>,
@@ -98,18 +99,6 @@ pub struct JournalStatus {
     /// "memory" when no file is configured.
     pub place: String,
     pub fault: Option<String>,
-}
-
-/// One webhook endpoint, without its secret and without the query of its URL.
-#[derive(Clone, Debug, Serialize, utoipa::ToSchema)]
-pub struct WebhookStatus {
-    pub url: String,
-    pub queued: u64,
-    pub delivered: u64,
-    pub failed: u64,
-    /// The receiver answered 410 and is left alone.
-    pub disabled: bool,
-    pub last_error: Option<String>,
 }
 
 impl SourceStatus {

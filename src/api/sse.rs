@@ -23,18 +23,20 @@ use super::websocket::{StreamQuery, stopped};
         (status = 200, description = "An endless stream", body = feed::Message, content_type = "text/event-stream"),
         (status = 400, description = "A parameter cannot be read", body = Problem, content_type = "application/problem+json"),
     ))]
-pub async fn events(
-    Shared(state): Shared<State>,
-    Query(query): Query<StreamQuery>,
-    headers: HeaderMap,
-) -> Response {
-    let last_seen = headers.get("last-event-id").and_then(|v| v.to_str().ok()).and_then(|v| v.parse().ok());
+pub async fn events(Shared(state): Shared<State>, Query(query): Query<StreamQuery>, headers: HeaderMap) -> Response {
+    let last_seen = headers
+        .get("last-event-id")
+        .and_then(|v| v.to_str().ok())
+        .and_then(|v| v.parse().ok());
     let mut stopping = state.stopping.subscribe();
     let reader = Reader::join(state, last_seen.or(query.after)).await;
     let counted = super::server::Counted::stream("sse");
     let messages = stream::unfold((reader, counted), |(mut reader, counted)| async move {
         let message = reader.next().await;
-        let event = Event::default().event(message.kind).id(message.seq.to_string()).data(message.text);
+        let event = Event::default()
+            .event(message.kind)
+            .id(message.seq.to_string())
+            .data(message.text);
         Some((Ok::<_, Infallible>(event), (reader, counted)))
     });
     let until_stop = async move { stopped(&mut stopping).await };

@@ -1,14 +1,14 @@
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
-use jiff::Timestamp;
 use metrics_exporter_prometheus::PrometheusHandle;
 use tokio::sync::{mpsc, oneshot, watch};
 
-use super::feed::{Event, Feed};
+use super::feed::Feed;
 use super::frame::Pictures;
 use crate::claim::Claim;
-use crate::monitor::{Alert, AlertKind, AlertState};
+use crate::journal::Journal;
+use crate::monitor::Alert;
 
 /// What the handlers work with. The daemon builds it; cloning is cheap.
 #[derive(Clone)]
@@ -16,7 +16,7 @@ pub struct State {
     pub feed: Arc<Feed>,
     /// To the compute thread. Full means overload: the client is told to come back.
     pub commands: mpsc::Sender<Command>,
-    pub alerts: Arc<dyn AlertStore>,
+    pub journal: Journal,
     pub metrics: PrometheusHandle,
     /// The model is loaded and the pipeline runs; `/readyz` asks for good frames besides.
     pub ready: Arc<AtomicBool>,
@@ -29,14 +29,14 @@ impl State {
     pub fn new(
         feed: Arc<Feed>,
         commands: mpsc::Sender<Command>,
-        alerts: Arc<dyn AlertStore>,
+        journal: Journal,
         metrics: PrometheusHandle,
         ready: Arc<AtomicBool>,
     ) -> Self {
         Self {
             feed,
             commands,
-            alerts,
+            journal,
             metrics,
             ready,
             pictures: Arc::default(),
@@ -66,31 +66,3 @@ pub enum Acknowledged {
     Unknown,
     AlreadyCleared,
 }
-
-/// The alerts of the past and the present, as the journal keeps them. Calls may block on the disk.
-pub trait AlertStore: Send + Sync + 'static {
-    /// Alerts that answer to `query`, newest first.
-    fn list(&self, query: &AlertQuery) -> Result<Vec<Alert>, StoreError>;
-
-    fn get(&self, id: &str) -> Result<Option<Alert>, StoreError>;
-
-    /// Events numbered above `after` up to `until`, in order, `limit` at most.
-    fn events(&self, after: u64, until: u64, limit: usize) -> Result<Vec<Event>, StoreError>;
-}
-
-/// Which alerts to list.
-#[derive(Clone, Debug, Default)]
-pub struct AlertQuery {
-    pub state: Option<AlertState>,
-    pub kind: Option<AlertKind>,
-    /// Raised at this time or later.
-    pub since: Option<Timestamp>,
-    /// Older than this alert: raised earlier, or at the same time with a smaller id.
-    pub before: Option<(Timestamp, String)>,
-    pub limit: usize,
-}
-
-/// The journal could not be read.
-#[derive(Debug, thiserror::Error)]
-#[error("the journal cannot be read: {0}")]
-pub struct StoreError(#[from] pub Box<dyn std::error::Error + Send + Sync>);

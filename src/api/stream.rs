@@ -6,11 +6,12 @@ use std::sync::Arc;
 use serde::Serialize;
 use tokio::sync::watch;
 
-use super::feed::{Cursor, Event, Joined, Next};
-use super::state::{AlertQuery, State};
 use super::alerts;
+use super::feed::{Cursor, Joined, Next};
+use super::state::State;
+use crate::journal::{Journal, Recorded};
 use crate::metric;
-use crate::monitor::{Alert, AlertState};
+use crate::monitor::Alert;
 
 /// Events read from the journal at a time.
 const JOURNAL_BATCH: usize = 256;
@@ -23,7 +24,10 @@ const ALERTS_SHOWN: usize = 500;
 /// too slow: `missed` counts how many since the last. `alert` is never lost; after a reconnect with `?after=SEQ` all
 /// alert events numbered above SEQ come again, also those of an earlier run of the daemon.
 #[derive(Debug, utoipa::ToSchema)]
-#[allow(dead_code, reason = "describes messages that are put together from parts made once for all readers")]
+#[allow(
+    dead_code,
+    reason = "describes messages that are put together from parts made once for all readers"
+)]
 pub struct Message {
     /// "snapshot", "positions" or "alert".
     r#type: String,
@@ -43,7 +47,7 @@ pub struct Reader {
     cursor: Cursor,
     first: Option<Outgoing>,
     /// Events read back from the journal, to be sent before anything newer.
-    backlog: VecDeque<Arc<Event>>,
+    backlog: VecDeque<Arc<Recorded>>,
     /// How far the journal is still to be read.
     owed: Option<(u64, u64)>,
     head: watch::Receiver<u64>,
@@ -53,7 +57,7 @@ pub struct Reader {
 struct AlertMessage<'a> {
     r#type: &'static str,
     #[serde(flatten)]
-    event: &'a Event,
+    event: &'a Recorded,
 }
 
 #[derive(Serialize)]
@@ -82,15 +86,10 @@ impl Reader {
             latest,
             cursor,
         } = state.feed.join(after);
-        let standing = |s: AlertState| AlertQuery {
-            state: Some(s),
-            limit: ALERTS_SHOWN,
-            ..AlertQuery::default()
-        };
-        let read = move |store: &dyn super::state::AlertStore| {
-            let mut all = store.list(&standing(AlertState::Open))?;
-            all.extend(store.list(&standing(AlertState::Acknowledged))?);
-            all.sort_by(|a, b| (b.raised_at, &b.id).cmp(&(a.raised_at, &a.id)));
+        let read = move |journal: &Journal| {
+            let mut all = journal.open_alerts()?;
+            all.reverse();
+            all.truncate(ALERTS_SHOWN);
             Ok(all)
         };
         let greeting = Greeting {
@@ -155,18 +154,20 @@ impl Reader {
     }
 
     async fn read_back(&mut self, after: u64, until: u64) {
-        let events = alerts::read(&self.state, move |store| store.events(after, until, JOURNAL_BATCH)).await;
+        let events = alerts::read(&self.state, move |journal| journal.events_after(after, JOURNAL_BATCH)).await;
         match events {
             Ok(events) => {
-                self.owed = events.last().filter(|_| events.len() == JOURNAL_BATCH).map(|e| (e.seq, until));
-                self.backlog.extend(events.into_iter().map(Arc::new));
+                let last = events.last().map_or(until, |e| e.seq);
+                self.owed = (last < until && events.len() == JOURNAL_BATCH).then_some((last, until));
+                let owed = events.into_iter().filter(|e| e.seq <= until);
+                self.backlog.extend(owed.map(Arc::new));
             }
             Err(_) => tokio::time::sleep(std::time::Duration::from_secs(1)).await,
         }
     }
 }
 
-fn alert_message(event: &Arc<Event>) -> Outgoing {
+fn alert_message(event: &Arc<Recorded>) -> Outgoing {
     let message = AlertMessage { r#type: "alert", event };
     Outgoing {
         seq: event.seq,

@@ -140,10 +140,21 @@ impl Journal {
     /// `at` is the frames' clock, `now` the wall's. Never waits for the disk. Gives the last sequence number; an
     /// error means the backlog is full and these events are lost to the journal.
     pub fn record(&self, events: &[AlertEvent], at: Timestamp, now: Timestamp) -> Result<u64, Error> {
-        self.shared.push_events(events.len(), |k, seq| Write::Event {
+        self.shared.push_events(events.len(), 0, |k, seq| Write::Event {
             seq,
             event: Arc::new(events[k].clone()),
             at,
+            now,
+        })
+    }
+
+    /// As [`Journal::record`], for events that have their numbers: consecutive and above [`Journal::last_seq`].
+    pub fn record_numbered(&self, events: &[Recorded], now: Timestamp) -> Result<u64, Error> {
+        let first = events.first().map_or(0, |e| e.seq);
+        self.shared.push_events(events.len(), first, |k, seq| Write::Event {
+            seq,
+            event: Arc::new(events[k].event.clone()),
+            at: events[k].at,
             now,
         })
     }

@@ -27,7 +27,7 @@ pub struct Cursor {
 /// An alert event as it stands in the journal.
 #[derive(Clone, Debug, PartialEq, serde::Serialize, utoipa::ToSchema)]
 pub struct Recorded {
-    /// Grows by one an event, over restarts too.
+    /// Grows with every event, over restarts too.
     pub seq: u64,
     /// When it happened, on the frames' clock.
     #[schema(value_type = String, format = DateTime)]

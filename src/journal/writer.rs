@@ -80,8 +80,14 @@ impl Shared {
         }
     }
 
-    /// Hands `n` events to the writer; `make` gets each one's sequence number. Gives the last one's.
-    pub(super) fn push_events(&self, n: usize, mut make: impl FnMut(usize, u64) -> Write) -> Result<u64, Error> {
+    /// Hands `n` events to the writer, numbered from `first` or, where that is taken, from the next free number;
+    /// `make` gets each one's. Gives the last one's.
+    pub(super) fn push_events(
+        &self,
+        n: usize,
+        first: u64,
+        mut make: impl FnMut(usize, u64) -> Write,
+    ) -> Result<u64, Error> {
         let mut queue = lock(&self.queue);
         if queue.events + n > BACKLOG {
             drop(queue);
@@ -92,6 +98,9 @@ impl Shared {
                 lost: health.lost,
                 limit: BACKLOG,
             });
+        }
+        if n > 0 {
+            queue.last_seq = queue.last_seq.max(first.saturating_sub(1));
         }
         for k in 0..n {
             queue.last_seq += 1;

@@ -1,15 +1,16 @@
 //! A daemon without frames: what the API needs from one, under the test's control.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::BTreeMap;
 use std::net::{SocketAddr, TcpListener};
+use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
-use std::sync::{Arc, Mutex};
 
 use jiff::Timestamp;
 use ndarray::Array2;
-use oapwatch::api::{self, Acknowledged, AlertQuery, AlertStore, Command, Config, Event, Feed, Server, State, StoreError};
+use oapwatch::api::{self, Acknowledged, Command, Config, Feed, Server, State};
 use oapwatch::claim::Claim;
 use oapwatch::frame::Frame;
+use oapwatch::journal::{self, Journal};
 use oapwatch::monitor::{
     Alert, AlertEvent, AlertEventKind, AlertKind, AlertSource, AlertState, PositionStatus, Report, Severity,
     TrackedPosition,
@@ -17,43 +18,11 @@ use oapwatch::monitor::{
 use oapwatch::optics;
 use tokio::sync::{mpsc, oneshot};
 
-/// Keeps alerts and events in memory.
-#[derive(Default)]
-pub struct Memory {
-    pub alerts: Mutex<HashMap<String, Alert>>,
-    pub events: Mutex<Vec<Event>>,
-}
-
-impl AlertStore for Memory {
-    fn list(&self, query: &AlertQuery) -> Result<Vec<Alert>, StoreError> {
-        let mut found: Vec<Alert> = self.alerts.lock().unwrap().values().cloned().collect();
-        found.sort_by(|a, b| (b.raised_at, &b.id).cmp(&(a.raised_at, &a.id)));
-        found.retain(|a| {
-            query.state.is_none_or(|s| a.state == s)
-                && query.kind.is_none_or(|k| a.kind == k)
-                && query.since.is_none_or(|t| a.raised_at >= t)
-                && query.before.as_ref().is_none_or(|(t, id)| (a.raised_at, &a.id) < (*t, id))
-        });
-        found.truncate(query.limit);
-        Ok(found)
-    }
-
-    fn get(&self, id: &str) -> Result<Option<Alert>, StoreError> {
-        Ok(self.alerts.lock().unwrap().get(id).cloned())
-    }
-
-    fn events(&self, after: u64, until: u64, limit: usize) -> Result<Vec<Event>, StoreError> {
-        let events = self.events.lock().unwrap();
-        let between = events.iter().filter(|e| e.seq > after && e.seq <= until);
-        Ok(between.take(limit).cloned().collect())
-    }
-}
-
 /// A running API and the strings that move it.
 pub struct Fake {
     pub address: SocketAddr,
     pub feed: Arc<Feed>,
-    pub store: Arc<Memory>,
+    pub journal: Journal,
     pub ready: Arc<AtomicBool>,
     stop: Option<oneshot::Sender<()>>,
     served: tokio::task::JoinHandle<Result<(), api::Error>>,
@@ -65,20 +34,22 @@ pub fn at(second: i64) -> Timestamp {
 
 impl Fake {
     pub async fn start(config: Config) -> Self {
-        Self::resume(config, Arc::new(Memory::default()), 1).await
+        let journal = Journal::open(&journal::Config::default(), Vec::new()).unwrap();
+        Self::resume(config, journal, 1).await
     }
 
     /// Starts on the journal of an earlier run; `now_us` stands for the clock.
-    pub async fn resume(config: Config, store: Arc<Memory>, now_us: u64) -> Self {
+    pub async fn resume(config: Config, journal: Journal, now_us: u64) -> Self {
+        // reqwest is built without a default; a second installation finds the first in place.
+        let _ = rustls::crypto::ring::default_provider().install_default();
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
         let address = listener.local_addr().unwrap();
-        let last = store.events.lock().unwrap().last().map_or(0, |e| e.seq);
-        let feed = Arc::new(Feed::new(last, now_us));
+        let feed = Arc::new(Feed::new(journal.last_seq(), now_us));
         let ready = Arc::new(AtomicBool::new(true));
         let (commands, received) = mpsc::channel(64);
         let metrics = oapwatch::metric::recorder().unwrap().handle();
-        let state = State::new(feed.clone(), commands, store.clone(), metrics, ready.clone());
-        tokio::spawn(answer(received, feed.clone(), store.clone()));
+        let state = State::new(feed.clone(), commands, journal.clone(), metrics, ready.clone());
+        tokio::spawn(answer(received, feed.clone(), journal.clone()));
         let (stop, stopped) = oneshot::channel::<()>();
         let server = Server::new(config).unwrap();
         let served = tokio::spawn(server.serve(listener, state, async {
@@ -87,7 +58,7 @@ impl Fake {
         Self {
             address,
             feed,
-            store,
+            journal,
             ready,
             stop: Some(stop),
             served,
@@ -108,19 +79,19 @@ impl Fake {
         self.feed.publish(snapshot(number));
     }
 
-    pub fn alert(&self, id: &str, second: i64) {
-        publish(&self.feed, &self.store, AlertEventKind::Raised, alert(id, second));
+    pub async fn alert(&self, id: &str, second: i64) {
+        publish(&self.feed, &self.journal, AlertEventKind::Raised, alert(id, second)).await;
     }
 }
 
-fn publish(feed: &Feed, store: &Memory, event: AlertEventKind, alert: Alert) {
-    store.alerts.lock().unwrap().insert(alert.id.clone(), alert.clone());
-    let events = feed.number(vec![AlertEvent { event, alert }]);
-    store.events.lock().unwrap().extend(events.iter().cloned());
+async fn publish(feed: &Feed, journal: &Journal, event: AlertEventKind, alert: Alert) {
+    let events = feed.number(vec![AlertEvent { event, alert }], at(0));
+    journal.record_numbered(&events, at(0)).unwrap();
+    journal.settled().await;
     feed.publish_events(events);
 }
 
-async fn answer(mut received: mpsc::Receiver<Command>, feed: Arc<Feed>, store: Arc<Memory>) {
+async fn answer(mut received: mpsc::Receiver<Command>, feed: Arc<Feed>, journal: Journal) {
     while let Some(command) = received.recv().await {
         match command {
             Command::Claims { claims, reply } => {
@@ -130,13 +101,12 @@ async fn answer(mut received: mpsc::Receiver<Command>, feed: Arc<Feed>, store: A
                 let _ = reply.send(claims.iter().enumerate().filter_map(beyond).collect());
             }
             Command::Acknowledge { id, reply } => {
-                let found = store.alerts.lock().unwrap().get(&id).cloned();
-                let outcome = match found {
+                let outcome = match journal.alert(&id).unwrap() {
                     None => Acknowledged::Unknown,
                     Some(alert) if alert.state == AlertState::Cleared => Acknowledged::AlreadyCleared,
                     Some(mut alert) => {
                         alert.state = AlertState::Acknowledged;
-                        publish(&feed, &store, AlertEventKind::Acknowledged, alert.clone());
+                        publish(&feed, &journal, AlertEventKind::Acknowledged, alert.clone()).await;
                         Acknowledged::Done(Box::new(alert))
                     }
                 };
@@ -204,7 +174,11 @@ pub fn snapshot(number: u64) -> api::Snapshot {
         ],
         unseen: vec!["u-9".into()],
         events: Vec::new(),
-        claims: vec![claim("u-1", 10.0, 20.0), claim("u-2", 90.0, -30.0), claim("u-9", 0.0, -90.0)],
+        claims: vec![
+            claim("u-1", 10.0, 20.0),
+            claim("u-2", 90.0, -30.0),
+            claim("u-9", 0.0, -90.0),
+        ],
     };
     api::Snapshot {
         report,

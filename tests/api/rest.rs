@@ -58,7 +58,9 @@ async fn an_etag_saves_the_transfer_until_something_changes() {
     }
     let tag = get(&fake, "/v1/positions").await.headers()[header::ETAG].clone();
     fake.step(2);
-    let again = Client::new().get(fake.url("/v1/positions")).header(header::IF_NONE_MATCH, &tag);
+    let again = Client::new()
+        .get(fake.url("/v1/positions"))
+        .header(header::IF_NONE_MATCH, &tag);
     assert_eq!(again.send().await.unwrap().status(), StatusCode::OK);
     fake.stop().await;
 }
@@ -67,13 +69,19 @@ async fn an_etag_saves_the_transfer_until_something_changes() {
 async fn alerts_are_paged_newest_first_and_filtered() {
     let fake = Fake::start(Config::default()).await;
     for k in 0..25 {
-        fake.alert(&format!("a-{k:02}"), k / 2);
+        fake.alert(&format!("a-{k:02}"), k / 2).await;
     }
     let mut seen = Vec::new();
     let mut path = "/v1/alerts?limit=10".to_owned();
     loop {
         let page = json_of(get(&fake, &path).await).await;
-        seen.extend(page["alerts"].as_array().unwrap().iter().map(|a| a["id"].as_str().unwrap().to_owned()));
+        seen.extend(
+            page["alerts"]
+                .as_array()
+                .unwrap()
+                .iter()
+                .map(|a| a["id"].as_str().unwrap().to_owned()),
+        );
         match page["next_cursor"].as_str() {
             Some(cursor) => path = format!("/v1/alerts?limit=10&cursor={cursor}"),
             None => break,
@@ -86,7 +94,15 @@ async fn alerts_are_paged_newest_first_and_filtered() {
     assert_eq!(since["alerts"].as_array().unwrap().len(), 3);
     let none = json_of(get(&fake, "/v1/alerts?kind=user_unseen").await).await;
     assert_eq!(none["alerts"], json!([]));
-    for wrong in ["limit=0", "limit=1001", "limit=x", "state=sleeping", "since=yesterday", "cursor=%21", "nosuch=1"] {
+    for wrong in [
+        "limit=0",
+        "limit=1001",
+        "limit=x",
+        "state=sleeping",
+        "since=yesterday",
+        "cursor=%21",
+        "nosuch=1",
+    ] {
         problem(get(&fake, &format!("/v1/alerts?{wrong}")).await, 400).await;
     }
     fake.stop().await;
@@ -95,14 +111,21 @@ async fn alerts_are_paged_newest_first_and_filtered() {
 #[tokio::test]
 async fn an_alert_is_acknowledged_once_and_for_all() {
     let fake = Fake::start(Config::default()).await;
-    fake.alert("a-1", 1);
-    let acknowledge = |id: &str| Client::new().post(fake.url(&format!("/v1/alerts/{id}/acknowledge"))).send();
+    fake.alert("a-1", 1).await;
+    let acknowledge = |id: &str| {
+        Client::new()
+            .post(fake.url(&format!("/v1/alerts/{id}/acknowledge")))
+            .send()
+    };
     for _ in 0..2 {
         let answer = acknowledge("a-1").await.unwrap();
         assert_eq!(answer.status(), StatusCode::OK);
         assert_eq!(json_of(answer).await["state"], "acknowledged");
     }
-    assert_eq!(json_of(get(&fake, "/v1/alerts/a-1").await).await["state"], "acknowledged");
+    assert_eq!(
+        json_of(get(&fake, "/v1/alerts/a-1").await).await["state"],
+        "acknowledged"
+    );
     problem(acknowledge("a-2").await.unwrap(), 404).await;
     fake.stop().await;
 }
@@ -111,7 +134,8 @@ async fn an_alert_is_acknowledged_once_and_for_all() {
 async fn claims_are_counted_and_refused_one_by_one() {
     let fake = Fake::start(Config::default()).await;
     let post = |body: &str| Client::new().post(fake.url("/v1/claims")).body(body.to_owned()).send();
-    let good = r#"{"time":"2026-11-21T08:00:00.000Z","user":"u-17","x_m":12.5,"y_m":-80.0,"sigma_m":1.0,"state":"active"}"#;
+    let good =
+        r#"{"time":"2026-11-21T08:00:00.000Z","user":"u-17","x_m":12.5,"y_m":-80.0,"sigma_m":1.0,"state":"active"}"#;
     let far = r#"{"time":"2026-11-21T08:00:00Z","user":"u-18","x_m":1e9,"y_m":0}"#;
 
     let one = post(good).await.unwrap();
@@ -123,13 +147,21 @@ async fn claims_are_counted_and_refused_one_by_one() {
 
     let mixed = json_of(post(&format!("{good}\n\nnot json\n{far}\n{good}\n")).await.unwrap()).await;
     assert_eq!((&mixed["accepted"], &mixed["refused"]), (&json!(2), &json!(2)));
-    let lines: Vec<u64> = mixed["reasons"].as_array().unwrap().iter().map(|r| r["line"].as_u64().unwrap()).collect();
+    let lines: Vec<u64> = mixed["reasons"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|r| r["line"].as_u64().unwrap())
+        .collect();
     assert_eq!(lines, [3, 4]);
 
     let detail = problem(post("not json").await.unwrap(), 422).await;
     assert!(detail.contains("line 1"), "{detail}");
     problem(post("").await.unwrap(), 422).await;
-    let image = Client::new().post(fake.url("/v1/claims")).header("content-type", "image/png").body(good);
+    let image = Client::new()
+        .post(fake.url("/v1/claims"))
+        .header("content-type", "image/png")
+        .body(good);
     problem(image.send().await.unwrap(), 415).await;
     problem(post(&"x".repeat(5 << 20)).await.unwrap(), 413).await;
     fake.stop().await;
@@ -205,7 +237,9 @@ async fn long_answers_are_compressed_for_those_who_can_read_them() {
     let fake = Fake::start(Config::default()).await;
     let plain = get(&fake, "/openapi.json").await;
     assert!(!plain.headers().contains_key(header::CONTENT_ENCODING));
-    let gzip = Client::new().get(fake.url("/openapi.json")).header(header::ACCEPT_ENCODING, "gzip");
+    let gzip = Client::new()
+        .get(fake.url("/openapi.json"))
+        .header(header::ACCEPT_ENCODING, "gzip");
     let gzip = gzip.send().await.unwrap();
     assert_eq!(gzip.headers()[header::CONTENT_ENCODING], "gzip");
     assert!(gzip.bytes().await.unwrap().len() < plain.bytes().await.unwrap().len() / 2);
