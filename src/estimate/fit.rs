@@ -86,6 +86,10 @@ const LAMBDA_FLOOR: f64 = 1e-14;
 const LAMBDA_CEILING: f64 = 1e10;
 /// A fit has converged after two drops of the deviance below this.
 const SMALL_DROP: f64 = 1e-3;
+/// A fit has also converged where the next step promises less than this.
+const NO_DROP: f64 = 1e-4;
+/// Spots farther apart than this, σ, along either axis need no curved steps.
+const OVERLAP: f64 = 3.0;
 /// |acceleration|² over |velocity|² above which a step is not trusted (Transtrum and Sethna, 2012, eq. 15).
 const LARGEST_ACCELERATION: f64 = 0.56 / 4.0;
 /// Amplitudes stay above this many standard deviations of noise, so that a position keeps its gradient.
@@ -184,6 +188,21 @@ impl Fitter {
         &self.residual
     }
 
+    /// Inner products of the residual with each spot's second derivatives (xx, xy, yy): how it is bent there.
+    pub fn curvatures(&mut self, reading: &Reading, model: &mut Model) -> Vec<[f64; 3]> {
+        self.fit(reading, model, 0);
+        let (mx, my) = (reading.mx, reading.my);
+        let x = |i: usize, d: usize| &self.now.x[(3 * i + d) * mx..(3 * i + d + 1) * mx];
+        let y = |i: usize, d: usize| &self.now.y[(3 * i + d) * my..(3 * i + d + 1) * my];
+        let inner = |i: usize, a: usize, b: usize| {
+            let rows = self.residual.chunks_exact(mx).zip(y(i, b));
+            rows.map(|(row, w)| w * dot(row, x(i, a))).sum::<f64>()
+        };
+        (0..model.spots.len())
+            .map(|i| [inner(i, 2, 0), inner(i, 1, 1), inner(i, 0, 2)])
+            .collect()
+    }
+
     /// Takes what unusable pixels hold out of a residual.
     pub fn clean(&self, reading: &Reading, nuisances: Nuisances, residual: &mut [f64]) {
         for bad in &reading.bad {
@@ -238,6 +257,11 @@ impl Fitter {
         let mut small_drops = 0;
         let mut converged = parameters == nuisances.background_atoms();
         let mut fresh = false;
+        let overlap = self.now.spots.iter().enumerate().any(|(i, s)| {
+            self.now.spots[..i]
+                .iter()
+                .any(|t| (s.u[0] - t.u[0]).abs() < OVERLAP && (s.u[1] - t.u[1]).abs() < OVERLAP)
+        });
         for _ in 0..steps {
             if converged {
                 break;
@@ -247,7 +271,14 @@ impl Fitter {
                 self.linearise(reading, nuisances);
                 fresh = true;
             }
-            let moved = self.step(reading, nuisances, lambda);
+            let moved = self.step(reading, nuisances, lambda, overlap);
+            if moved && lambda <= LAMBDA_START {
+                let expected = dot(&self.velocity[..parameters], &self.gradient[..parameters]);
+                if expected < NO_DROP {
+                    converged = true;
+                    break;
+                }
+            }
             let accepted = moved && {
                 self.evaluate(reading, nuisances, true);
                 self.solve_amplitudes(reading, nuisances, true);
@@ -641,7 +672,7 @@ impl Fitter {
 
     /// Sets the trial hypothesis one damped, accelerated step away. `false` where no step could be had.
     #[inline(always)]
-    fn step(&mut self, reading: &Reading, nuisances: Nuisances, lambda: f64) -> bool {
+    fn step(&mut self, reading: &Reading, nuisances: Nuisances, lambda: f64, overlap: bool) -> bool {
         let n = self.now.spots.len();
         let p = 3 * n + nuisances.count();
         self.factor.clear();
@@ -655,7 +686,12 @@ impl Fitter {
         self.velocity.clear();
         self.velocity.extend_from_slice(&self.gradient[..p]);
         solve(&self.factor, p, &mut self.velocity);
-        self.accelerate(reading, nuisances, p);
+        if overlap {
+            self.accelerate(reading, nuisances, p);
+        } else {
+            self.acceleration.clear();
+            self.acceleration.resize(p, 0.0);
+        }
         let (mut speed, mut turn) = (0.0, 0.0);
         for i in 0..p {
             let scale = self.hessian[i * p + i];

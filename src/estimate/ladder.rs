@@ -22,6 +22,8 @@ pub struct Rung {
 enum Method {
     Peak { is_subpixel: bool },
     Greedy,
+    Pencil { steps: usize },
+    MaximumLikelihood,
 }
 
 /// Every rung offered, cheapest first.
@@ -41,10 +43,25 @@ pub const LADDER: &[Rung] = &[
         summary: "residual peaks added one round at a time, all emitters refitted jointly",
         method: Method::Greedy,
     },
+    Rung {
+        name: "pencil",
+        summary: "half-kernel matrix pencil where spots overlap, amplitudes by least squares",
+        method: Method::Pencil { steps: 0 },
+    },
+    Rung {
+        name: "pencil-fit",
+        summary: "the pencil's seeds and five steps of the joint fit",
+        method: Method::Pencil { steps: 5 },
+    },
+    Rung {
+        name: "ml",
+        summary: "maximum likelihood: pencil or greedy seeds, moves, the number of emitters by a false-alarm test",
+        method: Method::MaximumLikelihood,
+    },
 ];
 
 /// The rung used when none is named.
-pub const DEFAULT: &str = "greedy-fit";
+pub const DEFAULT: &str = "ml";
 
 /// Why an `[estimator]` table describes no estimator.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
@@ -131,7 +148,17 @@ impl Estimator for Analytic {
         let nuisances = Nuisances::default();
         let mut model = match self.rung.method {
             Method::Peak { is_subpixel } => search.peaks(reading, is_subpixel),
-            Method::Greedy => search.greedy(reading, nuisances, 40),
+            Method::Greedy => {
+                let mut model = search.greedy(reading, nuisances);
+                search.shrink(reading, &mut model);
+                model
+            }
+            Method::Pencil { steps } => search.seeded(reading, &self.frame.pixels, steps),
+            Method::MaximumLikelihood => {
+                let mut model = search.start(reading, &self.frame.pixels, nuisances, 60);
+                search.refine(reading, &mut model);
+                model
+            }
         };
         Ok(ground::locate(
             search,

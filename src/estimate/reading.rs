@@ -1,6 +1,7 @@
 //! A frame in the two bases, ready to be fitted.
 
 use super::basis::Basis;
+use super::fit::Model;
 use super::screen::Screened;
 
 /// What a frame may leave outside the basis, in units of the noise.
@@ -86,6 +87,12 @@ impl Reading {
         self.numbers = inside - leverage;
         let left = (nx * ny) as f64 - inside - (self.bad.len() as f64 - leverage);
         self.outside = (0.0, left.max(0.0));
+    }
+
+    /// Whether the model explains the frame to within the noise.
+    pub fn is_explained(&self, model: &Model) -> bool {
+        let freedom = (self.numbers - model.parameters() as f64).max(1.0);
+        model.deviance < freedom + 2.5 * (2.0 * freedom).sqrt() + 2.5
     }
 
     /// Fills `out` (Ny, Nx) with what the basis holds of the frame, Uᵧ Z Uₓᵀ.

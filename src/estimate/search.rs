@@ -2,79 +2,287 @@
 
 use super::fit::{Fitter, Model, Nuisances, Spot};
 use super::heatmap::Heatmap;
+use super::pencil::Pencil;
 use super::reading::Reading;
 
 /// Emitters a frame may hold at most.
 const MOST: usize = 80;
 /// Two greedy peaks of one round stand at least this far apart, σ.
 const SEPARATION: f64 = 2.5;
+/// Steps that a candidate may take before it is judged, and a chosen model before it is reported.
+const TRIAL_STEPS: usize = 30;
+const FINAL_STEPS: usize = 200;
+/// Rounds of moves.
+const ROUNDS: usize = 8;
+/// Spots nearer than this, σ, may be one.
+const MERGE: f64 = 2.5;
+/// A split puts its halves this far to either side, σ.
+const SPLIT: f64 = 0.4;
 
-/// The search's settings that follow from the camera.
+/// The search with its settings that follow from the camera.
 pub(super) struct Search {
     pub fitter: Fitter,
     pub heatmap: Heatmap,
     /// Least drop of the deviance that an emitter must bring.
     pub price: f64,
+    residual: Vec<f64>,
 }
 
 impl Search {
     pub fn new(fitter: Fitter) -> Self {
         let heatmap = Heatmap::new(&fitter.bx, &fitter.by);
         let area = |b: &super::basis::Basis| b.edges[b.n] - b.edges[0];
-        // False alarms: the matched filter has about area/σ² independent positions, each exceeding 13 by chance
-        // in less than 1e-3 of 6 + 2 ln(area/σ²).
+        // The matched filter has about area/σ² independent positions; the price keeps the chance that any of
+        // them exceeds it in an empty frame below 1e-3.
         let price = (6.0 + 2.0 * (area(&fitter.bx) * area(&fitter.by)).ln()).max(13.0);
-        Self { fitter, heatmap, price }
+        Self {
+            fitter,
+            heatmap,
+            price,
+            residual: Vec::new(),
+        }
+    }
+
+    /// What is held against each other: −2 ln likelihood plus the price of the emitters.
+    pub fn score(&self, model: &Model) -> f64 {
+        model.deviance + self.price * model.spots.len() as f64
     }
 
     /// Adds peaks of the residual until none is significant, refitting all emitters each time.
-    pub fn greedy(&mut self, reading: &Reading, nuisances: Nuisances, steps: usize) -> Model {
+    pub fn greedy(&mut self, reading: &Reading, nuisances: Nuisances) -> Model {
         let mut model = Model::empty(nuisances);
-        let mut residual = Vec::new();
-        loop {
-            residual.clear();
-            residual.extend_from_slice(self.fitter.residual_of(reading, &mut model));
-            self.fitter.clean(reading, nuisances, &mut residual);
-            let peaks = self
-                .heatmap
-                .peaks(&residual, reading.mx, reading.my, self.price.sqrt(), SEPARATION);
-            let Some(strongest) = peaks.first() else { break };
-            if model.spots.len() >= MOST {
+        self.fitter.fit(reading, &mut model, TRIAL_STEPS);
+        while model.spots.len() < MOST {
+            let room = MOST - model.spots.len();
+            let mut next = model.clone();
+            let peaks = self.residual_peaks(reading, &mut model);
+            let least = peaks.first().map_or(0.0, |p| 0.1 * p.significance);
+            let strong = peaks.iter().take_while(|p| p.significance >= least).take(room);
+            next.spots.extend(strong.map(|p| Spot { u: p.u, a: p.a }));
+            if next.spots.len() == model.spots.len() {
                 break;
             }
-            let least = 0.1 * strongest.significance;
-            let mut next = model.clone();
-            next.spots.extend(
-                peaks
-                    .iter()
-                    .filter(|p| p.significance >= least)
-                    .take(MOST - model.spots.len())
-                    .map(|p| Spot { u: p.u, a: p.a }),
-            );
-            self.fitter.fit(reading, &mut next, steps);
-            let added = (next.spots.len() - model.spots.len()) as f64;
-            if next.deviance + self.price * added > model.deviance {
+            self.fitter.fit(reading, &mut next, TRIAL_STEPS);
+            if self.score(&next) > self.score(&model) {
                 break;
             }
             model = next;
         }
-        self.drop_insignificant(reading, &mut model, steps);
         model
     }
 
-    /// Drops emitters, weakest first, as long as the fit without them is worse by less than their price.
-    pub fn drop_insignificant(&mut self, reading: &Reading, model: &mut Model, steps: usize) {
-        while !model.spots.is_empty() {
-            let weakest = (0..model.spots.len())
-                .min_by(|&i, &j| model.spots[i].a.total_cmp(&model.spots[j].a))
-                .expect("not empty");
-            let mut next = model.clone();
-            next.spots.remove(weakest);
-            self.fitter.fit(reading, &mut next, steps);
-            if next.deviance > model.deviance + self.price {
+    /// Seeds by the pencil for rising N until the frame is explained.
+    fn pencil(&mut self, reading: &Reading, pixels: &[f64], nuisances: Nuisances, polish: usize) -> Option<Model> {
+        let pencil = Pencil::new(pixels, &self.fitter.bx, &self.fitter.by)?;
+        let mut best = Model::empty(nuisances);
+        self.fitter.fit(reading, &mut best, TRIAL_STEPS);
+        let sure = pencil.strength.iter().take_while(|&&s| s > 4.0).count();
+        let likely = pencil.strength.iter().take_while(|&&s| s > 0.5).count();
+        let mut worse = 0;
+        for count in sure.max(1)..=(likely + 2).min(pencil.most()).min(MOST) {
+            if reading.is_explained(&best) || worse == 2 {
                 break;
             }
+            let Some(seeds) = pencil.seeds(count) else { break };
+            let mut model = Model::empty(nuisances);
+            model.spots.extend(seeds.into_iter().map(|u| Spot { u, a: 0.0 }));
+            self.fitter.fit(reading, &mut model, polish);
+            if self.score(&model) < self.score(&best) {
+                best = model;
+                worse = 0;
+            } else {
+                worse += 1;
+            }
+        }
+        Some(best)
+    }
+
+    /// Seeds by the pencil where spots overlap, by residual peaks elsewhere.
+    pub fn start(&mut self, reading: &Reading, pixels: &[f64], nuisances: Nuisances, polish: usize) -> Model {
+        let model = if Pencil::suits(&self.fitter.bx, &self.fitter.by) {
+            self.pencil(reading, pixels, nuisances, polish)
+        } else {
+            None
+        };
+        model.unwrap_or_else(|| self.greedy(reading, nuisances))
+    }
+
+    /// The number of emitters of least score: moves from `model` until none helps, then a fit to convergence.
+    pub fn refine(&mut self, reading: &Reading, model: &mut Model) {
+        for _ in 0..ROUNDS {
+            let before = self.score(model);
+            if !reading.is_explained(model) {
+                self.fitter.fit(reading, model, FINAL_STEPS);
+            }
+            self.grow(reading, model);
+            self.shrink(reading, model);
+            if before - self.score(model) < 0.1 {
+                break;
+            }
+        }
+        self.fitter.fit(reading, model, FINAL_STEPS);
+    }
+
+    /// Tries `next` and keeps it where it is better.
+    fn consider(&mut self, reading: &Reading, model: &mut Model, mut next: Model) -> bool {
+        if next.spots.len() > MOST {
+            return false;
+        }
+        self.fitter.fit(reading, &mut next, TRIAL_STEPS);
+        let is_better = self.score(&next) < self.score(model) - 1e-6;
+        if is_better {
             *model = next;
         }
+        is_better
+    }
+
+    fn residual_peaks(&mut self, reading: &Reading, model: &mut Model) -> &[super::heatmap::Peak] {
+        self.residual.clear();
+        self.residual.extend_from_slice(self.fitter.residual_of(reading, model));
+        self.fitter.clean(reading, model.nuisances, &mut self.residual);
+        let (mx, my) = (reading.mx, reading.my);
+        // A peak's share that other spots have absorbed comes back in the joint fit: look a little lower.
+        let threshold = 0.7 * self.price.sqrt();
+        self.heatmap.peaks(&self.residual, mx, my, threshold, SEPARATION)
+    }
+
+    /// Adds, splits and relocates.
+    fn grow(&mut self, reading: &Reading, model: &mut Model) {
+        let peaks: Vec<_> = self.residual_peaks(reading, model).iter().take(2).copied().collect();
+        for peak in &peaks {
+            let mut next = model.clone();
+            next.spots.push(Spot { u: peak.u, a: peak.a });
+            if self.consider(reading, model, next) {
+                break;
+            }
+        }
+        if reading.is_explained(model) {
+            return;
+        }
+        for (index, direction) in self.splits(reading, model).into_iter().take(3) {
+            let mut next = model.clone();
+            let spot = next.spots[index];
+            let half = |sign: f64| Spot {
+                u: [0, 1].map(|k| spot.u[k] + sign * SPLIT * direction[k]),
+                a: 0.5 * spot.a,
+            };
+            next.spots[index] = half(1.0);
+            next.spots.push(half(-1.0));
+            if self.consider(reading, model, next) {
+                return;
+            }
+        }
+        if reading.is_explained(model) {
+            return;
+        }
+        let Some(peak) = peaks.first() else { return };
+        let mut weakest: Vec<usize> = (0..model.spots.len()).collect();
+        weakest.sort_by(|&i, &j| model.spots[i].a.total_cmp(&model.spots[j].a));
+        for index in weakest.into_iter().take(3) {
+            let mut next = model.clone();
+            next.spots[index] = Spot { u: peak.u, a: peak.a };
+            if self.consider(reading, model, next) {
+                return;
+            }
+        }
+    }
+
+    /// Merges and drops.
+    pub fn shrink(&mut self, reading: &Reading, model: &mut Model) {
+        loop {
+            let n = model.spots.len();
+            let mut pairs: Vec<(f64, usize, usize)> = (0..n)
+                .flat_map(|i| (0..i).map(move |j| (i, j)))
+                .map(|(i, j)| {
+                    let d = [0, 1].map(|k| model.spots[i].u[k] - model.spots[j].u[k]);
+                    (d[0].hypot(d[1]), i, j)
+                })
+                .filter(|p| p.0 < MERGE)
+                .collect();
+            pairs.sort_by(|a, b| a.0.total_cmp(&b.0));
+            let mut has_shrunk = false;
+            for (_, i, j) in pairs.into_iter().take(3) {
+                let (p, q) = (model.spots[i], model.spots[j]);
+                if self.separation(reading, model, i, j) > 8.0 * self.price {
+                    continue;
+                }
+                let mut next = model.clone();
+                let total = p.a + q.a;
+                next.spots[j] = Spot {
+                    u: [0, 1].map(|k| (p.a * p.u[k] + q.a * q.u[k]) / total),
+                    a: total,
+                };
+                next.spots.remove(i);
+                if self.consider(reading, model, next) {
+                    has_shrunk = true;
+                    break;
+                }
+            }
+            if !has_shrunk && n > 0 {
+                let significance = self.significance(reading, model);
+                let weakest = (0..n)
+                    .min_by(|&i, &j| significance[i].total_cmp(&significance[j]))
+                    .expect("not empty");
+                if significance[weakest] < 4.0 * self.price {
+                    let mut next = model.clone();
+                    next.spots.remove(weakest);
+                    has_shrunk = self.consider(reading, model, next);
+                }
+            }
+            if !has_shrunk {
+                break;
+            }
+        }
+    }
+
+    /// Squared amplitude over its variance, for each spot (Wald's test).
+    fn significance(&mut self, reading: &Reading, model: &mut Model) -> Vec<f64> {
+        let (p, n) = (model.parameters(), model.spots.len());
+        self.fitter.information(reading, model);
+        let mut cov = Vec::new();
+        if !self.fitter.covariance(p, n, 1e-9, &mut cov) {
+            return vec![0.0; n];
+        }
+        (0..n)
+            .map(|i| model.spots[i].a.powi(2) / cov[(3 * i + 2) * p + 3 * i + 2].max(1e-300))
+            .collect()
+    }
+
+    /// Rise of the deviance, to second order, when spots i and j become one.
+    fn separation(&mut self, reading: &Reading, model: &mut Model, i: usize, j: usize) -> f64 {
+        let (p, n) = (model.parameters(), model.spots.len());
+        self.fitter.information(reading, model);
+        let mut cov = Vec::new();
+        if !self.fitter.covariance(p, n, 1e-9, &mut cov) {
+            return 0.0;
+        }
+        let at = |a: usize, r: usize, b: usize, c: usize| cov[(3 * a + r) * p + 3 * b + c];
+        let d = [0, 1].map(|k| model.spots[i].u[k] - model.spots[j].u[k]);
+        let s = [0, 1].map(|r| [0, 1].map(|c| at(i, r, i, c) + at(j, r, j, c) - at(i, r, j, c) - at(j, r, i, c)));
+        let det = s[0][0] * s[1][1] - s[0][1] * s[1][0];
+        (d[0] * d[0] * s[1][1] - 2.0 * d[0] * d[1] * s[0][1] + d[1] * d[1] * s[0][0]) / det.max(1e-300)
+    }
+
+    /// Spots whose residual is bent as that of two, with the direction they lie in; the most bent first.
+    fn splits(&mut self, reading: &Reading, model: &mut Model) -> Vec<(usize, [f64; 2])> {
+        let mut bent: Vec<(f64, usize, [f64; 2])> = self
+            .fitter
+            .curvatures(reading, model)
+            .into_iter()
+            .enumerate()
+            .filter_map(|(i, [xx, xy, yy])| {
+                let (mean, half) = (0.5 * (xx + yy), 0.5 * (xx - yy));
+                let largest = mean + half.hypot(xy);
+                let angle = 0.5 * xy.atan2(half);
+                (largest > 0.0).then(|| (largest, i, [angle.cos(), angle.sin()]))
+            })
+            .collect();
+        bent.sort_by(|a, b| b.0.total_cmp(&a.0));
+        bent.into_iter().map(|(_, i, d)| (i, d)).collect()
+    }
+
+    /// Seeds by the pencil (or residual peaks) with a given number of fit steps, and nothing more.
+    pub fn seeded(&mut self, reading: &Reading, pixels: &[f64], steps: usize) -> Model {
+        self.start(reading, pixels, Nuisances::default(), steps)
     }
 }

@@ -93,6 +93,11 @@ mod tests {
         let (mut f, mut f1, mut f2) = (vec![0.0; n], vec![0.0; n], vec![0.0; n]);
         let (mut lo, mut hi, mut t1, mut t2) = (vec![0.0; n], vec![0.0; n], vec![0.0; n], vec![0.0; n]);
         for (u, w) in [(0.0, 1.0), (0.137, 0.93), (-3.71, 1.1), (5.2, 1.0)] {
+            f.fill(0.0);
+            lo.fill(0.0);
+            hi.fill(0.0);
+            f1.fill(0.0);
+            f2.fill(0.0);
             profile(&edges, u, w, &mut f, &mut f1, &mut f2);
             let h = 1e-4;
             profile(&edges, u - h, w, &mut lo, &mut t1, &mut t2);
