@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use crate::{api, calibrate, claims, estimate, frames, journal, monitor, notify, optics};
+use crate::{api, calibrate, claims, daemon, estimate, frames, journal, monitor, notify, optics, scene};
 
 /// A config file. Every table may be left out.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
@@ -18,6 +18,7 @@ pub struct Config {
     pub api: api::Config,
     pub journal: journal::Config,
     pub webhook: Vec<notify::Config>,
+    pub log: daemon::logging::Config,
 }
 
 /// Why a config file cannot be used.
@@ -33,6 +34,15 @@ pub enum Error {
     },
     #[error("optics.calibration: {0}")]
     Calibration(#[from] calibrate::file::Error),
+}
+
+/// Why there is no camera.
+#[derive(Debug, thiserror::Error)]
+pub enum CameraError {
+    #[error(transparent)]
+    Optics(#[from] optics::Error),
+    #[error(transparent)]
+    Scene(#[from] scene::Error),
 }
 
 /// The known key an unknown one was probably meant to be.
@@ -78,6 +88,30 @@ fn nearest_key(message: &str) -> Nearest {
 }
 
 impl Config {
+    /// The camera that frames come from. Where a scene is simulated and `[optics]` says nothing, it is the scene's.
+    pub fn camera(&self) -> Result<optics::Camera, CameraError> {
+        let is_simulated = self.source.kind == frames::SourceKind::Simulator;
+        let scene = self
+            .source
+            .scene
+            .as_ref()
+            .filter(|_| is_simulated && self.optics == optics::Config::default());
+        Ok(match scene {
+            Some(path) => scene::Scene::load(path)?.optics.camera()?,
+            None => self.optics.camera()?,
+        })
+    }
+
+    /// Names of the tables in which two configs differ.
+    pub fn tables_that_differ(&self, other: &Self) -> Vec<String> {
+        let tables = |config: &Self| toml::Table::try_from(config).expect("a config is plain TOML");
+        let (mine, theirs) = (tables(self), tables(other));
+        mine.iter()
+            .filter(|(name, table)| theirs.get(*name) != Some(*table))
+            .map(|(name, _)| name.clone())
+            .collect()
+    }
+
     /// Reads a config; relative paths in it are taken from the file's own folder.
     pub fn load(path: &Path) -> Result<Self, Error> {
         let mut config: Self = read_toml(path)?;

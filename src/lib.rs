@@ -29,3 +29,4 @@ pub mod study;
 pub mod cli;
 pub mod config;
 pub mod daemon;
+pub mod pipeline;

@@ -15,7 +15,10 @@ fn an_honest_crowd_raises_nothing_and_is_verified() {
         told.expect(&[]);
         let last = told.reports.last().unwrap();
         assert_eq!(last.emitters.len(), 6);
-        assert!(last.emitters.iter().all(|e| e.status == PositionStatus::Verified), "{last:?}");
+        assert!(
+            last.emitters.iter().all(|e| e.status == PositionStatus::Verified),
+            "{last:?}"
+        );
     }
 }
 
@@ -81,8 +84,13 @@ fn a_slow_drift_is_caught_before_it_is_a_metre_beyond() {
 fn a_jump_is_one_mismatch_whatever_its_length() {
     for (seed, length) in [8.0, 14.0, 20.0, 45.0, 120.0].into_iter().enumerate() {
         let mut actors = crowd();
-        actors[0] = Actor::new("u-0", |_| [-80.0, -50.0])
-            .beam(move |t| Some(if t < 10.25 { [-80.0, -50.0] } else { [-80.0, -50.0 + length] }));
+        actors[0] = Actor::new("u-0", |_| [-80.0, -50.0]).beam(move |t| {
+            Some(if t < 10.25 {
+                [-80.0, -50.0]
+            } else {
+                [-80.0, -50.0 + length]
+            })
+        });
         tell(&Story::new(seed as u64, actors)).expect(&[(PositionMismatch, Some("u-0"), 10.25, 11.5)]);
     }
 }
@@ -90,16 +98,21 @@ fn a_jump_is_one_mismatch_whatever_its_length() {
 #[test]
 fn a_claim_that_jumps_is_a_mismatch_too() {
     let mut actors = crowd();
-    actors[0] = Actor::new("u-0", |_| [-80.0, -50.0])
-        .claim(|t| Some(if t < 10.0 { [-80.0, -50.0] } else { [-80.0, 0.0] }));
+    actors[0] =
+        Actor::new("u-0", |_| [-80.0, -50.0]).claim(|t| Some(if t < 10.0 { [-80.0, -50.0] } else { [-80.0, 0.0] }));
     tell(&Story::new(1, actors)).expect(&[(PositionMismatch, Some("u-0"), 10.0, 12.0)]);
 }
 
 #[test]
 fn a_mismatch_clears_when_the_user_is_back() {
     let mut actors = crowd();
-    actors[0] = Actor::new("u-0", |_| [-80.0, -50.0])
-        .beam(|t| Some(if (10.0..15.0).contains(&t) { [-80.0, -38.0] } else { [-80.0, -50.0] }));
+    actors[0] = Actor::new("u-0", |_| [-80.0, -50.0]).beam(|t| {
+        Some(if (10.0..15.0).contains(&t) {
+            [-80.0, -38.0]
+        } else {
+            [-80.0, -50.0]
+        })
+    });
     let told = tell(&Story::new(3, actors));
     told.expect(&[(PositionMismatch, Some("u-0"), 10.0, 11.5)]);
     let cleared = told.cleared();
@@ -122,7 +135,8 @@ fn an_absent_users_claim_answered_from_elsewhere_is_a_mismatch() {
 fn a_user_that_goes_dark_is_unseen() {
     for seed in SEEDS {
         let mut actors = crowd();
-        actors[3] = Actor::new("u-3", |_| [-80.0, 50.0]).beam(|t| (!(10.0..20.0).contains(&t)).then_some([-80.0, 50.0]));
+        actors[3] =
+            Actor::new("u-3", |_| [-80.0, 50.0]).beam(|t| (!(10.0..20.0).contains(&t)).then_some([-80.0, 50.0]));
         let told = tell(&Story::new(seed, actors));
         told.expect(&[(UserUnseen, Some("u-3"), 10.0, 12.5)]);
         assert!((20.0..22.0).contains(&told.cleared()[0].2));
@@ -134,7 +148,10 @@ fn an_unseen_user_and_a_later_intruder_are_two_causes() {
     let mut actors = crowd();
     actors[3] = Actor::new("u-3", |_| [-80.0, 50.0]).beam(|t| (t < 10.0).then_some([-80.0, 50.0]));
     actors.push(Actor::intruder(|t| (t >= 15.0).then_some([20.0, 0.0])));
-    tell(&Story::new(5, actors)).expect(&[(UserUnseen, Some("u-3"), 10.0, 12.5), (UnclaimedEmitter, None, 15.0, 16.0)]);
+    tell(&Story::new(5, actors)).expect(&[
+        (UserUnseen, Some("u-3"), 10.0, 12.5),
+        (UnclaimedEmitter, None, 15.0, 16.0),
+    ]);
 }
 
 #[test]
@@ -181,7 +198,14 @@ fn users_walking_together_raise_nothing() {
 
 #[test]
 fn a_blinded_sensor_is_one_alert() {
-    for kind in [Sensor::Nan, Sensor::Zero, Sensor::Saturated, Sensor::Frozen, Sensor::Nothing, Sensor::LensCap] {
+    for kind in [
+        Sensor::Nan,
+        Sensor::Zero,
+        Sensor::Saturated,
+        Sensor::Frozen,
+        Sensor::Nothing,
+        Sensor::LensCap,
+    ] {
         let mut story = Story::new(8, crowd());
         story.sensor = Box::new(move |t| if (10.0..15.0).contains(&t) { kind } else { Sensor::Fine });
         let told = tell(&story);

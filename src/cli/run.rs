@@ -1,14 +1,34 @@
-use super::Outcome;
+use std::net::SocketAddr;
+use std::path::PathBuf;
+
+use super::{Failure, Outcome};
+use crate::config::Config;
+use crate::daemon::{Daemon, logging};
 
 #[derive(Debug, clap::Args)]
 pub struct Args {
+    /// Without one it runs on the built-in simulator
     #[arg(long)]
-    config: Option<std::path::PathBuf>,
+    config: Option<PathBuf>,
     /// Address for the API instead of the one configured
     #[arg(long)]
-    listen: Option<std::net::SocketAddr>,
+    listen: Option<SocketAddr>,
 }
 
-pub fn run(_args: Args) -> Outcome {
-    Err(super::Failure::other(anyhow::anyhow!("run is not built yet")))
+pub fn run(args: Args) -> Outcome {
+    let mut config = match &args.config {
+        Some(path) => Config::load(path).map_err(Failure::config)?,
+        None => Config::default(),
+    };
+    if let Some(listen) = args.listen {
+        config.api.listen = listen;
+    }
+    let logging = logging::install(&config.log).map_err(Failure::config)?;
+    let daemon = Daemon::new(config, args.config).map_err(Failure::Config)?;
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .enable_all()
+        .thread_name("oapwatch")
+        .build()
+        .map_err(Failure::other)?;
+    runtime.block_on(daemon.run(logging)).map_err(Failure::Other)
 }

@@ -53,8 +53,15 @@ pub fn install(config: &Config) -> Result<Handle, Error> {
     let journald = std::env::var_os("JOURNAL_STREAM").and_then(|_| tracing_journald::layer().ok());
     let output: Box<dyn Layer<_> + Send + Sync> = match journald {
         Some(layer) => layer.boxed(),
-        None if std::io::stderr().is_terminal() => tracing_subscriber::fmt::layer().with_writer(std::io::stderr).with_target(false).boxed(),
-        None => tracing_subscriber::fmt::layer().json().flatten_event(true).with_writer(std::io::stderr).boxed(),
+        None if std::io::stderr().is_terminal() => tracing_subscriber::fmt::layer()
+            .with_writer(std::io::stderr)
+            .with_target(false)
+            .boxed(),
+        None => tracing_subscriber::fmt::layer()
+            .json()
+            .flatten_event(true)
+            .with_writer(std::io::stderr)
+            .boxed(),
     };
     tracing_subscriber::registry().with(filter).with(output).init();
     Ok(Handle(handle))
@@ -64,7 +71,9 @@ impl Handle {
     pub fn set(&self, config: &Config) -> Result<(), Error> {
         let filter = config.filter()?;
         if std::env::var_os("OAPWATCH_LOG").is_none() {
-            self.0.reload(filter).expect("the subscriber lives as long as the process");
+            self.0
+                .reload(filter)
+                .expect("the subscriber lives as long as the process");
         }
         Ok(())
     }

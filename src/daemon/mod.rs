@@ -1,1 +1,189 @@
-//! Composes the daemon: capture thread → latest-wins slot → compute thread → snapshot and events → tasks.
+//! Composes the daemon: capture thread → latest-wins slot → compute thread → journal, snapshot and events → tasks.
+
+mod compute;
+pub mod logging;
+mod publish;
+mod reload;
+mod status;
+mod supervisor;
+
+use std::net::TcpListener;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use anyhow::{Context, Result};
+use jiff::Timestamp;
+use tokio::sync::{mpsc, watch};
+
+use crate::claims::Follower;
+use crate::config::Config;
+use crate::frames::{self, Capture, FrameSource, SourceKind};
+use crate::journal::Journal;
+use crate::optics::Camera;
+use crate::pipeline::Pipeline;
+use crate::{api, metric, notify};
+use compute::Compute;
+use publish::Outlet;
+use status::State;
+use supervisor::Supervisor;
+
+/// Requests that may wait for the compute thread; more are told to come back.
+const COMMANDS: usize = 64;
+/// How often the journal is held to its limits.
+const MAINTENANCE: Duration = Duration::from_secs(3600);
+/// Deliveries under way when the daemon stops have this long.
+const LAST_DELIVERIES: Duration = Duration::from_millis(800);
+
+/// A daemon whose config has been checked and whose files have been opened; no port is bound yet.
+pub struct Daemon {
+    config: Config,
+    path: Option<PathBuf>,
+    camera: Camera,
+    pipeline: Pipeline,
+    source: Box<dyn FrameSource>,
+    server: api::Server,
+    endpoints: Vec<notify::Endpoint>,
+    journal: Journal,
+}
+
+impl Daemon {
+    /// Checks and opens everything a config names. `path` is re-read on SIGHUP.
+    pub fn new(config: Config, path: Option<PathBuf>) -> Result<Self> {
+        let camera = config.camera()?;
+        let pipeline = Pipeline::new(&config, &camera)?;
+        let server = api::Server::new(config.api.clone())?;
+        let endpoints = notify::load(&config.webhook)?;
+        let source = frames::open(&config.source, &camera)?;
+        let subscriptions = endpoints.iter().map(notify::Endpoint::subscription).collect();
+        let journal = Journal::open(&config.journal, subscriptions)?;
+        Ok(Self {
+            config,
+            path,
+            camera,
+            pipeline,
+            source,
+            server,
+            endpoints,
+            journal,
+        })
+    }
+
+    /// Runs until SIGTERM or SIGINT.
+    pub async fn run(mut self, logging: logging::Handle) -> Result<()> {
+        let listen = self.config.api.listen;
+        let listener = TcpListener::bind(listen).with_context(|| format!("api.listen: cannot listen on {listen}"))?;
+        let recorder = metric::recorder()?;
+        let metrics = recorder.handle();
+        // A second daemon in one process (a test) counts into the first one's recorder.
+        let _ = metrics::set_global_recorder(recorder);
+        metric::describe();
+
+        let started_at = Timestamp::now();
+        let open = self.journal.open_alerts()?;
+        let known: Vec<_> = open.iter().map(|a| (a.id.clone(), a.kind)).collect();
+        self.pipeline.monitor.restore(open);
+
+        let (stop, stopped) = watch::channel(false);
+        let stops = || {
+            let mut stopped = stopped.clone();
+            async move {
+                // An error would mean that the sender is gone, which is a stop too.
+                let _ = stopped.wait_for(|s| *s).await;
+            }
+        };
+        let micros = u64::try_from(started_at.as_microsecond()).unwrap_or(0);
+        let feed = Arc::new(api::Feed::new(self.journal.last_seq(), micros));
+        let outlet = Outlet::default();
+        let publisher = tokio::spawn(outlet.clone().publish(self.journal.clone(), feed.clone()));
+        let (notifier, deliveries) = notify::spawn(
+            self.endpoints,
+            self.journal.clone(),
+            notify::Clock::wall(),
+            micros,
+            stops(),
+        );
+        let (commands, orders) = mpsc::channel(COMMANDS);
+        let ready = Arc::new(AtomicBool::new(false));
+        let state = api::State::new(feed, commands, self.journal.clone(), metrics, ready.clone());
+
+        let source = &self.config.source;
+        let log = self.config.claims.log.as_deref();
+        tracing::info!(
+            source = source.kind.name(),
+            pixels = format!("{} × {}", self.camera.x.n, self.camera.y.n),
+            estimator = self.pipeline.estimator(),
+            claims = log.map_or("POST only".to_owned(), |l| l.display().to_string()),
+            journal = self
+                .config
+                .journal
+                .path
+                .as_ref()
+                .map_or("memory".to_owned(), |p| p.display().to_string()),
+            "watching; API and page on {}://{}",
+            self.server.scheme(),
+            listener.local_addr()?,
+        );
+        let is_replay = source.kind == SourceKind::Replay;
+        let halt = Arc::new(AtomicBool::new(false));
+        let compute = Compute {
+            pipeline: self.pipeline,
+            capture: Capture::start(self.source)?,
+            commands: orders,
+            follower: log.map(|l| Follower::new(l, &self.config.claims)),
+            outlet,
+            journal: self.journal.clone(),
+            webhooks: notifier,
+            supervisor: Supervisor::default(),
+            camera: Arc::new(self.camera),
+            claims_log: log.map(|l| l.display().to_string()),
+            source: source.kind.name().to_owned(),
+            is_replay,
+            stop: halt.clone(),
+            ready,
+            state: State::new(started_at, compute::first_clock(is_replay, source.start), known),
+        };
+        let mut compute = tokio::task::spawn_blocking(move || compute.run());
+        let mut serving = tokio::spawn(self.server.serve(listener, state, stops()));
+        let upkeep = tokio::spawn(maintain(self.journal.clone()));
+
+        let outcome = tokio::select! {
+            signal = reload::until_stopped(&self.config, self.path.as_deref(), &logging) => signal,
+            ended = &mut compute => Err(ended.err().map_or(
+                anyhow::anyhow!("the compute thread ended by itself"),
+                |panic| anyhow::anyhow!("the compute thread panicked: {panic}"),
+            )),
+            served = &mut serving => match served {
+                Ok(Ok(())) => Err(anyhow::anyhow!("the API ended by itself")),
+                Ok(Err(error)) => Err(error.into()),
+                Err(panic) => Err(anyhow::anyhow!("the API panicked: {panic}")),
+            },
+        };
+
+        // First the intake, then those who live on it; the journal, dropped last, writes what is left.
+        halt.store(true, Ordering::Relaxed);
+        if !compute.is_finished() {
+            compute.await?;
+        }
+        publisher.await?;
+        stop.send_replace(true);
+        if !serving.is_finished() {
+            serving.await??;
+        }
+        if tokio::time::timeout(LAST_DELIVERIES, deliveries).await.is_err() {
+            tracing::info!("webhook deliveries are left for the next start");
+        }
+        upkeep.abort();
+        tracing::info!("stopped");
+        outcome
+    }
+}
+
+async fn maintain(journal: Journal) {
+    let mut interval = tokio::time::interval(MAINTENANCE);
+    loop {
+        interval.tick().await;
+        journal.maintain(Timestamp::now());
+    }
+}

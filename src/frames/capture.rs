@@ -2,12 +2,13 @@
 
 use std::path::Path;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
 use super::slot::{Slot, Taken};
 use super::{FrameSource, Next};
+use crate::metric;
 
 /// How long a closing capture may go unnoticed.
 const PATIENCE: Duration = Duration::from_millis(100);
@@ -30,6 +31,7 @@ impl Captured {
 pub struct Capture {
     slot: Arc<Slot>,
     stop: Arc<AtomicBool>,
+    dropped: AtomicU64,
     thread: Option<JoinHandle<()>>,
 }
 
@@ -48,8 +50,14 @@ impl Capture {
         Ok(Self {
             slot,
             stop,
+            dropped: AtomicU64::new(0),
             thread: Some(thread),
         })
+    }
+
+    /// Frames that gave way to newer ones so far.
+    pub fn dropped(&self) -> u64 {
+        self.dropped.load(Ordering::Relaxed)
     }
 
     /// Waits up to `patience` for the latest frame. Gives `Next::End` once the source has ended.
@@ -57,7 +65,8 @@ impl Capture {
         match self.slot.take(patience) {
             Taken::Captured(captured, dropped) => {
                 if dropped > 0 {
-                    metrics::counter!("oapwatch_frames_dropped_total").increment(dropped);
+                    metrics::counter!(metric::FRAMES_DROPPED).increment(dropped);
+                    self.dropped.fetch_add(dropped, Ordering::Relaxed);
                 }
                 captured
             }

@@ -159,6 +159,11 @@ impl Journal {
         })
     }
 
+    /// Numbers the next events above `seq`, for readers who number other things in between.
+    pub fn number_above(&self, seq: u64) {
+        self.shared.number_above(seq);
+    }
+
     /// Waits until all that was handed over so far is on disk or, where the disk refuses it, in memory.
     pub async fn settled(&self) {
         self.until(self.shared.accepted()).await;

@@ -113,6 +113,11 @@ impl Shared {
         Ok(queue.last_seq)
     }
 
+    pub(super) fn number_above(&self, seq: u64) {
+        let mut queue = lock(&self.queue);
+        queue.last_seq = queue.last_seq.max(seq);
+    }
+
     /// Hands over any other write; gives the count of `done` at which it is through.
     pub(super) fn push(&self, write: Write) -> u64 {
         let mut queue = lock(&self.queue);

@@ -19,6 +19,17 @@ pub enum AlertKind {
     PoseInconsistent,
 }
 
+impl AlertKind {
+    pub const ALL: [Self; 6] = [
+        Self::UnclaimedEmitter,
+        Self::PositionMismatch,
+        Self::UserUnseen,
+        Self::SensorLost,
+        Self::ClaimsStale,
+        Self::PoseInconsistent,
+    ];
+}
+
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum Severity {

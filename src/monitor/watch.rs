@@ -335,9 +335,7 @@ impl Monitor {
     fn claims_settled(&self, now: Timestamp) -> bool {
         let Some(first) = self.first else { return false };
         match (self.first_claim, self.period_s) {
-            (Some(t), Some(period)) => {
-                seconds(t, now) >= (FIRST_CLAIMS * period + 2.0 * self.delay_s).min(NO_CLAIMS_S)
-            }
+            (Some(t), Some(period)) => seconds(t, now) >= (FIRST_CLAIMS * period + 2.0 * self.delay_s).min(NO_CLAIMS_S),
             _ => seconds(first, now) >= NO_CLAIMS_S,
         }
     }

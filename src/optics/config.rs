@@ -6,7 +6,7 @@ use super::camera::{Axis, Camera};
 use super::{Calibration, CalibrationError, Distortion};
 
 /// `[optics]` of a config or scene. What is left out takes the value of the paper's scene.
-#[derive(Clone, Debug, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Config {
     pub altitude_m: f64,
@@ -32,7 +32,7 @@ pub struct Config {
 }
 
 /// The blur budget σ_eff² = σ_def² + σ_diff² + σ_sens².
-#[derive(Clone, Debug, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct BlurConfig {
     pub focal_length_m: f64,

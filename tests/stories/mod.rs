@@ -174,13 +174,20 @@ impl Told {
             .map(|e| {
                 let time = e.alert.cleared_at.filter(|_| kind == AlertEventKind::Cleared);
                 let time = time.unwrap_or(e.alert.raised_at);
-                (e.alert.kind, e.alert.user.clone(), time.duration_since(start()).as_secs_f64())
+                (
+                    e.alert.kind,
+                    e.alert.user.clone(),
+                    time.duration_since(start()).as_secs_f64(),
+                )
             })
             .collect()
     }
 
     pub fn ndjson(&self) -> String {
-        self.events.iter().map(|e| serde_json::to_string(e).unwrap() + "\n").collect()
+        self.events
+            .iter()
+            .map(|e| serde_json::to_string(e).unwrap() + "\n")
+            .collect()
     }
 
     /// Exactly these were raised, each within its interval, and nothing else.
@@ -188,10 +195,15 @@ impl Told {
     pub fn expect(&self, expected: &[(AlertKind, Option<&str>, f64, f64)]) {
         let raised = self.raised();
         let as_wished = raised.len() == expected.len()
-            && raised.iter().zip(expected).all(|(r, e)| {
-                r.0 == e.0 && r.1.as_deref() == e.1 && r.2 >= e.2 - 1e-9 && r.2 <= e.3 + 1e-9
-            });
-        assert!(as_wished, "raised {raised:#?}\nexpected {expected:#?}\n{}", self.ndjson());
+            && raised
+                .iter()
+                .zip(expected)
+                .all(|(r, e)| r.0 == e.0 && r.1.as_deref() == e.1 && r.2 >= e.2 - 1e-9 && r.2 <= e.3 + 1e-9);
+        assert!(
+            as_wished,
+            "raised {raised:#?}\nexpected {expected:#?}\n{}",
+            self.ndjson()
+        );
     }
 }
 

@@ -1,0 +1,339 @@
+//! The compute thread: alone owns the pipeline; takes the latest frame, then what came in beside it.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use jiff::{SignedDuration, Timestamp};
+use tokio::sync::mpsc;
+
+use super::publish::Outlet;
+use super::status::State;
+use super::supervisor::Supervisor;
+use crate::api::{
+    Acknowledged, ClaimsStatus, Command, FrameCounts, JournalStatus, Snapshot, SourceState, SourceStatus, Status,
+};
+use crate::claims::{ClaimState, Follower, Outcome};
+use crate::frame::Frame;
+use crate::frames::{Capture, Next};
+use crate::journal::Journal;
+use crate::metric;
+use crate::monitor::{AlertState, Report};
+use crate::notify;
+use crate::optics::Camera;
+use crate::pipeline::{Pipeline, Step};
+
+/// How long commands may wait while no frame comes.
+const PATIENCE: Duration = Duration::from_millis(50);
+/// How often the claims log is looked at.
+const FOLLOW_EVERY: Duration = Duration::from_millis(100);
+/// A source that gives nothing at all, not even word of a failure, for this long is taken for dead.
+const SILENCE: Duration = Duration::from_secs(2);
+
+/// What the thread works with.
+pub struct Compute {
+    pub pipeline: Pipeline,
+    pub capture: Capture,
+    pub commands: mpsc::Receiver<Command>,
+    pub follower: Option<Follower>,
+    pub outlet: Outlet,
+    pub journal: Journal,
+    pub webhooks: notify::Notifier,
+    pub supervisor: Supervisor,
+    pub camera: Arc<Camera>,
+    pub claims_log: Option<String>,
+    pub source: String,
+    /// A recording's clock is its own; everything else runs on the wall's.
+    pub is_replay: bool,
+    pub stop: Arc<AtomicBool>,
+    pub ready: Arc<AtomicBool>,
+    pub state: State,
+}
+
+impl Compute {
+    /// Runs until told to stop.
+    pub fn run(mut self) {
+        let mut heard = Instant::now();
+        while !self.stop.load(Ordering::Relaxed) {
+            self.follow_log();
+            self.obey();
+            let captured = self.capture.next(PATIENCE);
+            let arrived = Instant::now();
+            match captured.next {
+                Next::Frame(frame, claims) => {
+                    heard = arrived;
+                    self.pipeline.claim(claims, frame.time);
+                    self.obey();
+                    self.frame(frame, arrived);
+                }
+                Next::Unusable { index, time, reason } => {
+                    heard = arrived;
+                    self.unusable(index, time, reason);
+                }
+                Next::Nothing if !self.is_replay && heard.elapsed() > SILENCE => {
+                    heard = arrived;
+                    self.silence();
+                }
+                Next::Nothing => {}
+                Next::End => self.ended(),
+            }
+        }
+        self.supervisor.stopping();
+        self.outlet.close();
+    }
+
+    fn frame(&mut self, mut frame: Frame, arrived: Instant) {
+        let Step {
+            report,
+            estimate,
+            estimation,
+            verdicts,
+        } = self.pipeline.step(&mut frame);
+        let s = &mut self.state;
+        s.counts.captured += 1;
+        s.clock = frame.time;
+        s.arrived(arrived);
+        metrics::counter!(metric::FRAMES_CAPTURED).increment(1);
+        metrics::histogram!(metric::STAGE_SECONDS, "stage" => "estimate").record(estimation);
+        metrics::histogram!(metric::STAGE_SECONDS, "stage" => "monitor").record(verdicts);
+        match &estimate {
+            Ok(_) => {
+                s.last_good = Some(frame.time);
+                s.fault = None;
+                s.source = SourceState::Running;
+                metrics::gauge!(metric::LAST_GOOD_FRAME).set(frame.time.as_millisecond() as f64 * 1e-3);
+            }
+            Err(error) => {
+                s.counts.unusable += 1;
+                s.source = SourceState::Blind;
+                metrics::counter!(metric::FRAMES_UNUSABLE).increment(1);
+                if s.fault.is_none() {
+                    tracing::warn!(frame = frame.index, %error, "a frame cannot be used");
+                }
+                s.fault = Some(error.to_string());
+            }
+        }
+        s.took(arrived.elapsed());
+        metrics::histogram!(metric::FRAME_SECONDS).record(arrived.elapsed());
+        self.publish(report, Some(Arc::new(frame)));
+    }
+
+    fn unusable(&mut self, index: u64, time: Timestamp, reason: String) {
+        let report = self.pipeline.unusable(index, time, &reason);
+        let s = &mut self.state;
+        s.clock = time;
+        s.counts.unusable += 1;
+        s.source = SourceState::Lost;
+        metrics::counter!(metric::FRAMES_UNUSABLE).increment(1);
+        if s.fault.as_deref() != Some(&reason) {
+            tracing::warn!(frame = index, reason, "no usable frame");
+        }
+        s.fault = Some(reason);
+        self.publish(report, None);
+    }
+
+    /// The source does not even report a failure.
+    fn silence(&mut self) {
+        let index = self.state.counts.captured;
+        self.unusable(index, Timestamp::now(), "the source gives no sign of life".to_owned());
+    }
+
+    fn ended(&mut self) {
+        if self.state.source != SourceState::Ended {
+            self.state.source = SourceState::Ended;
+            tracing::info!(
+                frames = self.state.counts.captured,
+                "the recording has ended; the API stays up"
+            );
+            if let Some(mut last) = self.state.last.take() {
+                last.status.source.state = SourceState::Ended;
+                self.outlet.snapshot(last);
+            }
+        }
+        self.alive();
+        // The capture has nothing to wait for any more.
+        std::thread::sleep(PATIENCE);
+    }
+
+    fn publish(&mut self, mut report: Report, frame: Option<Arc<Frame>>) {
+        for event in &report.events {
+            self.state.note(event);
+        }
+        self.state.gauge(&report);
+        let at = report.time;
+        self.outlet.events(std::mem::take(&mut report.events), at);
+        let status = self.status(&report);
+        let is_first = !self.ready.swap(true, Ordering::Relaxed);
+        if is_first {
+            tracing::info!(frame = report.frame, "the first frame is through");
+        }
+        let camera = self.camera.clone();
+        let snapshot = Snapshot {
+            report,
+            frame,
+            camera,
+            status,
+        };
+        if self.is_replay {
+            self.state.last = Some(snapshot.clone());
+        }
+        self.outlet.snapshot(snapshot);
+        self.alive();
+    }
+
+    fn alive(&mut self) {
+        let s = &self.state;
+        let line = format!(
+            "{} {:?}, {:.1} frames/s, {} µs a frame, {} open alerts",
+            self.source,
+            s.source,
+            s.rate_hz(),
+            s.latency().median_us,
+            s.open.len()
+        );
+        self.supervisor.alive(&line);
+    }
+
+    fn status(&self, report: &Report) -> Status {
+        let s = &self.state;
+        let health = self.journal.health();
+        let counts = self.pipeline.claims.counts();
+        Status {
+            version: env!("CARGO_PKG_VERSION"),
+            started_at: s.started_at,
+            source: SourceStatus {
+                kind: self.source.clone(),
+                state: s.source,
+                rate_hz: s.rate_hz(),
+                last_good_frame_at: s.last_good,
+                fault: s.fault.clone(),
+            },
+            frames: FrameCounts {
+                dropped: self.capture.dropped(),
+                ..s.counts
+            },
+            latency: s.latency(),
+            claims: ClaimsStatus {
+                log: self.claims_log.clone(),
+                accepted: counts.accepted,
+                malformed: s.malformed,
+                users: report.claims.iter().filter(|c| c.state == ClaimState::Active).count() as u64,
+                last_at: s.last_claim,
+            },
+            journal: JournalStatus {
+                healthy: health.writable,
+                place: health
+                    .path
+                    .as_ref()
+                    .map_or("memory".to_owned(), |p| p.display().to_string()),
+                fault: if health.writable { None } else { health.last_error },
+            },
+            webhooks: self.webhooks.status(),
+            estimator: self.pipeline.estimator().to_owned(),
+            alerts_open: s.open_by_kind(),
+            field_of_view_m: self
+                .camera
+                .to_ground([self.camera.x.half_width(), self.camera.y.half_width()]),
+        }
+    }
+
+    /// Claims by POST and acknowledgements.
+    fn obey(&mut self) {
+        while let Ok(command) = self.commands.try_recv() {
+            match command {
+                Command::Claims { claims, reply } => {
+                    let now = self.now();
+                    let mut refused = Vec::new();
+                    for (index, claim) in claims.into_iter().enumerate() {
+                        self.state.last_claim = Some(claim.time);
+                        let reason = match self.pipeline.claims.insert(claim, now) {
+                            Outcome::Full => "the store of claims is full",
+                            Outcome::Conflicting => "another position was claimed for this user and time",
+                            Outcome::TooLate => "older than all that is kept of this user",
+                            Outcome::Accepted | Outcome::Ahead | Outcome::Late | Outcome::Duplicate => continue,
+                        };
+                        refused.push((index, reason.to_owned()));
+                    }
+                    // A client that has gone away needs no answer.
+                    let _ = reply.send(refused);
+                }
+                Command::Acknowledge { id, reply } => {
+                    let outcome = match self.pipeline.monitor.acknowledge(&id, self.now()) {
+                        Some(event) => {
+                            let alert = event.alert.clone();
+                            self.outlet.events(vec![event], self.now());
+                            Acknowledged::Done(Box::new(alert))
+                        }
+                        None => match self.journal.alert(&id) {
+                            Ok(Some(alert)) if alert.state == AlertState::Cleared => Acknowledged::AlreadyCleared,
+                            Ok(Some(alert)) => Acknowledged::Done(Box::new(alert)),
+                            Ok(None) | Err(_) => Acknowledged::Unknown,
+                        },
+                    };
+                    self.outlet.acknowledged(reply, outcome);
+                }
+            }
+        }
+    }
+
+    /// The frames' clock: a recording's own, else the wall's.
+    fn now(&self) -> Timestamp {
+        if self.is_replay {
+            self.state.clock
+        } else {
+            Timestamp::now()
+        }
+    }
+
+    fn follow_log(&mut self) {
+        let due = self.state.looked.is_none_or(|t| t.elapsed() >= FOLLOW_EVERY);
+        let Some(follower) = self.follower.as_mut().filter(|_| due) else {
+            return;
+        };
+        self.state.looked = Some(Instant::now());
+        loop {
+            let poll = match follower.poll() {
+                Ok(poll) => poll,
+                Err(error) => {
+                    if !self.state.log_broken {
+                        tracing::warn!(%error, "the claims log cannot be read");
+                    }
+                    self.state.log_broken = true;
+                    return;
+                }
+            };
+            self.state.log_broken = false;
+            if poll.restarted {
+                tracing::info!("the claims log was replaced; reading it from its start");
+            }
+            if let Some(first) = poll.refused.first() {
+                let count = poll.refused.len() as u64;
+                self.state.malformed += count;
+                metrics::counter!(metric::CLAIMS, "outcome" => "malformed").increment(count);
+                tracing::warn!(line = first.line, error = %first.error, count, "lines of the claims log are no claims");
+            }
+            if let Some(last) = poll.claims.last() {
+                self.state.last_claim = Some(last.time);
+            }
+            let now = if self.is_replay {
+                self.state.clock
+            } else {
+                Timestamp::now()
+            };
+            self.pipeline.claim(poll.claims, now);
+            // A recording's first frame waits until the whole log has been read, so that no claim comes late.
+            if !poll.more || !(self.is_replay && self.state.counts.captured == 0) {
+                return;
+            }
+        }
+    }
+}
+
+/// The frames' clock before the first frame: nothing is late yet.
+pub fn first_clock(is_replay: bool, start: Option<Timestamp>) -> Timestamp {
+    match (is_replay, start) {
+        (true, Some(start)) => start - SignedDuration::from_nanos(1),
+        (true, None) => Timestamp::UNIX_EPOCH,
+        (false, _) => Timestamp::now(),
+    }
+}

@@ -1,0 +1,116 @@
+//! From the compute thread to everybody else: events to the journal first, then to readers; positions after them.
+
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use jiff::Timestamp;
+use tokio::sync::{Notify, oneshot};
+
+use crate::api::{Acknowledged, Feed, Snapshot};
+use crate::journal::Journal;
+use crate::monitor::AlertEvent;
+
+/// A disk that hangs may hold back what readers hear for this long, no longer.
+const PATIENCE: Duration = Duration::from_secs(2);
+
+/// Where the compute thread leaves things. It never waits: a newer snapshot takes an older one's place, events add up
+/// (they are few, and the journal's backlog bounds what becomes of them).
+#[derive(Clone, Default)]
+pub struct Outlet(Arc<Shared>);
+
+#[derive(Default)]
+struct Shared {
+    pending: Mutex<Pending>,
+    changed: Notify,
+}
+
+#[derive(Default)]
+struct Pending {
+    events: Vec<AlertEvent>,
+    at: Timestamp,
+    snapshot: Option<Snapshot>,
+    acknowledged: Vec<(oneshot::Sender<Acknowledged>, Acknowledged)>,
+    closed: bool,
+}
+
+impl Pending {
+    fn is_empty(&self) -> bool {
+        self.events.is_empty() && self.snapshot.is_none() && self.acknowledged.is_empty()
+    }
+}
+
+impl Outlet {
+    fn lock(&self) -> MutexGuard<'_, Pending> {
+        self.0.pending.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Alert events of a step at `at` (the frames' clock), in order.
+    pub fn events(&self, events: Vec<AlertEvent>, at: Timestamp) {
+        if events.is_empty() {
+            return;
+        }
+        let mut pending = self.lock();
+        pending.events.extend(events);
+        pending.at = at;
+        drop(pending);
+        self.0.changed.notify_one();
+    }
+
+    pub fn snapshot(&self, snapshot: Snapshot) {
+        self.lock().snapshot = Some(snapshot);
+        self.0.changed.notify_one();
+    }
+
+    /// Answers a client once the acknowledgement is on disk.
+    pub fn acknowledged(&self, reply: oneshot::Sender<Acknowledged>, outcome: Acknowledged) {
+        self.lock().acknowledged.push((reply, outcome));
+        self.0.changed.notify_one();
+    }
+
+    /// Nothing more will come; `publish` ends when all is out.
+    pub fn close(&self) {
+        self.lock().closed = true;
+        self.0.changed.notify_one();
+    }
+
+    /// Publishes until the outlet is closed and empty.
+    pub async fn publish(self, journal: Journal, feed: Arc<Feed>) {
+        loop {
+            let (pending, closed) = {
+                let mut pending = self.lock();
+                let closed = pending.closed;
+                (std::mem::take(&mut *pending), closed)
+            };
+            if closed {
+                self.lock().closed = true;
+            }
+            if pending.is_empty() {
+                if closed {
+                    return;
+                }
+                self.0.changed.notified().await;
+                continue;
+            }
+            if !pending.events.is_empty() {
+                let numbered = feed.number(pending.events.clone(), pending.at);
+                if let Some(first) = numbered.first() {
+                    journal.number_above(first.seq - 1);
+                }
+                if let Err(error) = journal.record(&pending.events, pending.at, Timestamp::now()) {
+                    tracing::error!(%error, "alert events are lost to the journal");
+                }
+                if tokio::time::timeout(PATIENCE, journal.settled()).await.is_err() {
+                    tracing::error!("the journal's disk hangs; alerts are published before they are on it");
+                }
+                feed.publish_events(numbered);
+            }
+            for (reply, outcome) in pending.acknowledged {
+                // A client that has gone away needs no answer.
+                let _ = reply.send(outcome);
+            }
+            if let Some(snapshot) = pending.snapshot {
+                feed.publish(snapshot);
+            }
+        }
+    }
+}

@@ -1,0 +1,145 @@
+//! What the compute thread remembers from frame to frame, and what it tells of it.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::time::{Duration, Instant};
+
+use jiff::Timestamp;
+use metrics::{counter, gauge};
+
+use crate::api::{FrameCounts, Latency, Snapshot, SourceState};
+use crate::metric;
+use crate::monitor::{AlertEvent, AlertEventKind, AlertKind, AlertState, PositionStatus, Report};
+
+/// Frames over which rate and latency are told.
+const WINDOW: usize = 128;
+/// Without a frame for this long the rate is nought.
+const STALE: Duration = Duration::from_secs(2);
+
+/// What the thread remembers from frame to frame for the status.
+pub(super) struct State {
+    pub started_at: Timestamp,
+    pub clock: Timestamp,
+    pub counts: FrameCounts,
+    pub malformed: u64,
+    pub last_claim: Option<Timestamp>,
+    pub last_good: Option<Timestamp>,
+    pub fault: Option<String>,
+    pub source: SourceState,
+    pub latencies: VecDeque<Duration>,
+    pub arrivals: VecDeque<Instant>,
+    pub open: BTreeMap<String, AlertKind>,
+    pub log_broken: bool,
+    pub looked: Option<Instant>,
+    pub last: Option<Snapshot>,
+}
+
+impl State {
+    pub fn new(started_at: Timestamp, clock: Timestamp, open: impl IntoIterator<Item = (String, AlertKind)>) -> Self {
+        Self {
+            started_at,
+            clock,
+            counts: FrameCounts::default(),
+            malformed: 0,
+            last_claim: None,
+            last_good: None,
+            fault: None,
+            source: SourceState::Starting,
+            latencies: VecDeque::with_capacity(WINDOW),
+            arrivals: VecDeque::with_capacity(WINDOW),
+            open: open.into_iter().collect(),
+            log_broken: false,
+            looked: None,
+            last: None,
+        }
+    }
+
+    pub fn arrived(&mut self, at: Instant) {
+        push(&mut self.arrivals, at);
+    }
+
+    pub fn took(&mut self, time: Duration) {
+        push(&mut self.latencies, time);
+    }
+
+    /// Keeps count of what is open, and logs it.
+    pub fn note(&mut self, event: &AlertEvent) {
+        let alert = &event.alert;
+        if alert.state == AlertState::Cleared {
+            self.open.remove(&alert.id);
+        } else {
+            self.open.insert(alert.id.clone(), alert.kind);
+        }
+        if event.event == AlertEventKind::Raised {
+            counter!(metric::ALERTS_RAISED, "kind" => word(alert.kind)).increment(1);
+        }
+        tracing::info!(
+            event = word(event.event),
+            kind = word(alert.kind),
+            severity = word(alert.severity),
+            id = alert.id,
+            user = alert.user,
+            x_m = alert.x_m,
+            y_m = alert.y_m,
+            "alert"
+        );
+    }
+
+    /// Alerts that are not cleared, by kind.
+    pub fn open_by_kind(&self) -> BTreeMap<AlertKind, u64> {
+        let mut open = BTreeMap::new();
+        for kind in self.open.values() {
+            *open.entry(*kind).or_insert(0) += 1;
+        }
+        open
+    }
+
+    /// Sets the gauges that follow from a report.
+    pub fn gauge(&self, report: &Report) {
+        use PositionStatus::{Mismatch, Pending, Unclaimed, Verified};
+        for status in [Verified, Mismatch, Unclaimed, Pending] {
+            let count = report.emitters.iter().filter(|e| e.status == status).count();
+            gauge!(metric::EMITTERS, "status" => word(status)).set(count as f64);
+        }
+        gauge!(metric::USERS_UNSEEN).set(report.unseen.len() as f64);
+        let open = self.open_by_kind();
+        for kind in AlertKind::ALL {
+            let count = open.get(&kind).copied().unwrap_or(0);
+            gauge!(metric::ALERTS_OPEN, "kind" => word(kind)).set(count as f64);
+        }
+    }
+
+    pub fn latency(&self) -> Latency {
+        let mut sorted: Vec<_> = self.latencies.iter().copied().collect();
+        sorted.sort_unstable();
+        let us = |d: Option<&Duration>| d.map_or(0, |d| d.as_micros() as u64);
+        Latency {
+            last_us: us(self.latencies.back()),
+            median_us: us(sorted.get(sorted.len() / 2)),
+            p99_us: us(sorted.get((sorted.len() * 99) / 100)),
+        }
+    }
+
+    pub fn rate_hz(&self) -> f64 {
+        match (self.arrivals.front(), self.arrivals.back()) {
+            (Some(first), Some(last)) if last > first && last.elapsed() < STALE => {
+                (self.arrivals.len() - 1) as f64 / (*last - *first).as_secs_f64()
+            }
+            _ => 0.0,
+        }
+    }
+}
+
+fn push<T>(window: &mut VecDeque<T>, value: T) {
+    if window.len() == WINDOW {
+        window.pop_front();
+    }
+    window.push_back(value);
+}
+
+/// The word that JSON uses for a value, for labels.
+fn word(value: impl serde::Serialize) -> String {
+    match serde_json::to_value(value) {
+        Ok(serde_json::Value::String(word)) => word,
+        other => unreachable!("labels are made of unit variants, found {other:?}"),
+    }
+}

@@ -1,0 +1,103 @@
+//! The chain from a frame to a report, the same for the daemon and for `review`.
+
+use std::time::{Duration, Instant};
+
+use jiff::Timestamp;
+
+use crate::claims::{self, Claim, Store};
+use crate::config::Config;
+use crate::estimate::{self, Estimate, Estimator};
+use crate::frame::Frame;
+use crate::frames::SourceKind;
+use crate::monitor::{self, Monitor, Observation, Report};
+use crate::optics::Camera;
+
+/// Why a config describes no pipeline.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    #[error(transparent)]
+    Estimator(#[from] estimate::ConfigError),
+    #[error(transparent)]
+    Monitor(#[from] monitor::ConfigError),
+    #[error(transparent)]
+    Claims(#[from] claims::ConfigError),
+}
+
+/// Owns everything that one frame after another goes through.
+pub struct Pipeline {
+    camera: Camera,
+    estimator: Box<dyn Estimator>,
+    pub claims: Store,
+    pub monitor: Monitor,
+}
+
+/// What became of a frame.
+pub struct Step {
+    pub report: Report,
+    pub estimate: Result<Estimate, estimate::Error>,
+    /// Time the estimator took.
+    pub estimation: Duration,
+    /// Time the monitor took.
+    pub verdicts: Duration,
+}
+
+impl Pipeline {
+    pub fn new(config: &Config, camera: &Camera) -> Result<Self, Error> {
+        config.monitor.validate()?;
+        config.claims.validate()?;
+        let file = (config.source.kind == SourceKind::Replay)
+            .then_some(config.source.frames.as_ref())
+            .flatten();
+        let source = monitor::Source {
+            kind: config.source.kind.name().to_owned(),
+            file: file.map(|f| f.display().to_string()),
+            rate_hz: config.source.rate_hz,
+        };
+        Ok(Self {
+            estimator: estimate::build(&config.estimator, camera)?,
+            claims: Store::new(&config.claims),
+            monitor: Monitor::new(&config.monitor, &config.claims, camera, source),
+            camera: camera.clone(),
+        })
+    }
+
+    pub fn estimator(&self) -> &'static str {
+        self.estimator.name()
+    }
+
+    /// Takes claims that came in at `now`, the frames' clock.
+    pub fn claim(&mut self, claims: impl IntoIterator<Item = Claim>, now: Timestamp) {
+        for claim in claims {
+            self.claims.insert(claim, now);
+        }
+    }
+
+    /// One frame through calibration, estimation and cross-check. The frame is left corrected.
+    pub fn step(&mut self, frame: &mut Frame) -> Step {
+        let began = Instant::now();
+        let digest = frame.digest();
+        if let Some(maps) = &self.camera.pixels {
+            maps.correct(frame, self.camera.saturation_j);
+        }
+        let estimate = self.estimator.estimate(frame);
+        let estimated = Instant::now();
+        let observation = Observation {
+            frame: frame.index,
+            time: frame.time,
+            result: estimate.as_ref(),
+            digest,
+        };
+        let report = self.monitor.step(observation, &mut self.claims);
+        Step {
+            report,
+            estimate,
+            estimation: estimated - began,
+            verdicts: estimated.elapsed(),
+        }
+    }
+
+    /// A frame that the source could not deliver whole.
+    pub fn unusable(&mut self, index: u64, time: Timestamp, reason: &str) -> Report {
+        self.monitor.unusable(index, time, reason, &mut self.claims)
+    }
+}
