@@ -15,6 +15,10 @@ pub enum Error {
     Io { path: PathBuf, source: std::io::Error },
     #[error("{lost} alert events were lost: {limit} are already waiting for the disk")]
     BacklogFull { lost: u64, limit: usize },
+    #[error("the disk takes too long")]
+    Hung,
+    #[error("the journal's disk thread ended")]
+    Closed,
     #[error("the journal cannot be read: {0}")]
     Read(#[from] rusqlite::Error),
     #[error("`{0}` is not a cursor of this list")]

@@ -18,10 +18,10 @@ pub struct Health {
 }
 
 impl Health {
-    pub(super) fn working(&mut self, path: &Path) {
+    pub(super) fn working(&mut self, size_bytes: u64, unwritten: usize) {
         self.writable = true;
-        self.unwritten = 0;
-        self.size_bytes = size(path);
+        self.unwritten = unwritten;
+        self.size_bytes = size_bytes;
         self.report();
     }
 
@@ -40,7 +40,7 @@ impl Health {
 }
 
 /// The journal with its write-ahead log, bytes.
-fn size(path: &Path) -> u64 {
+pub(super) fn size(path: &Path) -> u64 {
     let mut log = path.as_os_str().to_owned();
     log.push("-wal");
     [path, Path::new(&log)]

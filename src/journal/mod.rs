@@ -1,16 +1,18 @@
 //! Floor 4: alerts and webhook deliveries on disk, before anyone hears of them.
 //!
-//! One thread writes ([`Journal::record`] hands it the events and returns at once, so that a slow disk never
-//! delays a frame); any thread reads, each over its own read-only connection. SQLite in WAL mode with
+//! One thread writes ([`Journal::record`] hands over the events and returns at once, so that a slow disk never
+//! delays a frame); any thread reads, over its own read-only connection. SQLite in WAL mode with
 //! `synchronous=FULL`: what [`Follower`] gives out survives a kill -9 and a power cut. While the disk refuses
-//! writes, events wait in memory, in order, are heard of all the same, and [`Health`] says so.
+//! writes or hangs, events wait in memory, in order, are heard of all the same, and [`Health`] says so.
 
 mod config;
+mod disk;
 mod error;
 mod follow;
 mod health;
 mod outbox;
 mod query;
+mod retention;
 mod schema;
 mod store;
 mod writer;
@@ -18,15 +20,17 @@ mod writer;
 use std::collections::BTreeMap;
 use std::fs::{File, OpenOptions, TryLockError};
 use std::path::Path;
-use std::sync::{Arc, Mutex};
+use std::sync::{Arc, Mutex, mpsc};
 use std::thread::JoinHandle;
 
 use jiff::Timestamp;
 use tokio::sync::watch;
 
 use crate::monitor::{Alert, AlertEvent};
+use disk::Disk;
+use retention::Retention;
 use store::{Store, Write};
-use writer::{Shared, Writer, lock};
+use writer::{Link, Shared, Writer, lock};
 
 pub use config::Config;
 pub use error::Error;
@@ -96,7 +100,7 @@ impl Journal {
                 Ok(store) => {
                     identity = store.identity()?;
                     disk = Some(store);
-                    health.working(path);
+                    health.working(health::size(path), 0);
                 }
                 Err(Error::Unusable { source, path }) if error::is_passing(&source) => {
                     tracing::error!(path = %path.display(), error = %source, "the journal cannot be written; alerts are held in memory");
@@ -109,21 +113,31 @@ impl Journal {
             }
         }
         let (id, last_seq) = identity;
+        let retention = Retention::new(config);
         let shared = Arc::new(Shared::new(
             config.path.clone(),
-            subscriptions,
+            subscriptions.clone(),
+            retention,
             overlay,
             last_seq,
             health,
         ));
-        let writer = Writer::new(shared.clone(), disk);
-        let join = std::thread::Builder::new()
-            .name("journal".to_owned())
-            .spawn(move || writer.run())
-            .map_err(|source| Error::Io {
-                path: config.path.clone().unwrap_or_default(),
-                source,
-            })?;
+        let link = match &config.path {
+            Some(path) => {
+                let disk = Disk::new(path.clone(), subscriptions, retention, disk);
+                let (batches, work) = mpsc::channel();
+                let (reply, answers) = mpsc::channel();
+                Some(Link {
+                    batches,
+                    answers,
+                    pending: 0,
+                    join: thread("journal-disk", config, move || disk.run(work, reply))?,
+                })
+            }
+            None => None,
+        };
+        let writer = Writer::new(shared.clone(), link);
+        let join = thread("journal", config, move || writer.run())?;
         Ok(Self {
             readers: Arc::default(),
             id: id.into(),
@@ -340,6 +354,14 @@ impl Journal {
             Err(error) => Err(error.into()),
         }
     }
+}
+
+fn thread(name: &str, config: &Config, run: impl FnOnce() + Send + 'static) -> Result<JoinHandle<()>, Error> {
+    let builder = std::thread::Builder::new().name(name.to_owned());
+    builder.spawn(run).map_err(|source| Error::Io {
+        path: config.path.clone().unwrap_or_default(),
+        source,
+    })
 }
 
 fn in_order(held: Option<Vec<Recorded>>, disk: Option<Vec<Recorded>>) -> Vec<Recorded> {

@@ -37,10 +37,21 @@ pub(super) enum Write {
     },
 }
 
+impl Write {
+    /// The wall clock when it was made, where it says so.
+    pub(super) fn now(&self) -> Option<Timestamp> {
+        match self {
+            Self::Event { now, .. } | Self::Maintain { now } => Some(*now),
+            Self::Attempt(Attempt { at, .. }) | Self::Disable { at, .. } | Self::Replay { at, .. } => Some(*at),
+            Self::Enable { .. } => None,
+        }
+    }
+}
+
 /// One SQLite connection with the journal's statements.
 pub(super) struct Store {
     pub(super) db: Connection,
-    subscriptions: Arc<[Subscription]>,
+    pub(super) subscriptions: Arc<[Subscription]>,
 }
 
 impl Store {

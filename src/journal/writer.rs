@@ -1,18 +1,24 @@
 use std::collections::VecDeque;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
+use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
-use std::time::{Duration, Instant};
+use std::thread::JoinHandle;
+use std::time::Duration;
 
 use tokio::sync::watch;
 
+use super::retention::Retention;
 use super::store::{Store, Write};
-use super::{Attempt, Error, Health, Outcome, Subscription};
+use super::{Attempt, Error, Health, Outcome, Subscription, disk};
 
 /// Alert events that may wait for a disk that refuses them.
 pub(super) const BACKLOG: usize = 20_000;
 
 /// Writes in one transaction: bounds how long it takes.
 const BATCH: usize = 2_000;
+
+/// How long an alarm waits for the disk before it is heard without it.
+const PATIENCE: Duration = Duration::from_millis(500);
 
 /// How soon a disk that refused a write is tried again.
 const RETRY: Duration = Duration::from_secs(1);
@@ -21,6 +27,7 @@ const RETRY: Duration = Duration::from_secs(1);
 pub(super) struct Shared {
     pub(super) path: Option<PathBuf>,
     pub(super) subscriptions: Arc<[Subscription]>,
+    pub(super) retention: Retention,
     queue: Mutex<Queue>,
     wake: Condvar,
     /// The journal itself when there is no path; otherwise what the disk has not taken yet.
@@ -55,6 +62,7 @@ impl Shared {
     pub(super) fn new(
         path: Option<PathBuf>,
         subscriptions: Arc<[Subscription]>,
+        retention: Retention,
         overlay: Store,
         last_seq: u64,
         health: Health,
@@ -66,6 +74,7 @@ impl Shared {
             }),
             path,
             subscriptions,
+            retention,
             queue: Mutex::new(Queue {
                 writes: VecDeque::new(),
                 last_seq,
@@ -159,36 +168,67 @@ impl Shared {
     }
 }
 
-/// The only one that writes. Events are heard of once they are on disk; where the disk refuses them they are
-/// held in memory and heard of all the same, because filling a disk must not silence an alarm.
+/// Decides what is heard when. Events are heard of once they are on disk; where the disk refuses them or takes
+/// too long they are held in memory and heard of all the same, because a full or hung disk must not silence an
+/// alarm.
 pub(super) struct Writer {
     shared: Arc<Shared>,
-    disk: Option<Store>,
-    opened: Option<FileId>,
+    /// `None` for a journal in memory.
+    disk: Option<Link>,
+    /// What is not on disk yet, oldest first.
     deferred: VecDeque<Write>,
+    failing: bool,
     done: u64,
 }
 
+/// The line to the disk's thread.
+pub(super) struct Link {
+    pub(super) batches: Sender<Vec<Write>>,
+    pub(super) answers: Receiver<disk::Answer>,
+    /// Writes at the head of `deferred` that the disk has not answered yet.
+    pub(super) pending: usize,
+    pub(super) join: JoinHandle<()>,
+}
+
 impl Writer {
-    pub(super) fn new(shared: Arc<Shared>, disk: Option<Store>) -> Self {
-        let opened = shared.path.as_deref().and_then(FileId::of);
+    pub(super) fn new(shared: Arc<Shared>, disk: Option<Link>) -> Self {
         Self {
             shared,
-            opened,
             disk,
             deferred: VecDeque::new(),
+            failing: false,
             done: 0,
         }
     }
 
     pub(super) fn run(mut self) {
+        let mut behind = false;
         loop {
-            let patience = (!self.deferred.is_empty()).then_some(RETRY);
+            let patience = match (behind, self.deferred.is_empty()) {
+                (true, _) => Some(Duration::ZERO),
+                (false, false) => Some(RETRY),
+                (false, true) => None,
+            };
             let (writes, closing) = self.shared.take(patience);
-            self.write(&writes);
+            behind = self.write(&writes);
             self.publish(&writes);
-            if closing {
+            if closing && !behind {
                 break;
+            }
+        }
+        self.end();
+    }
+
+    /// Gives a disk that has not answered a last chance, then lets go of it.
+    fn end(mut self) {
+        if self.disk.as_ref().is_some_and(|link| link.pending > 0) {
+            self.try_disk();
+        }
+        if let Some(link) = self.disk.take() {
+            drop(link.batches);
+            // A thread that hangs in the disk cannot be waited for.
+            if link.pending == 0 && link.join.join().is_err() {
+                tracing::error!("the journal's disk thread panicked");
             }
         }
         let unwritten = events_in(&self.deferred);
@@ -200,92 +240,106 @@ impl Writer {
         }
     }
 
-    fn write(&mut self, writes: &[Write]) {
-        let Some(path) = self.shared.path.clone() else {
-            self.write_overlay(writes);
+    /// Brings writes to the disk or, failing that, to memory. `true` where the disk works but has more to take.
+    fn write(&mut self, writes: &[Write]) -> bool {
+        if self.disk.is_none() {
+            self.hold(writes);
             self.shared.settled(events_in(writes));
-            return;
-        };
-        let started = Instant::now();
-        match self.write_disk(&path, writes) {
-            Ok(()) => {
-                metrics::histogram!("oapwatch_journal_write_seconds").record(started.elapsed().as_secs_f64());
-                self.shared.settled(events_in(writes) + events_in(&self.deferred));
-                if !self.deferred.is_empty() {
-                    tracing::info!(
-                        writes = self.deferred.len(),
-                        "the journal's disk is back; all that waited is written"
-                    );
-                    self.deferred.clear();
-                    self.clear_overlay();
-                }
-                lock(&self.shared.health).working(&path);
+            return false;
+        }
+        for write in writes {
+            self.defer(write.clone());
+        }
+        let progress = self.try_disk();
+        if !self.deferred.is_empty() {
+            self.hold(writes);
+        } else if lock(&self.shared.overlay).in_use {
+            tracing::info!("the journal's disk is back; all that waited is written");
+            self.clear_overlay();
+        }
+        progress && !self.deferred.is_empty()
+    }
+
+    fn try_disk(&mut self) -> bool {
+        let Some(link) = &mut self.disk else { return false };
+        if self.deferred.is_empty() {
+            return false;
+        }
+        if link.pending == 0 {
+            link.pending = self.deferred.len().min(BATCH);
+            let batch = self.deferred.iter().take(link.pending).cloned().collect();
+            if link.batches.send(batch).is_err() {
+                // The disk's thread panicked; what follows fails on the answers.
+                link.pending = 0;
             }
-            Err(error) => {
-                if self.deferred.is_empty() {
-                    tracing::error!(%error, "the journal cannot be written; alert events are held in memory");
-                }
-                metrics::counter!("oapwatch_journal_write_failures_total").increment(1);
-                self.write_overlay(writes);
-                for write in writes {
-                    self.defer(write.clone());
-                }
-                // A fresh connection also recovers from faults that stick to an open file.
-                self.disk = None;
-                lock(&self.shared.health).failed(error.to_string(), events_in(&self.deferred));
+        }
+        match link.answers.recv_timeout(PATIENCE) {
+            Ok(Ok(size)) => {
+                let written: Vec<Write> = self.deferred.drain(..link.pending).collect();
+                link.pending = 0;
+                self.failing = false;
+                self.shared.settled(events_in(&written));
+                lock(&self.shared.health).working(size, events_in(&self.deferred));
+                true
+            }
+            Ok(Err(error)) => {
+                link.pending = 0;
+                self.fail(&error);
+                false
+            }
+            Err(RecvTimeoutError::Timeout) => {
+                self.fail(&Error::Hung);
+                false
+            }
+            Err(RecvTimeoutError::Disconnected) => {
+                self.fail(&Error::Closed);
+                false
             }
         }
     }
 
-    fn write_disk(&mut self, path: &Path, writes: &[Write]) -> Result<(), Error> {
-        let unusable = |source| Error::Unusable {
-            path: path.to_owned(),
-            source,
-        };
-        if self.disk.is_some() && FileId::of(path) != self.opened {
-            tracing::error!(path = %path.display(), "the journal was moved or deleted while in use; a new one is begun");
-            self.disk = None;
+    fn fail(&mut self, error: &Error) {
+        if !std::mem::replace(&mut self.failing, true) {
+            tracing::error!(%error, "the journal cannot be written; alert events are held in memory");
         }
-        let mut disk = match self.disk.take() {
-            Some(disk) => disk,
-            None => {
-                let disk = Store::open(Some(path), self.shared.subscriptions.clone())?;
-                self.opened = FileId::of(path);
-                disk
-            }
-        };
-        disk.apply(self.deferred.iter().chain(writes)).map_err(unusable)?;
-        self.disk = Some(disk);
-        Ok(())
+        metrics::counter!("oapwatch_journal_write_failures_total").increment(1);
+        lock(&self.shared.health).failed(error.to_string(), events_in(&self.deferred));
     }
 
-    fn write_overlay(&self, writes: &[Write]) {
+    fn hold(&self, writes: &[Write]) {
         let mut overlay = lock(&self.shared.overlay);
         overlay.in_use = true;
-        if let Err(error) = overlay.store.apply(writes) {
+        let mut held = overlay.store.apply(writes);
+        if self.disk.is_none()
+            && let Some(now) = writes.iter().rev().find_map(Write::now)
+        {
+            held = held.and_then(|()| overlay.store.maintain(self.shared.retention, now).map(|_| ()));
+        }
+        if let Err(error) = held {
             tracing::error!(%error, "alert events cannot even be held in memory");
-            lock(&self.shared.health).lost += events_in(writes) as u64;
         }
     }
 
     fn clear_overlay(&self) {
         let mut overlay = lock(&self.shared.overlay);
         match Store::open(None, self.shared.subscriptions.clone()) {
-            Ok(store) => {
-                *overlay = Overlay { store, in_use: false };
-            }
-            // What it holds is on disk as well, and readers know a record twice when they see one.
+            Ok(store) => *overlay = Overlay { store, in_use: false },
+            // What it holds is on disk as well, and readers know a record when they see it twice.
             Err(error) => tracing::warn!(%error, "the journal's memory cannot be cleared"),
         }
     }
 
     /// Keeps a write for the disk. Only the last of a delivery's failed attempts matters.
     fn defer(&mut self, write: Write) {
-        if let Write::Attempt(Attempt { seq, endpoint, .. }) = &write {
-            self.deferred.retain(|earlier| {
-                !matches!(earlier, Write::Attempt(Attempt { seq: s, endpoint: e, outcome: Outcome::Retry { .. }, .. })
-                    if s == seq && e == endpoint)
-            });
+        let pending = self.disk.as_ref().map_or(0, |link| link.pending);
+        if let Write::Attempt(attempt) = &write {
+            let overtaken = |earlier: &Write| {
+                matches!(earlier, Write::Attempt(Attempt { seq, endpoint, outcome: Outcome::Retry { .. }, .. })
+                    if *seq == attempt.seq && *endpoint == attempt.endpoint)
+            };
+            if let Some(k) = (pending..self.deferred.len()).find(|&k| overtaken(&self.deferred[k])) {
+                self.deferred.remove(k);
+            }
         }
         self.deferred.push_back(write);
     }
@@ -305,22 +359,4 @@ impl Writer {
 
 fn events_in<'a>(writes: impl IntoIterator<Item = &'a Write>) -> usize {
     writes.into_iter().filter(|w| matches!(w, Write::Event { .. })).count()
-}
-
-/// Tells a file from another that took its name.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-struct FileId {
-    device: u64,
-    inode: u64,
-}
-
-impl FileId {
-    fn of(path: &Path) -> Option<Self> {
-        use std::os::unix::fs::MetadataExt;
-        let meta = std::fs::metadata(path).ok()?;
-        Some(Self {
-            device: meta.dev(),
-            inode: meta.ino(),
-        })
-    }
 }

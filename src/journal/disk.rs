@@ -1,0 +1,144 @@
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::mpsc::{Receiver, Sender};
+use std::time::Instant;
+
+use jiff::{SignedDuration, Timestamp};
+
+use super::retention::Retention;
+use super::store::{Store, Write};
+use super::{Error, Subscription, health};
+
+/// How often old alerts are looked for.
+const ROUND: SignedDuration = SignedDuration::from_hours(1);
+
+/// A wall clock that runs on by more than this between two writes was set: one round is then left out, so that a
+/// clock which is wrong for a moment does not make everything old.
+const JUMP: SignedDuration = SignedDuration::from_hours(25);
+
+/// Writes between two looks at a journal that is too large.
+const PAUSE: usize = 1_000;
+
+/// The thread that waits for the disk, so that nobody else has to. It answers every batch.
+pub(super) struct Disk {
+    path: PathBuf,
+    subscriptions: Arc<[Subscription]>,
+    retention: Retention,
+    store: Option<Store>,
+    opened: Option<FileId>,
+    last_round: Option<Timestamp>,
+    since_round: usize,
+}
+
+/// What became of a batch: the journal's size in bytes once all of it is on disk, or why none of it is.
+pub(super) type Answer = Result<u64, Error>;
+
+impl Disk {
+    pub(super) fn new(
+        path: PathBuf,
+        subscriptions: Arc<[Subscription]>,
+        retention: Retention,
+        store: Option<Store>,
+    ) -> Self {
+        Self {
+            opened: FileId::of(&path),
+            path,
+            subscriptions,
+            retention,
+            store,
+            last_round: None,
+            since_round: PAUSE,
+        }
+    }
+
+    pub(super) fn run(mut self, batches: Receiver<Vec<Write>>, answers: Sender<Answer>) {
+        for batch in batches {
+            let started = Instant::now();
+            let answer = self.write(&batch).map(|()| health::size(&self.path));
+            metrics::histogram!("oapwatch_journal_write_seconds").record(started.elapsed().as_secs_f64());
+            let size = answer.as_ref().copied().ok();
+            if answers.send(answer).is_err() {
+                return;
+            }
+            if let Some(size) = size {
+                self.since_round += batch.len();
+                self.maintain(&batch, size);
+            }
+        }
+    }
+
+    fn write(&mut self, batch: &[Write]) -> Result<(), Error> {
+        if self.store.is_some() && FileId::of(&self.path) != self.opened {
+            tracing::error!(path = %self.path.display(), "the journal was moved or deleted while in use; a new one is begun");
+            self.store = None;
+        }
+        // Taken, and put back when all went well: a fresh connection also gets over faults that stick to an open file.
+        let mut store = match self.store.take() {
+            Some(store) => store,
+            None => {
+                let store = Store::open(Some(&self.path), self.subscriptions.clone())?;
+                self.opened = FileId::of(&self.path);
+                store
+            }
+        };
+        store.apply(batch).map_err(|source| Error::Unusable {
+            path: self.path.clone(),
+            source,
+        })?;
+        self.store = Some(store);
+        Ok(())
+    }
+
+    fn maintain(&mut self, batch: &[Write], size: u64) {
+        let Some(now) = batch.iter().rev().find_map(Write::now) else {
+            return;
+        };
+        let asked = batch.iter().any(|write| matches!(write, Write::Maintain { .. }));
+        let last = *self.last_round.get_or_insert(now);
+        let age = now.duration_since(last);
+        let due = age >= ROUND && age < JUMP;
+        if age >= ROUND || age < SignedDuration::ZERO {
+            self.last_round = Some(now);
+        }
+        let large = self.retention.exceeded_by(size) && self.since_round >= PAUSE;
+        let Some(store) = self.store.as_mut().filter(|_| asked || due || large) else {
+            return;
+        };
+        self.since_round = 0;
+        match store.maintain(self.retention, now) {
+            Ok(removed) => {
+                if removed.alerts + removed.deliveries > 0 {
+                    tracing::info!(
+                        alerts = removed.alerts,
+                        given_up_deliveries = removed.deliveries,
+                        "old alerts were removed from the journal"
+                    );
+                }
+                if removed.oversize {
+                    tracing::warn!(
+                        "the journal is larger than max_mb, but all it holds is open or still to be delivered"
+                    );
+                }
+            }
+            Err(error) => tracing::warn!(%error, "old alerts could not be removed from the journal"),
+        }
+    }
+}
+
+/// Tells a file from another that took its name.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+struct FileId {
+    device: u64,
+    inode: u64,
+}
+
+impl FileId {
+    fn of(path: &Path) -> Option<Self> {
+        use std::os::unix::fs::MetadataExt;
+        let meta = std::fs::metadata(path).ok()?;
+        Some(Self {
+            device: meta.dev(),
+            inode: meta.ino(),
+        })
+    }
+}
