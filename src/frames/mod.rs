@@ -3,6 +3,7 @@
 mod capture;
 mod config;
 pub mod npy;
+pub mod record;
 mod replay;
 mod simulator;
 mod slot;
@@ -10,10 +11,9 @@ pub mod v4l2;
 
 pub use capture::{Capture, Captured};
 pub use config::{Config, SourceKind};
-pub use replay::Replay;
 pub use simulator::Simulator;
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use jiff::Timestamp;
@@ -82,6 +82,18 @@ pub enum Error {
     Scene(#[from] scene::Error),
     #[error("optics.joules_per_count: needed for source.kind = \"v4l2\", whose frames are counts; found nothing")]
     NoScale,
+    #[error("{path}: {source}")]
+    Recording { path: PathBuf, source: std::io::Error },
+    #[error("{path}: line {line}: {source}")]
+    Index {
+        path: PathBuf,
+        line: u64,
+        source: serde_json::Error,
+    },
+    #[error("{path}: expected recordings (NAME.npy with NAME.frames.ndjson), found none")]
+    NoRecording { path: PathBuf },
+    #[error("source.loop: a recording with times of its own cannot be looped; set source.start to give it new ones")]
+    LoopWithTimes,
     #[error(transparent)]
     Npy(#[from] npy::Error),
 }
@@ -89,14 +101,17 @@ pub enum Error {
 impl Error {
     /// Whether the config is at fault, not what it points at.
     pub fn is_config(&self) -> bool {
-        !matches!(self, Self::Npy(_))
+        !matches!(
+            self,
+            Self::Npy(_) | Self::Recording { .. } | Self::Index { .. } | Self::NoRecording { .. }
+        )
     }
 }
 
 /// Opens the configured source. A device that is not there yet is no error: it is waited for.
 pub fn open(config: &Config, camera: &Camera) -> Result<Box<dyn FrameSource>, Error> {
     match config.kind {
-        SourceKind::Replay => Ok(Box::new(Replay::open(config, camera.joules_per_count)?)),
+        SourceKind::Replay => replay::open(config, camera.joules_per_count),
         SourceKind::V4l2 => Ok(Box::new(v4l2::V4l2::new(config, camera)?)),
         SourceKind::Simulator => Ok(Box::new(Simulator::open(config, camera)?)),
     }

@@ -6,11 +6,95 @@ use std::time::{Duration, Instant};
 use jiff::{SignedDuration, Timestamp};
 
 use super::npy::Reader;
+use super::record::{self, Player};
 use super::{Config, Error, FrameSource, Next};
 use crate::frame::Frame;
 
+/// Opens `source.frames`: a folder of our own recordings, or one of them, whose times and claims are replayed as
+/// they were; or, where `source.start` gives the times, any .npy file.
+pub(super) fn open(config: &Config, joules_per_count: Option<f64>) -> Result<Box<dyn FrameSource>, Error> {
+    let path = config.frames.as_ref().ok_or(Error::Missing {
+        field: "frames",
+        kind: "replay",
+    })?;
+    let files = if path.is_dir() {
+        record::recordings(path).map_err(|source| Error::Recording {
+            path: path.clone(),
+            source,
+        })?
+    } else if config.start.is_none() && record::index_of(path).exists() {
+        vec![path.clone()]
+    } else {
+        return Ok(Box::new(Replay::open(path, config, joules_per_count)?));
+    };
+    if config.r#loop {
+        return Err(Error::LoopWithTimes);
+    }
+    let player = Player::open(files.into())?.ok_or(Error::NoRecording { path: path.clone() })?;
+    Ok(Box::new(Playback {
+        player,
+        pace: Pace::new(config.speed)?,
+        waiting: None,
+        ended: false,
+        last: (0, Timestamp::UNIX_EPOCH),
+    }))
+}
+
+/// Our own recording, as the monitor saw it.
+struct Playback {
+    player: Player,
+    pace: Pace,
+    /// What comes next, until its time has come.
+    waiting: Option<(Timestamp, Next)>,
+    ended: bool,
+    /// Index and time of what was given last.
+    last: (u64, Timestamp),
+}
+
+impl FrameSource for Playback {
+    fn next(&mut self, patience: Duration) -> Next {
+        if self.ended {
+            return Next::End;
+        }
+        let (time, next) = match self.waiting.take() {
+            Some(waiting) => waiting,
+            None => match self.player.next() {
+                Ok(Some(seen)) => {
+                    self.last = (seen.entry.index, seen.entry.time);
+                    (seen.entry.time, seen.next())
+                }
+                Ok(None) => return Next::End,
+                Err(error) => {
+                    tracing::error!(%error, "the recording ends early");
+                    self.ended = true;
+                    let (index, time) = self.last;
+                    let reason = error.to_string();
+                    return Next::Unusable {
+                        index: index + 1,
+                        time,
+                        reason,
+                    };
+                }
+            },
+        };
+        if self.pace.wait(time, patience) {
+            return next;
+        }
+        self.waiting = Some((time, next));
+        Next::Nothing
+    }
+
+    fn file(&self) -> Option<&Path> {
+        Some(self.player.path())
+    }
+
+    fn waits(&self) -> bool {
+        true
+    }
+}
+
 /// Frames of one .npy file. Frame k is at start + k/rate_hz whatever the speed; a loop goes on counting.
-pub struct Replay {
+struct Replay {
     reader: Reader,
     start: Timestamp,
     rate_hz: f64,
@@ -22,11 +106,7 @@ pub struct Replay {
 }
 
 impl Replay {
-    pub fn open(config: &Config, joules_per_count: Option<f64>) -> Result<Self, Error> {
-        let path = config.frames.as_ref().ok_or(Error::Missing {
-            field: "frames",
-            kind: "replay",
-        })?;
+    fn open(path: &Path, config: &Config, joules_per_count: Option<f64>) -> Result<Self, Error> {
         if !(config.rate_hz.is_finite() && config.rate_hz > 0.0) {
             return Err(Error::OutOfRange {
                 field: "rate_hz",

@@ -10,8 +10,8 @@ use super::sys;
 
 /// A time stamp older than this is not believed.
 const OLDEST: Duration = Duration::from_secs(10);
-/// Nor is one this far ahead of its own clock (the two are read one after the other).
-const AHEAD: Duration = Duration::from_millis(1);
+/// Nor is one further ahead of its own clock than this: some drivers stamp by an ideal frame interval.
+const AHEAD: Duration = Duration::from_millis(100);
 
 /// Both clocks at one moment.
 #[derive(Clone, Copy, Debug)]

@@ -1,0 +1,319 @@
+//! Keeps what the monitor was given: a ring on disk, and around each alert a copy as evidence. A thread of its
+//! own writes, so that a slow disk costs recordings and never alerts.
+
+mod config;
+mod player;
+mod ring;
+mod standing;
+mod tape;
+
+pub use config::Config;
+pub(super) use player::Player;
+pub(super) use ring::recordings;
+pub(super) use tape::index_of;
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::thread::JoinHandle;
+
+use jiff::{SignedDuration, Timestamp};
+
+use super::Error;
+use crate::claim::Claim;
+use crate::frame::Frame;
+use standing::Standing;
+use tape::{Entry, Seen, TapeReader, TapeWriter};
+
+/// Evidence that may grow at a time; an alert beyond that lies within the time of another's.
+const MOST_CLIPS: usize = 8;
+/// Frames that may wait for the disk.
+const QUEUE: usize = 64;
+
+/// Records on a thread of its own. Dropping it writes what waits and ends the thread.
+#[derive(Debug)]
+pub struct Recorder {
+    folder: PathBuf,
+    segment: SignedDuration,
+    /// Bytes of pixels after which a file ends, whatever its length.
+    segment_bytes: u64,
+    next_number: u64,
+    current: Option<Segment>,
+    queue: Option<SyncSender<Order>>,
+    thread: Option<JoinHandle<()>>,
+}
+
+/// The file that frames go to.
+#[derive(Clone, Debug)]
+struct Segment {
+    path: Arc<Path>,
+    began: Timestamp,
+    shape: (usize, usize),
+    bytes: u64,
+}
+
+#[derive(Debug)]
+enum Order {
+    Write {
+        path: Arc<Path>,
+        shape: (usize, usize),
+        seen: Seen,
+    },
+    Evidence {
+        name: String,
+        time: Timestamp,
+    },
+}
+
+impl Recorder {
+    /// Starts recording; `None` when the config names no folder.
+    pub fn start(config: &Config) -> Result<Option<Self>, Error> {
+        config.check()?;
+        let Some(folder) = config.folder.clone() else {
+            return Ok(None);
+        };
+        let failed = |path: &Path| {
+            let path = path.to_owned();
+            move |source| Error::Recording { path, source }
+        };
+        let evidence = folder.join("evidence");
+        std::fs::create_dir_all(&evidence).map_err(failed(&evidence))?;
+        let next_number = ring::next_number(&folder).map_err(failed(&folder))?;
+        let (queue, orders) = sync_channel(QUEUE);
+        let clerk = Clerk {
+            folder: folder.clone(),
+            evidence,
+            config: config.clone(),
+            tape: None,
+            broken: None,
+            standing: Standing::default(),
+            clips: Vec::new(),
+        };
+        let thread = std::thread::Builder::new()
+            .name("recorder".into())
+            .spawn(move || clerk.run(&orders))
+            .map_err(failed(&folder))?;
+        Ok(Some(Self {
+            segment: seconds(config.segment_s),
+            segment_bytes: (bytes(config.limit_mb) / 8).max(1),
+            folder,
+            next_number,
+            current: None,
+            queue: Some(queue),
+            thread: Some(thread),
+        }))
+    }
+
+    /// Records a frame as it came, before any correction, with the claims taken in since the one before. Gives the
+    /// file that holds it, or `None` when the disk cannot keep up and the frame was let go.
+    pub fn frame(&mut self, frame: &Frame, claims: &[Claim]) -> Option<Arc<Path>> {
+        let bytes = 8 * frame.pixels.len() as u64;
+        self.write(Some(frame.pixels.dim()), bytes, Seen::frame(frame, claims))
+    }
+
+    /// Records that there was no usable frame.
+    pub fn unusable(&mut self, index: u64, time: Timestamp, reason: &str, claims: &[Claim]) -> Option<Arc<Path>> {
+        let entry = Entry {
+            index,
+            time,
+            unusable: Some(reason.to_owned()),
+            masked: None,
+            claims: claims.to_vec(),
+        };
+        self.write(None, 0, Seen { entry, pixels: None })
+    }
+
+    /// Keeps what lies around an alert, under its id.
+    pub fn evidence(&mut self, alert: &str, time: Timestamp) {
+        // An id of ours needs no change; nothing else may name a path.
+        let name = alert.replace(|c: char| !(c.is_ascii_alphanumeric() || c == '-' || c == '_'), "_");
+        self.order(Order::Evidence { name, time });
+    }
+
+    fn write(&mut self, shape: Option<(usize, usize)>, bytes: u64, seen: Seen) -> Option<Arc<Path>> {
+        let time = seen.entry.time;
+        let fits = |segment: &Segment| {
+            shape.is_none_or(|shape| shape == segment.shape)
+                && time.duration_since(segment.began).abs() < self.segment
+                && segment.bytes + bytes <= self.segment_bytes.max(bytes)
+        };
+        let mut segment = match self.current.take().filter(fits) {
+            Some(segment) => segment,
+            None => {
+                let name = format!("{:08}-{}.npy", self.next_number, time.strftime("%Y%m%dT%H%M%SZ"));
+                self.next_number += 1;
+                Segment {
+                    path: self.folder.join(name).into(),
+                    began: time,
+                    shape: shape.unwrap_or((1, 1)),
+                    bytes: 0,
+                }
+            }
+        };
+        segment.bytes += bytes;
+        let path = segment.path.clone();
+        let shape = segment.shape;
+        self.current = Some(segment);
+        self.order(Order::Write {
+            path: path.clone(),
+            shape,
+            seen,
+        })
+        .then_some(path)
+    }
+
+    fn order(&self, order: Order) -> bool {
+        let sent = self.queue.as_ref().is_some_and(|queue| queue.try_send(order).is_ok());
+        if !sent {
+            metrics::counter!("oapwatch_recorder_dropped_total").increment(1);
+        }
+        sent
+    }
+}
+
+impl Drop for Recorder {
+    fn drop(&mut self) {
+        self.queue = None;
+        if let Some(thread) = self.thread.take()
+            && thread.join().is_err()
+        {
+            tracing::error!("the recorder's thread ended in a panic");
+        }
+    }
+}
+
+/// The recorder's thread.
+struct Clerk {
+    folder: PathBuf,
+    evidence: PathBuf,
+    config: Config,
+    tape: Option<TapeWriter>,
+    /// The file that could not be written; the next one is tried again.
+    broken: Option<Arc<Path>>,
+    standing: Standing,
+    clips: Vec<Clip>,
+}
+
+/// Evidence that is still growing.
+struct Clip {
+    tape: TapeWriter,
+    until: Timestamp,
+}
+
+impl Clerk {
+    fn run(mut self, orders: &Receiver<Order>) {
+        for order in orders {
+            let done = match order {
+                Order::Write { path, shape, seen } => self.write(path, shape, &seen),
+                Order::Evidence { name, time } => self.keep(&name, time),
+            };
+            if let Err(error) = done {
+                metrics::counter!("oapwatch_recorder_errors_total").increment(1);
+                tracing::error!(%error, "not recorded");
+            }
+        }
+    }
+
+    fn write(&mut self, path: Arc<Path>, shape: (usize, usize), seen: &Seen) -> Result<(), Error> {
+        if self.broken.as_ref() == Some(&path) {
+            return Ok(());
+        }
+        let written = self.append(&path, shape, seen);
+        self.standing.take(&seen.entry.claims);
+        self.clips.retain(|clip| seen.entry.time <= clip.until);
+        let mut grown = Ok(());
+        self.clips.retain_mut(|clip| match clip.tape.push(seen) {
+            Ok(()) => true,
+            Err(error) => {
+                grown = Err(error);
+                false
+            }
+        });
+        if written.is_err() {
+            self.broken = Some(path);
+            self.tape = None;
+        }
+        written.and(grown)
+    }
+
+    fn append(&mut self, path: &Path, shape: (usize, usize), seen: &Seen) -> Result<(), Error> {
+        let tape = match self.tape.take().filter(|tape| tape.path() == path) {
+            Some(tape) => self.tape.insert(tape),
+            None => {
+                let tape = TapeWriter::create(path, shape, self.standing.claims())?;
+                self.trim(&self.folder, self.config.limit_mb, path);
+                self.tape.insert(tape)
+            }
+        };
+        tape.push(seen)
+    }
+
+    fn trim(&self, folder: &Path, limit_mb: f64, keep: &Path) {
+        if let Err(error) = ring::trim(folder, bytes(limit_mb), keep) {
+            metrics::counter!("oapwatch_recorder_errors_total").increment(1);
+            tracing::error!(folder = %folder.display(), %error, "old recordings could not be removed");
+        }
+    }
+
+    /// Starts a clip with what the ring holds of the time before the alert.
+    fn keep(&mut self, name: &str, time: Timestamp) -> Result<(), Error> {
+        if self.clips.len() >= MOST_CLIPS {
+            tracing::warn!(
+                alert = name,
+                "no evidence of its own: {MOST_CLIPS} alerts are being recorded already"
+            );
+            return Ok(());
+        }
+        let path = self.evidence.join(format!("{name}.npy"));
+        let from = time
+            .saturating_sub(seconds(self.config.before_s))
+            .unwrap_or(Timestamp::MIN);
+        let until = time
+            .saturating_add(seconds(self.config.after_s))
+            .unwrap_or(Timestamp::MAX);
+        let mut files = recordings(&self.folder).map_err(|source| Error::Recording {
+            path: self.folder.clone(),
+            source,
+        })?;
+        // The ring's own file names tell their order; those far before the alert need not be read.
+        let few = (self.config.before_s / self.config.segment_s).ceil() as usize + 2;
+        files.drain(..files.len().saturating_sub(few.max(10)));
+        let mut standing = Standing::default();
+        let mut clip: Option<TapeWriter> = None;
+        for file in files {
+            let (mut tape, claims) = TapeReader::open(&file)?;
+            if clip.is_none() {
+                standing = Standing::default();
+                standing.take(&claims);
+            }
+            while let Some(seen) = tape.next()? {
+                if clip.is_none() && (seen.entry.time < from || seen.pixels.is_none()) {
+                    standing.take(&seen.entry.claims);
+                    continue;
+                }
+                let shape = seen.pixels.as_ref().map_or((1, 1), ndarray::Array2::dim);
+                let writer = match &mut clip {
+                    Some(writer) => writer,
+                    None => clip.insert(TapeWriter::create(&path, shape, standing.claims())?),
+                };
+                // A camera whose array changed its shape meanwhile: the evidence ends where it changed.
+                if writer.push(&seen).is_err() {
+                    break;
+                }
+            }
+        }
+        if let Some(tape) = clip {
+            self.clips.push(Clip { tape, until });
+            self.trim(&self.evidence, self.config.evidence_limit_mb, &path);
+        }
+        Ok(())
+    }
+}
+
+fn seconds(s: f64) -> SignedDuration {
+    SignedDuration::try_from_secs_f64(s).unwrap_or(SignedDuration::MAX)
+}
+
+fn bytes(mb: f64) -> u64 {
+    (mb * 1e6) as u64
+}

@@ -1,0 +1,52 @@
+//! The recorder's folder: numbered files, of which the oldest make way.
+
+use std::io;
+use std::path::{Path, PathBuf};
+
+use super::tape::index_of;
+
+/// Recordings of a folder, oldest first: NNNNNNNN-TIME.npy with its index beside it.
+pub(in crate::frames) fn recordings(folder: &Path) -> io::Result<Vec<PathBuf>> {
+    let mut found = Vec::new();
+    for entry in std::fs::read_dir(folder)? {
+        let path = entry?.path();
+        if path.extension().is_some_and(|e| e == "npy") && index_of(&path).exists() {
+            found.push(path);
+        }
+    }
+    found.sort();
+    Ok(found)
+}
+
+/// The number that the next file of a folder takes.
+pub(super) fn next_number(folder: &Path) -> io::Result<u64> {
+    let number = |path: &PathBuf| path.file_name()?.to_str()?.split_once('-')?.0.parse::<u64>().ok();
+    Ok(recordings(folder)?.iter().filter_map(number).max().map_or(0, |n| n + 1))
+}
+
+/// Removes the oldest recordings until all are within `limit` bytes; `keep` stays. Gives the number removed.
+pub(super) fn trim(folder: &Path, limit: u64, keep: &Path) -> io::Result<u64> {
+    let size = |path: &Path| std::fs::metadata(path).map_or(0, |m| m.len());
+    let mut all: Vec<(PathBuf, u64)> = recordings(folder)?
+        .into_iter()
+        .map(|path| {
+            let bytes = size(&path) + size(&index_of(&path));
+            (path, bytes)
+        })
+        .collect();
+    // Evidence is named by its alert, not by its age.
+    all.sort_by_key(|(path, _)| std::fs::metadata(path).and_then(|m| m.modified()).ok());
+    let mut total: u64 = all.iter().map(|(_, bytes)| bytes).sum();
+    let mut removed = 0;
+    for (path, bytes) in all.iter().filter(|(path, _)| path != keep) {
+        if total <= limit {
+            break;
+        }
+        // The index last: a recording without one is not seen again, an index without frames is no harm.
+        std::fs::remove_file(path)?;
+        std::fs::remove_file(index_of(path))?;
+        total -= bytes;
+        removed += 1;
+    }
+    Ok(removed)
+}

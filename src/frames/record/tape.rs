@@ -1,0 +1,212 @@
+//! One file of a recording: frames in NAME.npy, and in NAME.frames.ndjson a line for each thing that the monitor
+//! was given, in order: times, claims, masks, and what was unusable.
+
+use std::fs::File;
+use std::io::{BufRead, BufReader, Write};
+use std::path::{Path, PathBuf};
+
+use jiff::Timestamp;
+use ndarray::Array2;
+use serde::{Deserialize, Serialize};
+
+use crate::claim::Claim;
+use crate::frame::Frame;
+use crate::frames::{Error, Next, npy};
+
+/// First line of the index.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub(super) struct Head {
+    /// Version of the format.
+    pub oapwatch_recording: u32,
+    /// The claims that stood when the file begins; for a replay that begins with it.
+    pub claims: Vec<Claim>,
+}
+
+/// Any other line.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub(in crate::frames) struct Entry {
+    pub index: u64,
+    pub time: Timestamp,
+    /// Why there is no frame; otherwise the next frame of the .npy is meant.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub unusable: Option<String>,
+    /// Masked pixels, row and column.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub masked: Option<Vec<[usize; 2]>>,
+    /// Claims that came with the frame, or since the one before.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub claims: Vec<Claim>,
+}
+
+/// What was seen at one time: an entry with its pixels.
+#[derive(Clone, Debug)]
+pub(in crate::frames) struct Seen {
+    pub entry: Entry,
+    pub pixels: Option<Array2<f64>>,
+}
+
+impl Seen {
+    pub fn frame(frame: &Frame, claims: &[Claim]) -> Self {
+        let masked = frame.masked.as_ref().map(|masked| {
+            let marked = masked.indexed_iter().filter(|(_, m)| **m);
+            marked.map(|((y, x), _)| [y, x]).collect()
+        });
+        let entry = Entry {
+            index: frame.index,
+            time: frame.time,
+            unusable: None,
+            masked,
+            claims: claims.to_vec(),
+        };
+        Self {
+            entry,
+            pixels: Some(frame.pixels.clone()),
+        }
+    }
+
+    pub fn next(self) -> Next {
+        let Entry {
+            index,
+            time,
+            unusable,
+            masked,
+            claims,
+        } = self.entry;
+        let Some(pixels) = self.pixels else {
+            let reason = unusable.unwrap_or_default();
+            return Next::Unusable { index, time, reason };
+        };
+        let masked = masked.map(|marked| {
+            let mut mask = Array2::from_elem(pixels.dim(), false);
+            for at in marked {
+                if let Some(pixel) = mask.get_mut(at) {
+                    *pixel = true;
+                }
+            }
+            mask
+        });
+        let frame = Frame {
+            index,
+            time,
+            pixels,
+            masked,
+        };
+        Next::Frame(frame, claims)
+    }
+}
+
+/// Where the index of a recording lies.
+pub(in crate::frames) fn index_of(npy: &Path) -> PathBuf {
+    npy.with_extension("frames.ndjson")
+}
+
+/// Writes one file. A frame's pixels go out before its line: what the index names is there.
+#[derive(Debug)]
+pub(super) struct TapeWriter {
+    frames: npy::Writer,
+    index: File,
+}
+
+impl TapeWriter {
+    pub fn create(path: &Path, shape: (usize, usize), claims: Vec<Claim>) -> Result<Self, Error> {
+        let frames = npy::Writer::create(path, shape)?;
+        let index = File::create(index_of(path)).map_err(|source| Error::Recording {
+            path: index_of(path),
+            source,
+        })?;
+        let mut tape = Self { frames, index };
+        tape.line(&Head {
+            oapwatch_recording: 1,
+            claims,
+        })?;
+        Ok(tape)
+    }
+
+    pub fn path(&self) -> &Path {
+        self.frames.path()
+    }
+
+    pub fn push(&mut self, seen: &Seen) -> Result<(), Error> {
+        if let Some(pixels) = &seen.pixels {
+            self.frames.push(pixels.view())?;
+        }
+        self.line(&seen.entry)
+    }
+
+    fn line(&mut self, value: &impl Serialize) -> Result<(), Error> {
+        let mut line = serde_json::to_vec(value).expect("plain data has a JSON form");
+        line.push(b'\n');
+        self.index.write_all(&line).map_err(|source| Error::Recording {
+            path: index_of(self.frames.path()),
+            source,
+        })
+    }
+}
+
+/// Reads one file. A last line that was cut short is what a killed recorder was writing: it is passed over.
+#[derive(Debug)]
+pub(in crate::frames) struct TapeReader {
+    path: PathBuf,
+    lines: std::io::Lines<BufReader<File>>,
+    number: u64,
+    frames: Option<npy::Reader>,
+}
+
+impl TapeReader {
+    /// The file and the claims that stood when it begins.
+    pub fn open(path: &Path) -> Result<(Self, Vec<Claim>), Error> {
+        let index = index_of(path);
+        let file = File::open(&index).map_err(|source| Error::Recording { path: index, source })?;
+        let mut tape = Self {
+            path: path.to_owned(),
+            lines: BufReader::new(file).lines(),
+            number: 0,
+            frames: None,
+        };
+        let head = tape.line::<Head>()?;
+        Ok((tape, head.map(|h| h.claims).unwrap_or_default()))
+    }
+
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    fn line<T: serde::de::DeserializeOwned>(&mut self) -> Result<Option<T>, Error> {
+        let Some(line) = self.lines.next() else {
+            return Ok(None);
+        };
+        self.number += 1;
+        let line = line.map_err(|source| Error::Recording {
+            path: index_of(&self.path),
+            source,
+        })?;
+        match serde_json::from_str(&line) {
+            Ok(value) => Ok(Some(value)),
+            Err(_) if self.lines.next().is_none() => Ok(None),
+            Err(source) => Err(Error::Index {
+                path: index_of(&self.path),
+                line: self.number,
+                source,
+            }),
+        }
+    }
+
+    /// The next thing that was seen.
+    pub fn next(&mut self) -> Result<Option<Seen>, Error> {
+        let Some(entry) = self.line::<Entry>()? else {
+            return Ok(None);
+        };
+        if entry.unusable.is_some() {
+            return Ok(Some(Seen { entry, pixels: None }));
+        }
+        let frames = match &mut self.frames {
+            Some(frames) => frames,
+            None => self.frames.insert(npy::Reader::open(&self.path, None)?),
+        };
+        let pixels = frames.next().transpose()?;
+        Ok(pixels.map(|pixels| Seen {
+            entry,
+            pixels: Some(pixels),
+        }))
+    }
+}
