@@ -8,6 +8,7 @@
 use super::basis::Basis;
 use super::linear::{axpy, cholesky, dot, invert, solve};
 use super::reading::Reading;
+use super::screen::Screened;
 
 /// An emitter on the sensor: centre in σ, energy in units of the noise.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -128,8 +129,8 @@ pub(super) struct Fitter {
     strip: Vec<f64>,
     small: Vec<f64>,
     active: Vec<bool>,
-    /// Steps taken since the last reset, for studies.
-    pub steps: usize,
+    /// Work done since the last reset, multiplications.
+    pub work: f64,
 }
 
 impl Fitter {
@@ -168,7 +169,7 @@ impl Fitter {
             strip: Vec::new(),
             small: Vec::new(),
             active: Vec::new(),
-            steps: 0,
+            work: 0.0,
         }
     }
 
@@ -186,6 +187,69 @@ impl Fitter {
     pub fn residual_of(&mut self, reading: &Reading, model: &mut Model) -> &[f64] {
         self.fit(reading, model, 0);
         &self.residual
+    }
+
+    /// Turns the covariance of least squares under even noise into that under noise that grows with the signal,
+    /// C JᵀVJ C (White, 1980, eq. 3).
+    pub fn spread(&mut self, reading: &Reading, model: &Model, frame: &Screened, cov: &mut [f64]) {
+        let p = model.parameters();
+        let (n, widths) = (model.spots.len(), model.nuisances.widths());
+        let sources = n + model.nuisances.background_atoms();
+        let (mx, my) = (reading.mx, reading.my);
+        let pixels = |b: &Basis, m: usize, atoms: &[f64]| -> Vec<f64> {
+            (0..sources * 3)
+                .flat_map(|i| (0..b.n).map(move |k| (i, k)))
+                .map(|(i, k)| dot(&b.row(k)[..m], &atoms[i * m..(i + 1) * m]))
+                .collect()
+        };
+        let (fx, fy) = (pixels(&self.bx, mx, &self.now.x), pixels(&self.by, my, &self.now.y));
+        let (nx, ny) = (self.bx.n, self.by.n);
+        let mut middle = vec![0.0; p * p];
+        let mut row = vec![0.0; p];
+        for y in 0..ny {
+            for x in 0..nx {
+                if frame.is_bad[y * nx + x] {
+                    continue;
+                }
+                row.fill(0.0);
+                let mut signal = 0.0;
+                for i in 0..sources {
+                    let [x0, x1, x2] = [0, 1, 2].map(|d| fx[(3 * i + d) * nx + x]);
+                    let [y0, y1, y2] = [0, 1, 2].map(|d| fy[(3 * i + d) * ny + y]);
+                    if i >= n {
+                        row[2 * n + i] = x0 * y0;
+                        signal += self.now.background[i - n] * x0 * y0;
+                        continue;
+                    }
+                    let a = self.now.spots[i].a;
+                    signal += a * x0 * y0;
+                    (row[3 * i], row[3 * i + 1], row[3 * i + 2]) = (a * x1 * y0, a * x0 * y1, x0 * y0);
+                    if widths > 0 {
+                        row[p - widths] += a * self.now.width[0].powi(2) * x2 * y0;
+                        row[p - 1] += a * self.now.width[1].powi(2) * x0 * y2;
+                    }
+                }
+                let v = reading.growth.at(signal);
+                for i in 0..p {
+                    axpy(v * row[i], &row[..=i], &mut middle[i * p..i * p + i + 1]);
+                }
+            }
+        }
+        for i in 0..p {
+            for j in 0..i {
+                middle[j * p + i] = middle[i * p + j];
+            }
+        }
+        let mut half = vec![0.0; p * p];
+        for i in 0..p {
+            for j in 0..p {
+                half[i * p + j] = dot(&cov[i * p..(i + 1) * p], &middle[j * p..(j + 1) * p]);
+            }
+        }
+        let full: Vec<f64> = (0..p * p)
+            .map(|k| dot(&half[k / p * p..(k / p + 1) * p], &cov[k % p * p..(k % p + 1) * p]))
+            .collect();
+        cov.copy_from_slice(&full);
     }
 
     /// Inner products of the residual with each spot's second derivatives (xx, xy, yy): how it is bent there.
@@ -253,6 +317,9 @@ impl Fitter {
         self.solve_amplitudes(reading, nuisances, false);
         let mut deviance = self.subtract(reading, nuisances, false);
         let parameters = 3 * model.spots.len() + nuisances.count();
+        let sources = (model.spots.len() + 1) as f64;
+        let size = (reading.mx * reading.my) as f64;
+        let work = sources * (9.0 * size + 40.0 * (reading.mx + reading.my) as f64) + 9.0 * sources.powi(3);
         let mut lambda = LAMBDA_START;
         let mut small_drops = 0;
         let mut converged = parameters == nuisances.background_atoms();
@@ -266,7 +333,7 @@ impl Fitter {
             if converged {
                 break;
             }
-            self.steps += 1;
+            self.work += work;
             if !fresh {
                 self.linearise(reading, nuisances);
                 fresh = true;

@@ -21,22 +21,26 @@ pub(super) fn locate(
     model: &mut Model,
     frame: &Screened,
     camera: &Camera,
-    rung: &'static str,
+    noise_j: f64,
 ) -> Estimate {
     let n = model.spots.len();
     let p = model.parameters();
     search.fitter.information(reading, model);
     let freedom = (reading.numbers - p as f64).max(1.0);
     let reduced_chi2 = model.deviance / freedom;
-    let is_poor = model.deviance > freedom + 5.0 * (2.0 * freedom).sqrt() + 5.0;
+    let expected = reading.mean_variance * freedom;
+    let is_poor = model.deviance > expected + reading.lit_variance * (5.0 * (2.0 * freedom).sqrt() + 5.0);
     // A misfit widens the claim: the covariance speaks for what was found, not for what was hoped.
-    let inflation = if is_poor { reduced_chi2 } else { 1.0 };
+    let inflation = if is_poor { model.deviance / expected } else { 1.0 };
     let (bx, by) = (&search.fitter.bx, &search.fitter.by);
     let (low, high) = ([bx.edges[0], by.edges[0]], [bx.edges[bx.n], by.edges[by.n]]);
     let pitch = [bx.pitch(), by.pitch()];
     let extent = (high[0] - low[0]).max(high[1] - low[1]);
     let mut cov = Vec::new();
     let is_regular = search.fitter.covariance(p, n, 12.0 / (extent * extent), &mut cov);
+    if is_regular && !reading.growth.is_flat() {
+        search.fitter.spread(reading, model, frame, &mut cov);
+    }
     let block = |i: usize, j: usize| {
         if is_regular {
             [0, 1].map(|r| [0, 1].map(|c| cov[(3 * i + r) * p + 3 * j + c]))
@@ -90,8 +94,8 @@ pub(super) fn locate(
                 x_m,
                 y_m,
                 cov_m2: camera.cov_to_ground(sensor_m, own.map(|r| r.map(|c| c * scale))),
-                energy_j: spot.a * camera.noise_std_j,
-                energy_std_j: (energy_variance * inflation).max(0.0).sqrt() * camera.noise_std_j,
+                energy_j: spot.a * noise_j,
+                energy_std_j: (energy_variance * inflation).max(0.0).sqrt() * noise_j,
                 sensor_m,
                 flags,
             }
@@ -99,7 +103,7 @@ pub(super) fn locate(
         .collect();
     Estimate {
         emitters,
-        rung,
+        rung: "",
         reduced_chi2,
         saturated_share: frame.saturated as f64 / frame.pixels.len() as f64,
     }

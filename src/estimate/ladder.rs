@@ -1,11 +1,14 @@
 //! The ladder of estimators: what each rung does, and building one from a config.
 
+use std::time::{Duration, Instant};
+
 use super::basis::Basis;
 use super::fit::{Fitter, Model, Nuisances};
+use super::noise::Inspection;
 use super::reading::Reading;
 use super::screen::Screened;
 use super::search::Search;
-use super::{Config, Error, Estimate, Estimator, ground};
+use super::{Config, Error, Estimate, Estimator, Flags, ground};
 use crate::frame::Frame;
 use crate::optics::Camera;
 
@@ -63,6 +66,9 @@ pub const LADDER: &[Rung] = &[
 /// The rung used when none is named.
 pub const DEFAULT: &str = "ml";
 
+/// Times that a frame is looked over for pixels that are lit alone.
+const LOOKS: usize = 3;
+
 /// Why an `[estimator]` table describes no estimator.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum ConfigError {
@@ -110,7 +116,11 @@ pub fn build(config: &Config, camera: &Camera) -> Result<Box<dyn Estimator>, Con
             found: budget,
         });
     }
-    Ok(Box::new(Analytic::new(rung, camera)))
+    Ok(Box::new(Analytic::new(
+        rung,
+        camera,
+        config.budget_ms.map(|ms| Duration::from_secs_f64(ms * 1e-3)),
+    )))
 }
 
 /// A rung without a learned part.
@@ -119,11 +129,13 @@ struct Analytic {
     camera: Camera,
     frame: Screened,
     reading: Reading,
+    inspection: Inspection,
+    budget: Option<Duration>,
     search: Search,
 }
 
 impl Analytic {
-    fn new(rung: &'static Rung, camera: &Camera) -> Self {
+    fn new(rung: &'static Rung, camera: &Camera, budget: Option<Duration>) -> Self {
         let bx = Basis::new(&camera.x, camera.spot_sigma_m);
         let by = Basis::new(&camera.y, camera.spot_sigma_m);
         Self {
@@ -131,6 +143,8 @@ impl Analytic {
             camera: camera.clone(),
             frame: Screened::default(),
             reading: Reading::default(),
+            inspection: Inspection::default(),
+            budget,
             search: Search::new(Fitter::new(bx, by)),
         }
     }
@@ -142,9 +156,27 @@ impl Estimator for Analytic {
     }
 
     fn estimate(&mut self, frame: &Frame) -> Result<Estimate, Error> {
+        let started = Instant::now();
         self.frame.load(frame, &self.camera)?;
         let Self { search, reading, .. } = self;
         reading.load(&self.frame, &search.fitter.bx, &search.fitter.by);
+        let mut scale = 1.0;
+        search.restart(self.budget.map(|b| started + b));
+        if self.rung.method == Method::MaximumLikelihood {
+            scale = self
+                .inspection
+                .run(&mut self.frame, reading, &search.fitter.bx, &search.fitter.by);
+            for _ in 0..LOOKS {
+                let Some(mut model) = search.first_look(reading, &self.frame) else {
+                    break;
+                };
+                let residual = search.fitter.residual_of(reading, &mut model).to_vec();
+                let (bx, by) = (&search.fitter.bx, &search.fitter.by);
+                if !self.inspection.reject_lone(&mut self.frame, reading, &residual, bx, by) {
+                    break;
+                }
+            }
+        }
         let nuisances = Nuisances::default();
         let mut model = match self.rung.method {
             Method::Peak { is_subpixel } => search.peaks(reading, is_subpixel),
@@ -154,20 +186,17 @@ impl Estimator for Analytic {
                 model
             }
             Method::Pencil { steps } => search.seeded(reading, &self.frame.pixels, steps),
-            Method::MaximumLikelihood => {
-                let mut model = search.start(reading, &self.frame.pixels, nuisances, 60);
-                search.refine(reading, &mut model);
-                model
-            }
+            Method::MaximumLikelihood => search.maximum_likelihood(reading, &self.frame),
         };
-        Ok(ground::locate(
-            search,
-            reading,
-            &mut model,
-            &self.frame,
-            &self.camera,
-            self.rung.name,
-        ))
+        let noise_j = scale * self.camera.noise_std_j;
+        let mut estimate = ground::locate(search, reading, &mut model, &self.frame, &self.camera, noise_j);
+        estimate.rung = self.rung.name;
+        if search.is_exhausted() {
+            for emitter in &mut estimate.emitters {
+                emitter.flags |= Flags::OUT_OF_TIME;
+            }
+        }
+        Ok(estimate)
     }
 }
 

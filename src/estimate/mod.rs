@@ -9,6 +9,7 @@ mod ground;
 mod heatmap;
 mod ladder;
 mod linear;
+mod noise;
 mod pencil;
 mod reading;
 mod screen;

@@ -2,6 +2,8 @@
 
 use super::basis::Basis;
 use super::fit::Model;
+use super::linear::dot;
+use super::noise::Growth;
 use super::screen::Screened;
 
 /// What a frame may leave outside the basis, in units of the noise.
@@ -21,6 +23,10 @@ pub(super) struct Reading {
     pub numbers: f64,
     /// Mean square of what lies outside the basis, and how many numbers that is.
     pub outside: (f64, f64),
+    /// How the noise grows with the signal, its mean variance over the frame and over its light.
+    pub growth: Growth,
+    pub mean_variance: f64,
+    pub lit_variance: f64,
     rows: Vec<f64>,
 }
 
@@ -86,13 +92,30 @@ impl Reading {
         let inside = (self.rank[0] * self.rank[1]) as f64;
         self.numbers = inside - leverage;
         let left = (nx * ny) as f64 - inside - (self.bad.len() as f64 - leverage);
-        self.outside = (0.0, left.max(0.0));
+        let energy = square(&frame.pixels) - square(&self.z) - self.filled_outside(frame, bx, by);
+        self.outside = (energy.max(0.0) / left.max(1.0), left.max(0.0));
+        (self.growth, self.mean_variance, self.lit_variance) = (Growth::default(), 1.0, 1.0);
+    }
+
+    /// Energy that the values filled into unusable pixels have outside the basis.
+    fn filled_outside(&self, frame: &Screened, bx: &Basis, by: &Basis) -> f64 {
+        let mut energy = 0.0;
+        let mut column = vec![0.0; if self.bad.is_empty() { 0 } else { self.my }];
+        for bad in &self.bad {
+            for (c, value) in column.iter_mut().enumerate() {
+                *value = dot(&self.z[c * self.mx..(c + 1) * self.mx], &bx.row(bad.x)[..self.mx]);
+            }
+            let smooth = dot(&column, &by.row(bad.y)[..self.my]);
+            energy += (frame.pixels[bad.y * bx.n + bad.x] - smooth).powi(2);
+        }
+        energy
     }
 
     /// Whether the model explains the frame to within the noise.
     pub fn is_explained(&self, model: &Model) -> bool {
         let freedom = (self.numbers - model.parameters() as f64).max(1.0);
-        model.deviance < freedom + 2.5 * (2.0 * freedom).sqrt() + 2.5
+        let spread = 2.5 * (2.0 * freedom).sqrt() + 2.5;
+        model.deviance < self.mean_variance * freedom + self.lit_variance * spread
     }
 
     /// Fills `out` (Ny, Nx) with what the basis holds of the frame, Uᵧ Z Uₓᵀ.
@@ -115,5 +138,5 @@ impl Reading {
 }
 
 fn square(v: &[f64]) -> f64 {
-    v.iter().map(|a| a * a).sum()
+    dot(v, v)
 }

@@ -1,9 +1,12 @@
 //! The search for the number of emitters: hypotheses are fitted jointly and held against each other.
 
-use super::fit::{Fitter, Model, Nuisances, Spot};
+use std::time::Instant;
+
+use super::fit::{Fitter, Model, Nuisances, Spot, Width};
 use super::heatmap::Heatmap;
 use super::pencil::Pencil;
 use super::reading::Reading;
+use super::screen::Screened;
 
 /// Emitters a frame may hold at most.
 const MOST: usize = 80;
@@ -12,12 +15,18 @@ const SEPARATION: f64 = 2.5;
 /// Steps that a candidate may take before it is judged, and a chosen model before it is reported.
 const TRIAL_STEPS: usize = 30;
 const FINAL_STEPS: usize = 200;
+/// Fewer steps than this are asked for by rungs that only polish seeds.
+const MINIMAL_POLISH: usize = 10;
 /// Rounds of moves.
 const ROUNDS: usize = 8;
 /// Spots nearer than this, σ, may be one.
 const MERGE: f64 = 2.5;
 /// A split puts its halves this far to either side, σ.
 const SPLIT: f64 = 0.4;
+/// Multiplications a frame may cost: the same for every run, unlike a clock. About 10 ms on one core of 2021.
+const MOST_WORK: f64 = 1e8;
+/// Least drop of the deviance that a nuisance parameter must bring.
+const NUISANCE_PRICE: f64 = 5.0;
 
 /// The search with its settings that follow from the camera.
 pub(super) struct Search {
@@ -25,6 +34,9 @@ pub(super) struct Search {
     pub heatmap: Heatmap,
     /// Least drop of the deviance that an emitter must bring.
     pub price: f64,
+    /// What the noise of the frame's light multiplies prices by.
+    pub factor: f64,
+    deadline: Option<Instant>,
     residual: Vec<f64>,
 }
 
@@ -39,13 +51,147 @@ impl Search {
             fitter,
             heatmap,
             price,
+            factor: 1.0,
+            deadline: None,
             residual: Vec::new(),
         }
     }
 
-    /// What is held against each other: −2 ln likelihood plus the price of the emitters.
+    /// Forgets the work done for the last frame.
+    pub fn restart(&mut self, deadline: Option<Instant>) {
+        self.fitter.work = 0.0;
+        self.deadline = deadline;
+        self.factor = 1.0;
+    }
+
+    /// Whether the frame has had its share of work, or of time where a budget is set.
+    pub fn is_exhausted(&self) -> bool {
+        self.fitter.work > MOST_WORK || self.deadline.is_some_and(|d| Instant::now() >= d)
+    }
+
+    /// What is held against each other: −2 ln likelihood plus the price of the emitters and nuisances.
     pub fn score(&self, model: &Model) -> f64 {
-        model.deviance + self.price * model.spots.len() as f64
+        let nuisances = NUISANCE_PRICE * model.nuisances.count() as f64;
+        model.deviance + self.factor * (self.price * model.spots.len() as f64 + nuisances)
+    }
+
+    /// Maximum likelihood with the number of emitters unknown. Nuisances are fitted only where the frame cannot be
+    /// explained without, and then within every hypothesis.
+    pub fn maximum_likelihood(&mut self, reading: &Reading, frame: &Screened) -> Model {
+        self.factor = reading.lit_variance;
+        let background = self.looks_lit(frame);
+        let plain = Nuisances {
+            background,
+            width: Width::Known,
+        };
+        let mut model = self.start(reading, &frame.pixels, plain, 60);
+        if !reading.is_explained(&model) {
+            let levels = [Width::Known, Width::Common, Width::PerAxis].map(|width| Nuisances {
+                background: true,
+                width,
+            });
+            for nuisances in levels {
+                if reading.is_explained(&model) || nuisances == model.nuisances {
+                    continue;
+                }
+                let next = self.start(reading, &frame.pixels, nuisances, 60);
+                if self.score(&next) < self.score(&model) {
+                    model = next;
+                }
+            }
+        }
+        self.refine(reading, &mut model, ROUNDS);
+        self.simplify(reading, &mut model);
+        self.fitter.fit(reading, &mut model, FINAL_STEPS);
+        model
+    }
+
+    /// `model` with those further nuisances that explain the frame best, if any do.
+    fn widened(&mut self, reading: &Reading, model: &Model) -> Option<Model> {
+        if model.spots.is_empty() {
+            return None;
+        }
+        let mut best: Option<Model> = None;
+        for width in [Width::Known, Width::Common, Width::PerAxis] {
+            let nuisances = Nuisances {
+                background: true,
+                width,
+            };
+            if nuisances.count() <= model.nuisances.count() {
+                continue;
+            }
+            let mut next = best.clone().unwrap_or_else(|| model.clone());
+            next.nuisances = nuisances;
+            self.fitter.fit(reading, &mut next, TRIAL_STEPS);
+            if self.score(&next) < best.as_ref().map_or(self.score(model), |b| self.score(b)) {
+                let is_explained = reading.is_explained(&next);
+                best = Some(next);
+                if is_explained {
+                    break;
+                }
+            }
+        }
+        best
+    }
+
+    /// The emitters that stand out at once, with a background where the frame looks lit: enough to tell what in the
+    /// residual cannot be light.
+    pub fn first_look(&mut self, reading: &Reading, frame: &Screened) -> Option<Model> {
+        if Pencil::suits(&self.fitter.bx, &self.fitter.by) {
+            return None;
+        }
+        let mut model = Model::empty(Nuisances {
+            background: self.looks_lit(frame),
+            width: Width::Known,
+        });
+        let peaks = self.residual_peaks(reading, &mut model);
+        let least = peaks.first().map_or(0.0, |p| 0.1 * p.significance);
+        let spots = peaks.iter().take_while(|p| p.significance >= least).take(MOST);
+        model.spots = spots.map(|p| Spot { u: p.u, a: p.a }).collect();
+        self.fitter.fit(reading, &mut model, TRIAL_STEPS);
+        (!reading.is_explained(&model)).then_some(model)
+    }
+
+    /// Whether the frame's dark parts are lighter or darker than the noise allows. Only for spots that leave parts dark.
+    fn looks_lit(&mut self, frame: &Screened) -> bool {
+        if Pencil::suits(&self.fitter.bx, &self.fitter.by) {
+            return false;
+        }
+        self.residual.clear();
+        let usable = frame.pixels.iter().zip(&frame.is_bad).filter(|(_, bad)| !**bad);
+        self.residual.extend(usable.map(|(p, _)| *p));
+        let count = self.residual.len();
+        let (_, tenth, _) = self.residual.select_nth_unstable_by(count / 10, f64::total_cmp);
+        // The lowest decile of standard normal noise is −1.2816, with standard deviation 1.71/√count.
+        (*tenth + 1.2816).abs() > 5.0 * 1.71 / (count as f64).sqrt()
+    }
+
+    /// Takes out nuisances that the frame can do without.
+    fn simplify(&mut self, reading: &Reading, model: &mut Model) {
+        let simpler = [
+            Nuisances {
+                background: model.nuisances.background,
+                width: Width::Known,
+            },
+            Nuisances {
+                background: false,
+                width: model.nuisances.width,
+            },
+            Nuisances::default(),
+        ];
+        for nuisances in simpler {
+            if nuisances.count() < model.nuisances.count() {
+                let mut next = model.clone();
+                next.nuisances = nuisances;
+                if nuisances.width == Width::Known {
+                    next.width = [1.0; 2];
+                }
+                if !nuisances.background {
+                    next.background = [0.0; 3];
+                }
+                self.consider(reading, model, next);
+            }
+        }
     }
 
     /// Adds peaks of the residual until none is significant, refitting all emitters each time.
@@ -63,10 +209,18 @@ impl Search {
                 break;
             }
             self.fitter.fit(reading, &mut next, TRIAL_STEPS);
+            // What looks like more emitters may be a background or another width: the better explanation stands.
+            let wider = self.widened(reading, &model);
+            if let Some(wider) = wider.filter(|w| self.score(w) < self.score(&next)) {
+                next = wider;
+            }
             if self.score(&next) > self.score(&model) {
                 break;
             }
             model = next;
+            if reading.is_explained(&model) || self.is_exhausted() {
+                break;
+            }
         }
         model
     }
@@ -79,8 +233,16 @@ impl Search {
         let sure = pencil.strength.iter().take_while(|&&s| s > 4.0).count();
         let likely = pencil.strength.iter().take_while(|&&s| s > 0.5).count();
         let mut worse = 0;
-        for count in sure.max(1)..=(likely + 2).min(pencil.most()).min(MOST) {
-            if reading.is_explained(&best) || worse == 2 {
+        let mut wide: Option<Model> = None;
+        let plain = nuisances == Nuisances::default() && polish > MINIMAL_POLISH;
+        // A background or another width has singular values of its own.
+        let fewest = if nuisances == Nuisances::default() {
+            sure
+        } else {
+            sure.saturating_sub(6)
+        };
+        for count in fewest.max(1)..=(likely + 2).min(pencil.most()).min(MOST) {
+            if reading.is_explained(&best) || worse == 3 || self.is_exhausted() {
                 break;
             }
             let Some(seeds) = pencil.seeds(count) else { break };
@@ -93,6 +255,26 @@ impl Search {
             } else {
                 worse += 1;
             }
+            if let Some(wide) = wide.as_ref().filter(|w| reading.is_explained(w))
+                && !reading.is_explained(&best)
+                && best.spots.len() > wide.spots.len() + 1
+            {
+                break;
+            }
+            if plain && !reading.is_explained(&best) && best.spots.len() == count {
+                let mut next = best.clone();
+                next.nuisances = Nuisances {
+                    background: true,
+                    width: Width::Common,
+                };
+                self.fitter.fit(reading, &mut next, polish);
+                if wide.as_ref().is_none_or(|w| self.score(&next) < self.score(w)) {
+                    wide = Some(next);
+                }
+            }
+        }
+        if let Some(wide) = wide.filter(|w| self.score(w) < self.score(&best)) {
+            best = wide;
         }
         Some(best)
     }
@@ -108,15 +290,15 @@ impl Search {
     }
 
     /// The number of emitters of least score: moves from `model` until none helps, then a fit to convergence.
-    pub fn refine(&mut self, reading: &Reading, model: &mut Model) {
-        for _ in 0..ROUNDS {
+    pub fn refine(&mut self, reading: &Reading, model: &mut Model, rounds: usize) {
+        for _ in 0..rounds {
             let before = self.score(model);
             if !reading.is_explained(model) {
                 self.fitter.fit(reading, model, FINAL_STEPS);
             }
             self.grow(reading, model);
             self.shrink(reading, model);
-            if before - self.score(model) < 0.1 {
+            if before - self.score(model) < 0.1 || self.is_exhausted() {
                 break;
             }
         }
@@ -125,7 +307,7 @@ impl Search {
 
     /// Tries `next` and keeps it where it is better.
     fn consider(&mut self, reading: &Reading, model: &mut Model, mut next: Model) -> bool {
-        if next.spots.len() > MOST {
+        if next.spots.len() > MOST || self.is_exhausted() {
             return false;
         }
         self.fitter.fit(reading, &mut next, TRIAL_STEPS);
@@ -142,7 +324,7 @@ impl Search {
         self.fitter.clean(reading, model.nuisances, &mut self.residual);
         let (mx, my) = (reading.mx, reading.my);
         // A peak's share that other spots have absorbed comes back in the joint fit: look a little lower.
-        let threshold = 0.7 * self.price.sqrt();
+        let threshold = 0.7 * (self.factor * self.price).sqrt();
         self.heatmap.peaks(&self.residual, mx, my, threshold, SEPARATION)
     }
 
@@ -203,7 +385,7 @@ impl Search {
             let mut has_shrunk = false;
             for (_, i, j) in pairs.into_iter().take(3) {
                 let (p, q) = (model.spots[i], model.spots[j]);
-                if self.separation(reading, model, i, j) > 8.0 * self.price {
+                if self.separation(reading, model, i, j) > 8.0 * self.factor * self.price {
                     continue;
                 }
                 let mut next = model.clone();
@@ -223,7 +405,7 @@ impl Search {
                 let weakest = (0..n)
                     .min_by(|&i, &j| significance[i].total_cmp(&significance[j]))
                     .expect("not empty");
-                if significance[weakest] < 4.0 * self.price {
+                if significance[weakest] < 4.0 * self.factor * self.price {
                     let mut next = model.clone();
                     next.spots.remove(weakest);
                     has_shrunk = self.consider(reading, model, next);

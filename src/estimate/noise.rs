@@ -1,0 +1,304 @@
+//! What a frame itself says about its noise, without a model of its emitters.
+//!
+//! No spot can reach outside the basis, so what lies there is noise: its mean square is the noise's, a single pixel
+//! that stands out of it is hot or dead, and where it grows with the signal the noise is shot noise or gain scatter.
+
+use super::basis::Basis;
+use super::reading::Reading;
+use super::screen::Screened;
+
+/// Numbers outside the basis below which they are too few to judge by.
+const FEWEST: f64 = 100.0;
+/// Standard deviations by which the noise must differ from the configured before it is believed.
+const DIFFERENT: f64 = 4.0;
+/// Standard deviations at which a single pixel is taken for hot or dead.
+const OUTLIER: f64 = 6.0;
+const PASSES: usize = 14;
+/// One pass rejects what stands out at least this share of the worst: the worst hide the rest.
+const SHARE: f64 = 0.5;
+/// Passes that settle the values of bad pixels.
+const SETTLING: usize = 3;
+/// Pixels wider than this, σ, can be lit alone by a spot.
+const WIDEST_PIXEL: f64 = 0.6;
+/// Signal levels that the noise is measured at.
+const LEVELS: usize = 8;
+
+/// Variance of a pixel's noise over that of the frame's darkest parts: 1 + a s + b s², s the signal in units of the noise.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub(super) struct Growth {
+    pub linear: f64,
+    pub square: f64,
+}
+
+impl Growth {
+    pub fn at(self, signal: f64) -> f64 {
+        let s = signal.max(0.0);
+        1.0 + s * (self.linear + s * self.square)
+    }
+
+    pub fn is_flat(self) -> bool {
+        self == Self::default()
+    }
+}
+
+/// Scratch memory of the inspection.
+#[derive(Default)]
+pub(super) struct Inspection {
+    smooth: Vec<f64>,
+    leverage: [Vec<f64>; 2],
+    squares: Vec<(f64, f64)>,
+    filled: Vec<f64>,
+}
+
+impl Inspection {
+    /// Finds hot and dead pixels, measures the noise, and loads `reading` anew where that changes it: the frame is
+    /// divided by the noise measured (returned, in units of the configured), bad pixels are listed and filled in.
+    pub fn run(&mut self, frame: &mut Screened, reading: &mut Reading, bx: &Basis, by: &Basis) -> f64 {
+        let left = reading.outside.1;
+        if left < FEWEST {
+            return 1.0;
+        }
+        let z = |reading: &Reading| (reading.outside.0 - 1.0) * (reading.outside.1 / 2.0).sqrt();
+        if z(reading).abs() < DIFFERENT {
+            return 1.0;
+        }
+        for _ in 0..PASSES {
+            reading.expand(bx, by, &mut self.smooth);
+            self.measure(frame, reading, bx, by);
+            if !self.reject(frame, reading, bx.n) {
+                break;
+            }
+            reading.load(frame, bx, by);
+        }
+        for _ in 0..if frame.bad.is_empty() { 0 } else { SETTLING } {
+            reading.expand(bx, by, &mut self.smooth);
+            self.fill(frame, bx.n);
+            reading.load(frame, bx, by);
+        }
+        reading.expand(bx, by, &mut self.smooth);
+        self.measure(frame, reading, bx, by);
+        let dark = self.grow(reading);
+        // Even noise is best measured by all of it; a median would take it for Gaussian.
+        let floor = if reading.growth.is_flat() {
+            reading.outside.0
+        } else {
+            dark
+        };
+        let floor = if (floor - 1.0).abs() * (reading.outside.1 / 2.0).sqrt() < DIFFERENT {
+            1.0
+        } else {
+            floor
+        };
+        let scale = floor.sqrt();
+        for p in &mut frame.pixels {
+            *p /= scale;
+        }
+        let growth = reading.growth;
+        reading.load(frame, bx, by);
+        // Of (1 + a s + b s²)·floor with s in the old units.
+        reading.growth = Growth {
+            linear: growth.linear * scale,
+            square: growth.square * floor,
+        };
+        let (mut all, mut lit, mut weight) = (0.0, 0.0, 0.0);
+        for &s in &self.smooth {
+            let s = (s / scale).max(0.0);
+            let v = reading.growth.at(s);
+            all += v;
+            lit += v * s;
+            weight += s;
+        }
+        reading.mean_variance = all / self.smooth.len() as f64;
+        reading.lit_variance = if weight > 0.0 { (lit / weight).max(1.0) } else { 1.0 };
+        scale
+    }
+
+    /// Rejects pixels that stand out of the residual (my, mx) of a first model alone, as no spot or misfit of one can.
+    /// `true` where there were any.
+    pub fn reject_lone(
+        &mut self,
+        frame: &mut Screened,
+        reading: &mut Reading,
+        residual: &[f64],
+        bx: &Basis,
+        by: &Basis,
+    ) -> bool {
+        if bx.pitch().max(by.pitch()) > WIDEST_PIXEL {
+            return false;
+        }
+        let (nx, ny) = (bx.n, by.n);
+        let data = reading.z.clone();
+        for (z, r) in reading.z.iter_mut().zip(residual) {
+            *z -= r;
+        }
+        reading.expand(bx, by, &mut self.smooth);
+        reading.z = data;
+        let left: Vec<f64> = frame.pixels.iter().zip(&self.smooth).map(|(p, m)| p - m).collect();
+        let mut found = Vec::new();
+        for y in 0..ny {
+            for x in 0..nx {
+                let k = y * nx + x;
+                if frame.is_bad[k] {
+                    continue;
+                }
+                let (mut sum, mut count) = (0.0, 0.0);
+                for (a, b) in [(x.wrapping_sub(1), y), (x + 1, y), (x, y.wrapping_sub(1)), (x, y + 1)] {
+                    if a < nx && b < ny && !frame.is_bad[b * nx + a] {
+                        sum += left[b * nx + a];
+                        count += 1.0;
+                    }
+                }
+                let beyond = (left[k] - if count > 0.0 { sum / count } else { 0.0 }).abs();
+                let noise = reading.growth.at(self.smooth[k]).sqrt();
+                // The mean of four neighbours adds a quarter of their variance.
+                if beyond > OUTLIER * noise * 1.12 && beyond > 0.5 * left[k].abs() && left[k].abs() > 0.6 * beyond {
+                    found.push((x, y));
+                }
+            }
+        }
+        for &(x, y) in &found {
+            frame.reject(x, y, nx);
+            frame.pixels[y * nx + x] = self.smooth[y * nx + x];
+        }
+        if !found.is_empty() {
+            let noise = (reading.growth, reading.mean_variance, reading.lit_variance);
+            reading.load(frame, bx, by);
+            (reading.growth, reading.mean_variance, reading.lit_variance) = noise;
+        }
+        !found.is_empty()
+    }
+
+    /// Squares of what lies outside, each over the share of a pixel that does, with the signal there.
+    fn measure(&mut self, frame: &Screened, reading: &Reading, bx: &Basis, by: &Basis) {
+        let share = |b: &Basis, m: usize| (0..b.n).map(|k| b.row(k)[..m].iter().map(|u| u * u).sum()).collect();
+        self.leverage = [share(bx, reading.mx), share(by, reading.my)];
+        self.squares.clear();
+        for (k, (&p, &s)) in frame.pixels.iter().zip(&self.smooth).enumerate() {
+            let outside = (1.0 - self.leverage[0][k % bx.n] * self.leverage[1][k / bx.n]).max(1e-3);
+            let square = if frame.is_bad[k] {
+                f64::NAN
+            } else {
+                (p - s).powi(2) / outside
+            };
+            self.squares.push((s, square));
+        }
+    }
+
+    /// Rejects pixels that stand out and fills all bad ones so that nothing of them lies outside. `false` where
+    /// there was none to reject.
+    fn reject(&mut self, frame: &mut Screened, reading: &mut Reading, nx: usize) -> bool {
+        let floor = self.grow(reading);
+        let ny = frame.pixels.len() / nx;
+        let excess = |k: usize| {
+            let (s, square) = self.squares[k];
+            if square.is_nan() {
+                0.0
+            } else {
+                square / (floor * reading.growth.at(s))
+            }
+        };
+        let worst = (0..self.squares.len()).map(excess).fold(0.0, f64::max);
+        let threshold = (OUTLIER * OUTLIER).max(SHARE * SHARE * worst);
+        let mut found = Vec::new();
+        for y in 0..ny {
+            for x in 0..nx {
+                let value = excess(y * nx + x);
+                if value <= threshold {
+                    continue;
+                }
+                let near_y = y.saturating_sub(1)..=(y + 1).min(ny - 1);
+                let is_largest = near_y
+                    .flat_map(|b| (x.saturating_sub(1)..=(x + 1).min(nx - 1)).map(move |a| b * nx + a))
+                    .all(|k| excess(k) <= value);
+                if is_largest {
+                    found.push((x, y));
+                }
+            }
+        }
+        for &(x, y) in &found {
+            frame.reject(x, y, nx);
+        }
+        self.fill(frame, nx);
+        !found.is_empty()
+    }
+
+    /// Fills bad pixels so that nothing of them lies outside, exactly where they stand alone.
+    fn fill(&mut self, frame: &mut Screened, nx: usize) {
+        self.filled.clear();
+        for bad in frame.bad.iter().filter(|b| !b.is_saturated) {
+            let k = bad.y * nx + bad.x;
+            let outside = (1.0 - self.leverage[0][bad.x] * self.leverage[1][bad.y]).max(0.05);
+            self.filled
+                .push(frame.pixels[k] - (frame.pixels[k] - self.smooth[k]) / outside);
+        }
+        for (bad, &value) in frame.bad.iter().filter(|b| !b.is_saturated).zip(&self.filled) {
+            frame.pixels[bad.y * nx + bad.x] = value;
+        }
+    }
+
+    /// Variance in the dark, with its growth with the signal set in `reading`. Medians, so that outliers count for
+    /// little: the median of a χ² variate of one degree of freedom is 0.4549.
+    fn grow(&mut self, reading: &mut Reading) -> f64 {
+        let mut sorted: Vec<(f64, f64)> = self.squares.iter().copied().filter(|s| !s.1.is_nan()).collect();
+        sorted.sort_by(|a, b| a.0.total_cmp(&b.0));
+        if sorted.len() < 8 * LEVELS {
+            return 1.0;
+        }
+        // Half the pixels make the dark level, the rest levels of rising signal and falling number.
+        let mut levels = Vec::with_capacity(LEVELS);
+        let mut start = 0;
+        for _ in 0..LEVELS {
+            let remaining = sorted.len() - start;
+            let size = if levels.len() + 1 == LEVELS {
+                remaining
+            } else {
+                remaining / 2
+            };
+            if size < 30 {
+                break;
+            }
+            let part = &sorted[start..start + size];
+            let mut squares: Vec<f64> = part.iter().map(|p| p.1).collect();
+            squares.sort_by(f64::total_cmp);
+            let variance = squares[size / 2] / 0.4549;
+            let signal = part.iter().map(|p| p.0.max(0.0)).sum::<f64>() / size as f64;
+            levels.push((signal, variance, size as f64));
+            start += size;
+        }
+        let dark = levels.first().map_or(1.0, |l| l.1).max(1e-6);
+        // Is the brightest level noisier than the darkest? The median's relative error is about 2.3/√size.
+        let brightest = levels
+            .iter()
+            .copied()
+            .fold((0.0, 0.0, 1.0), |a, b| if b.1 > a.1 { b } else { a });
+        let excess = brightest.1 / dark - 1.0;
+        reading.growth = Growth::default();
+        if brightest.0 <= 0.0 || excess < DIFFERENT * 2.3 / (brightest.2).sqrt() {
+            // One level: all pixels together say it best.
+            let mut squares: Vec<f64> = sorted.iter().map(|p| p.1).collect();
+            squares.sort_by(f64::total_cmp);
+            return (squares[squares.len() / 2] / 0.4549).max(1e-6);
+        }
+        let fit = |power: i32| {
+            let (mut top, mut bottom) = (0.0, 0.0);
+            for &(s, v, size) in &levels {
+                let (x, w) = (s.powi(power), size / (v / dark).powi(2));
+                top += w * x * (v / dark - 1.0);
+                bottom += w * x * x;
+            }
+            let slope = (top / bottom).max(0.0);
+            let misfit: f64 = levels
+                .iter()
+                .map(|&(s, v, size)| size * (v / dark / (1.0 + slope * s.powi(power)) - 1.0).powi(2))
+                .sum();
+            (slope, misfit)
+        };
+        let ((linear, a), (square, b)) = (fit(1), fit(2));
+        reading.growth = if a < b {
+            Growth { linear, square: 0.0 }
+        } else {
+            Growth { linear: 0.0, square }
+        };
+        dark
+    }
+}
