@@ -1,7 +1,21 @@
 use std::path::PathBuf;
 
 use super::{Failure, Outcome};
-use crate::config::Config;
+use crate::config::{self, Config};
+use crate::pipeline::Pipeline;
+use crate::scene::{Plan, Scene};
+use crate::{api, frames, notify};
+
+/// Keys that a scene has and a config has not.
+const OF_SCENES: [&str; 7] = [
+    "about",
+    "rate_hz",
+    "link",
+    "random_emitters",
+    "user",
+    "intruder",
+    "effects",
+];
 
 #[derive(Debug, clap::Args)]
 pub struct Args {
@@ -10,14 +24,31 @@ pub struct Args {
 }
 
 pub fn run(args: Args) -> Outcome {
+    let name = args.file.display();
+    let table: toml::Table = config::read_toml(&args.file).map_err(Failure::config)?;
+    if OF_SCENES.iter().any(|key| table.contains_key(*key)) {
+        let scene = Scene::load(&args.file).map_err(Failure::config)?;
+        Plan::compile(&scene, 0).map_err(Failure::config)?;
+        println!(
+            "{name}: a scene, {} users and {} intruders",
+            scene.user.len(),
+            scene.intruder.len()
+        );
+        return Ok(());
+    }
     let config = Config::load(&args.file).map_err(Failure::config)?;
-    let camera = config.optics.camera().map_err(Failure::config)?;
+    let camera = config.camera().map_err(Failure::config)?;
+    let pipeline = Pipeline::new(&config, &camera).map_err(Failure::config)?;
+    frames::open(&config.source, &camera).map_err(Failure::config)?;
+    config.log.filter().map_err(Failure::config)?;
+    api::Server::new(config.api.clone()).map_err(Failure::config)?;
+    notify::load(&config.webhook).map_err(Failure::config)?;
     println!(
-        "{}: a config; {} × {} pixels, source {}",
-        args.file.display(),
+        "{name}: a config; {} × {} pixels, source {}, estimator {}",
         camera.x.n,
         camera.y.n,
-        config.source.kind.name()
+        config.source.kind.name(),
+        pipeline.estimator()
     );
     Ok(())
 }
