@@ -1,5 +1,6 @@
 use std::net::SocketAddr;
 use std::path::PathBuf;
+use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
@@ -24,6 +25,8 @@ pub struct Config {
     pub max_connections: usize,
     /// Requests a client address may make per second, on average.
     pub requests_per_second: u32,
+    /// A client that takes longer to send a request, or to take a byte of the answer, is cut off.
+    pub client_timeout_s: f64,
 }
 
 /// Why the API cannot be served as configured.
@@ -40,7 +43,7 @@ pub enum ConfigError {
     OutOfRange {
         field: &'static str,
         expected: &'static str,
-        found: u64,
+        found: f64,
     },
     #[error("api.allowed_origins: expected an origin such as \"https://ops.example.org\", found {found:?}")]
     NoOrigin { found: String },
@@ -58,11 +61,17 @@ impl Default for Config {
             allowed_hosts: Vec::new(),
             max_connections: 2048,
             requests_per_second: 200,
+            client_timeout_s: 15.0,
         }
     }
 }
 
 impl Config {
+    /// Patience with a client that is slow.
+    pub(super) fn patience(&self) -> Duration {
+        Duration::from_secs_f64(self.client_timeout_s)
+    }
+
     /// Checks what can be checked without opening a file or a port.
     pub fn validate(&self) -> Result<(), ConfigError> {
         let loopback = self.listen.ip().to_canonical().is_loopback();
@@ -88,14 +97,21 @@ impl Config {
             return Err(ConfigError::OutOfRange {
                 field: "max_connections",
                 expected: "at least 1",
-                found: 0,
+                found: 0.0,
             });
         }
         if self.requests_per_second == 0 {
             return Err(ConfigError::OutOfRange {
                 field: "requests_per_second",
                 expected: "at least 1",
-                found: 0,
+                found: 0.0,
+            });
+        }
+        if !(0.1..=3600.0).contains(&self.client_timeout_s) {
+            return Err(ConfigError::OutOfRange {
+                field: "client_timeout_s",
+                expected: "0.1 to 3600 seconds",
+                found: self.client_timeout_s,
             });
         }
         for origin in &self.allowed_origins {

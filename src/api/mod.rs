@@ -54,8 +54,6 @@ use crate::metric;
 
 /// The largest body read: about 20,000 claims.
 const MAX_BODY_BYTES: usize = 4 << 20;
-/// A request, body included, must have arrived and been answered within this time; streams excepted.
-const ANSWER_WITHIN: Duration = Duration::from_secs(20);
 
 /// All routes under all guards, the outermost last.
 fn router(state: State, config: &Config, tokens: Arc<auth::Tokens>) -> Router {
@@ -76,7 +74,7 @@ fn router(state: State, config: &Config, tokens: Arc<auth::Tokens>) -> Router {
         .layer(from_fn_with_state(rates, guard::rate))
         .layer(TimeoutLayer::with_status_code(
             StatusCode::REQUEST_TIMEOUT,
-            ANSWER_WITHIN,
+            config.patience(),
         ))
         .layer(CatchPanicLayer::new())
         .layer(from_fn(problem::for_every_error))

@@ -23,10 +23,6 @@ use super::config::{Config, ConfigError};
 use super::state::State;
 use crate::metric;
 
-/// A request's header must have arrived within this time, and an idle connection ends after it.
-const HEADER_WITHIN: Duration = Duration::from_secs(15);
-/// A connection that takes no byte of what we send for this long is cut.
-const WRITE_STALL: Duration = Duration::from_secs(30);
 /// Requests under way when the daemon stops have this long.
 const LAST_ORDERS: Duration = Duration::from_secs(1);
 /// How often secrets and certificates on disk are looked at.
@@ -110,13 +106,17 @@ impl Server {
         });
         let app = super::router(state, &self.config, self.tokens.clone());
         let service = app.into_make_service_with_connect_info::<SocketAddr>();
-        let limited = Limited(Arc::new(Semaphore::new(self.config.max_connections)));
+        let patience = self.config.patience();
+        let limited = Limited {
+            connections: Arc::new(Semaphore::new(self.config.max_connections)),
+            patience,
+        };
         let mut server = axum_server::from_tcp(listener)?.handle(handle);
-        *server.http_builder() = protocol();
+        *server.http_builder() = protocol(patience);
         let outcome = match self.tls {
             None => server.acceptor(limited).serve(service).await,
             Some(tls) => {
-                let acceptor = RustlsAcceptor::new(tls.config).handshake_timeout(HEADER_WITHIN);
+                let acceptor = RustlsAcceptor::new(tls.config).handshake_timeout(patience);
                 server.acceptor(acceptor.acceptor(limited)).serve(service).await
             }
         };
@@ -127,12 +127,12 @@ impl Server {
 }
 
 /// HTTP/1.1 only: what browsers and Prometheus speak to one host, and WebSockets need no second way in.
-fn protocol() -> auto::Builder<TokioExecutor> {
+fn protocol(patience: Duration) -> auto::Builder<TokioExecutor> {
     let mut builder = auto::Builder::new(TokioExecutor::new()).http1_only();
     builder
         .http1()
         .timer(TokioTimer::new())
-        .header_read_timeout(HEADER_WITHIN)
+        .header_read_timeout(patience)
         .max_buf_size(MAX_HEADER_BYTES);
     builder
 }
@@ -213,7 +213,10 @@ async fn keep_up(metrics: metrics_exporter_prometheus::PrometheusHandle, tokens:
 
 /// Turns connections away above a limit, and cuts those that stall.
 #[derive(Clone)]
-struct Limited(Arc<Semaphore>);
+struct Limited {
+    connections: Arc<Semaphore>,
+    patience: Duration,
+}
 
 impl<S> Accept<TcpStream, S> for Limited {
     type Stream = Connection;
@@ -221,7 +224,7 @@ impl<S> Accept<TcpStream, S> for Limited {
     type Future = std::future::Ready<io::Result<(Connection, S)>>;
 
     fn accept(&self, stream: TcpStream, service: S) -> Self::Future {
-        let Ok(permit) = self.0.clone().try_acquire_owned() else {
+        let Ok(permit) = self.connections.clone().try_acquire_owned() else {
             metrics::counter!(metric::HTTP_REFUSED, "reason" => "connections").increment(1);
             return std::future::ready(Err(io::ErrorKind::ConnectionRefused.into()));
         };
@@ -233,7 +236,7 @@ impl<S> Accept<TcpStream, S> for Limited {
             return std::future::ready(Err(e));
         }
         let mut stream = TimeoutStream::new(stream);
-        stream.set_write_timeout(Some(WRITE_STALL));
+        stream.set_write_timeout(Some(self.patience));
         let connection = Connection {
             stream: Box::pin(stream),
             _permit: permit,

@@ -79,6 +79,17 @@ impl Fake {
         self.feed.publish(snapshot(number));
     }
 
+    /// Raises without waiting for the journal.
+    pub fn raise_at_once(&self, id: &str) {
+        let event = AlertEvent {
+            event: AlertEventKind::Raised,
+            alert: alert(id, 0),
+        };
+        let events = self.feed.number(vec![event], at(0));
+        self.journal.record_numbered(&events, at(0)).unwrap();
+        self.feed.publish_events(events);
+    }
+
     pub async fn alert(&self, id: &str, second: i64) {
         publish(&self.feed, &self.journal, AlertEventKind::Raised, alert(id, second)).await;
     }

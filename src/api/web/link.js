@@ -1,0 +1,106 @@
+// The connection to the daemon: one WebSocket that is resumed where it broke, and requests with the same token.
+
+const SILENCE_MS = 8000;
+
+export class Link {
+  constructor(on) {
+    this.on = on; // { state(name), message(object), ask(why) }
+    this.seq = null;
+    this.tries = 0;
+    this.heard = 0;
+    this.open();
+    setInterval(() => this.watch(), 1000);
+    addEventListener("online", () => this.again(0));
+  }
+
+  get token() {
+    return sessionStorage.getItem("oapwatch-token");
+  }
+
+  useToken(token) {
+    sessionStorage.setItem("oapwatch-token", token);
+    this.again(0);
+  }
+
+  headers() {
+    return this.token ? { Authorization: `Bearer ${this.token}` } : {};
+  }
+
+  async request(path, options = {}) {
+    const response = await fetch(path, { ...options, headers: { ...this.headers(), ...options.headers }, cache: "no-cache" });
+    if (response.status === 401) {
+      this.on.ask(this.token ? "That token is not known here." : null);
+    }
+    if (!response.ok) {
+      const problem = await response.json().catch(() => ({}));
+      throw Object.assign(new Error(problem.detail ?? response.statusText), { status: response.status });
+    }
+    return response;
+  }
+
+  async json(path, options) {
+    return (await this.request(path, options)).json();
+  }
+
+  async open() {
+    clearTimeout(this.timer);
+    this.close();
+    this.on.state("connecting");
+    // A WebSocket does not tell why it was refused; a request does.
+    try {
+      const probe = await fetch("/v1/status", { headers: this.headers() });
+      if (probe.status === 401) {
+        this.on.state("refused");
+        this.on.ask(this.token ? "That token is not known here." : null);
+        return;
+      }
+    } catch {
+      this.again();
+      return;
+    }
+    const after = this.seq === null ? "" : `?after=${this.seq}`;
+    const scheme = location.protocol === "https:" ? "wss:" : "ws:";
+    const protocols = ["oapwatch.v1"];
+    if (this.token) protocols.push(`bearer.${base64url(this.token)}`);
+    const socket = new WebSocket(`${scheme}//${location.host}/v1/stream${after}`, protocols);
+    this.socket = socket;
+    socket.onmessage = (e) => {
+      this.heard = Date.now();
+      const message = JSON.parse(e.data);
+      this.seq = message.seq;
+      if (message.type === "snapshot") {
+        this.tries = 0;
+        this.on.state("live");
+      }
+      this.on.message(message);
+    };
+    socket.onclose = () => {
+      if (socket === this.socket) this.again();
+    };
+  }
+
+  close() {
+    const socket = this.socket;
+    this.socket = null;
+    socket?.close();
+  }
+
+  // Tries again after a while: half a second at first, ten at most, spread so that viewers do not all come at once.
+  again(wait = Math.min(10000, 500 * 2 ** this.tries++) * (0.7 + 0.6 * Math.random())) {
+    this.close();
+    this.on.state("lost");
+    clearTimeout(this.timer);
+    this.timer = setTimeout(() => this.open(), wait);
+  }
+
+  // A cable that was pulled says nothing.
+  watch() {
+    const open = this.socket?.readyState === WebSocket.OPEN;
+    if (open && this.heard && Date.now() - this.heard > SILENCE_MS) this.on.quiet(Date.now() - this.heard);
+  }
+}
+
+function base64url(text) {
+  const bytes = new TextEncoder().encode(text);
+  return btoa(String.fromCharCode(...bytes)).replaceAll("+", "-").replaceAll("/", "_").replaceAll("=", "");
+}

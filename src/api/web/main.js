@@ -1,0 +1,235 @@
+import { Alerts } from "./alerts.js";
+import { Link } from "./link.js";
+import { GroundMap } from "./map.js";
+import { claimIcon, icon } from "./marks.js";
+import { Timeline } from "./timeline.js";
+import { STATUS, clock, el, lasting, metres, micros } from "./words.js";
+
+const $ = (id) => document.getElementById(id);
+const FRAME_EVERY_MS = 500;
+
+let latest = null; // the newest snapshot or positions message
+let arrived = 0; // when it came, by our clock
+let linkState = "connecting";
+let wanted = false; // whether a redraw is due
+
+const map = new GroundMap($("map"));
+const timeline = new Timeline({ changed: redraw });
+const link = new Link({ state: onState, message: onMessage, ask, quiet: banner });
+const alerts = new Alerts(link, {
+  changed: redraw,
+  pick(place, alert) {
+    const raised = Date.parse(alert.raised_at);
+    if (alert.cleared_at && timeline.moments.length && raised >= Date.parse(timeline.moments[0].time)) timeline.go(raised + 1000);
+    map.pick(place);
+    $("map").scrollIntoView({ block: "nearest", behavior: "smooth" });
+  },
+});
+
+legend();
+for (const [id, act] of [["zoom-in", () => map.zoomBy(1.5)], ["zoom-out", () => map.zoomBy(1 / 1.5)], ["zoom-all", () => map.all()]]) {
+  $(id).addEventListener("click", act);
+}
+addEventListener("keydown", (e) => {
+  if (e.ctrlKey || e.metaKey || e.altKey || e.target.matches("input:not([type=range])")) return;
+  const acts = { "+": () => map.zoomBy(1.5), "=": () => map.zoomBy(1.5), "-": () => map.zoomBy(1 / 1.5), 0: () => map.all(), l: () => timeline.present(), a: () => $("alerts").focus() };
+  acts[e.key]?.();
+});
+setInterval(() => {
+  banner();
+  facts();
+  if (latest) alerts.tick(Date.parse(latest.time) + (stalled() ? Date.now() - arrived : 0));
+}, 500);
+setInterval(frame, FRAME_EVERY_MS);
+history();
+
+async function history() {
+  try {
+    timeline.load((await link.json("/v1/history")).moments);
+    redraw();
+  } catch {
+    // Nothing to show of the past yet.
+  }
+}
+
+function onState(state) {
+  const before = linkState;
+  linkState = state;
+  const [words, tone] = {
+    connecting: ["connecting", ""],
+    live: ["live", "ok"],
+    lost: ["disconnected", "bad"],
+    refused: ["token needed", "bad"],
+  }[state];
+  // While a connection is tried again it is still lost.
+  if (state === "connecting" && before === "lost") return;
+  $("link").textContent = words;
+  $("link").className = `pill ${tone}`;
+  if (state === "live" && before !== "live") history();
+  banner();
+}
+
+function onMessage(message) {
+  if (message.type === "alert") {
+    alerts.event(message.event, message.alert);
+    return;
+  }
+  if (message.type === "snapshot") alerts.reset(message.alerts);
+  if (message.emitters) {
+    latest = message;
+    arrived = Date.now();
+    timeline.record(message);
+  }
+  redraw();
+}
+
+const stalled = () => linkState !== "live" || Date.now() - arrived > 3000;
+
+// What must not be overlooked: that what is shown is old, or that the sensor sees nothing.
+function banner() {
+  const text = trouble();
+  document.body.classList.toggle("stale", Boolean(text));
+  $("banner").hidden = !text;
+  if ($("banner").textContent !== text) $("banner").textContent = text;
+}
+
+function trouble() {
+  const age = arrived ? `; what is shown is ${lasting(Date.now() - arrived)} old` : "";
+  if (linkState === "refused") return "This monitor asks for a token.";
+  if (linkState === "lost" || (linkState === "connecting" && arrived)) return `Disconnected from the monitor${age}. Trying again.`;
+  if (!latest) return linkState === "live" ? "The monitor runs but has not looked at a frame yet." : "";
+  const { source } = latest.status;
+  const fault = source.fault ? ` (${source.fault})` : "";
+  switch (source.state) {
+    case "blind":
+      return `The sensor is blind: frames arrive but none can be used${fault}. Nothing on this page can be trusted to be there, or not to be.`;
+    case "lost":
+      return `The sensor is lost: no frames arrive${fault}. Nobody is being watched.`;
+    case "ended":
+      return "The recording has ended.";
+    case "starting":
+      return "The monitor is waiting for its first frame.";
+    default:
+      return stalled() ? `Connected, but the monitor has said nothing for ${lasting(Date.now() - arrived)}.` : "";
+  }
+}
+
+function redraw() {
+  if (wanted) return;
+  wanted = true;
+  requestAnimationFrame(() => {
+    wanted = false;
+    draw();
+  });
+}
+
+function draw() {
+  if (!latest) return;
+  const live = timeline.at === null;
+  const moment = live ? latest : timeline.moment();
+  const scene = {
+    emitters: moment.emitters,
+    claims: live ? latest.claims : [],
+    unseen: live ? latest.unseen : [],
+    trails: timeline.trails(moment.emitters),
+    half: latest.status.field_of_view_m,
+  };
+  map.show(scene);
+  $("clock").textContent = live ? clock(Date.parse(moment.time)) : `${clock(Date.parse(moment.time))} · the past`;
+  timeline.render(alerts.known.values());
+  beams(scene);
+}
+
+let beamsDrawn = 0;
+function beams({ emitters, claims, unseen }) {
+  if (Date.now() - beamsDrawn < 400) return;
+  beamsDrawn = Date.now();
+  const said = new Map(claims.map((c) => [c.user, c]));
+  const order = { unclaimed: 0, mismatch: 1, pending: 2, verified: 3 };
+  const rows = [...emitters].sort((a, b) => order[a.status] - order[b.status] || a.track - b.track).map((e) => {
+    const claim = said.get(e.user);
+    const off = claim ? metres(Math.hypot(claim.x_m - e.x_m, claim.y_m - e.y_m)) : "";
+    const sigma = e.cov_m2 ? metres(Math.sqrt(e.cov_m2[0][0] + e.cov_m2[1][1])) : "";
+    const cells = [[`${e.track}`], [e.user ?? "nobody"], [STATUS[e.status], e.status], [metres(e.x_m), "n"], [metres(e.y_m), "n"], [sigma, "n"], [off, "n"]];
+    return el("tr", {}, ...cells.map(([text, kind = ""]) => el("td", { className: kind }, text)));
+  });
+  for (const user of unseen) {
+    const cells = ["–", user, "not seen", "", "", "", ""];
+    rows.push(el("tr", { className: "quiet" }, ...cells.map((text) => el("td", {}, text))));
+  }
+  $("rows").replaceChildren(...rows);
+  $("beam-count").textContent = `${emitters.length} seen${unseen.length ? `, ${unseen.length} claimed and not seen` : ""}`;
+}
+
+function facts() {
+  if (!latest) return;
+  const s = latest.status;
+  const claimAge = s.claims.last_at ? Math.max(0, Date.parse(latest.time) - Date.parse(s.claims.last_at)) : null;
+  const queued = s.webhooks.reduce((n, w) => n + w.queued, 0);
+  const failing = s.webhooks.filter((w) => w.state !== "working").length;
+  const rows = [
+    ["Source", `${s.source.kind}, ${s.source.state}`, s.source.state === "running" ? "" : "bad"],
+    ["Frames", `${s.source.rate_hz.toFixed(1)} /s`],
+    ["Latency", `${micros(s.latency.median_us)}`, "", `99 % within ${micros(s.latency.p99_us)}`],
+    ["Dropped", `${s.frames.dropped}`, "", `${s.frames.captured} captured, ${s.frames.unusable} unusable`],
+    ["Claims", claimAge === null ? "none" : `${s.claims.users} users, ${lasting(claimAge)} ago`, "", `${s.claims.accepted} accepted, ${s.claims.malformed} malformed${s.claims.log ? `, from ${s.claims.log}` : ""}`],
+    ["Journal", s.journal.healthy ? (s.journal.place === "memory" ? "memory" : "on disk") : "failing", s.journal.healthy ? "" : "bad", s.journal.fault ?? s.journal.place],
+    ["Webhooks", s.webhooks.length ? (failing ? `${failing} failing, ${queued} queued` : `${queued} queued`) : "none", failing ? "warn" : ""],
+  ];
+  $("facts").replaceChildren(...rows.map(([name, value, tone = "", title = ""]) => el("div", { title }, el("dt", {}, name), el("dd", { className: tone }, value))));
+  $("webhooks").hidden = !s.webhooks.length;
+  $("endpoints").replaceChildren(...s.webhooks.map((w) => {
+    const tone = w.state === "working" ? "quiet" : "warn";
+    const error = w.last_error && w.state !== "working" ? ` — ${w.last_error}` : "";
+    return el("li", {}, el("strong", {}, w.name), ` ${w.url} `, el("span", { className: tone }, `${w.state}: ${w.sent} sent, ${w.queued} queued, ${w.failed} given up${error}`));
+  }));
+}
+
+let fetching = false;
+let shownFrame = null;
+let url = null;
+async function frame() {
+  const seen = latest && latest.frame !== shownFrame && linkState === "live";
+  if (!seen || fetching || document.hidden || timeline.at !== null) return;
+  fetching = true;
+  try {
+    const number = latest.frame;
+    const picture = await (await link.request("/v1/frame.png")).blob();
+    const before = url;
+    url = URL.createObjectURL(picture);
+    $("frame").src = url;
+    if (before) URL.revokeObjectURL(before);
+    shownFrame = number;
+    $("frame-number").textContent = `frame ${number}`;
+    $("no-frame").hidden = true;
+  } catch (e) {
+    if (e.status === 503) {
+      $("frame").removeAttribute("src");
+      $("no-frame").hidden = false;
+    }
+  } finally {
+    fetching = false;
+  }
+}
+
+function ask(why) {
+  if (why) $("ask-why").textContent = why;
+  if (!$("ask").open) $("ask").showModal();
+}
+$("ask").addEventListener("close", () => {
+  const token = $("token").value.trim();
+  $("token").value = "";
+  if (token) link.useToken(token);
+});
+
+function legend() {
+  const entries = [
+    [icon("verified"), "where they say"],
+    [icon("mismatch"), "not where they say"],
+    [icon("unclaimed"), "nobody claims it"],
+    [icon("pending"), "not decided yet"],
+    [claimIcon(false), "claimed position"],
+    [claimIcon(true), "claimed, not seen"],
+  ];
+  $("legend").replaceChildren(...entries.map(([mark, words]) => el("li", {}, mark, words)));
+}

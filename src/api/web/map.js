@@ -1,0 +1,252 @@
+// The ground in metres: x to the right, y up, the UAV's nadir in the middle.
+
+import { metres, svg } from "./words.js";
+import { shape } from "./marks.js";
+
+// 95 % of a two-dimensional normal distribution lies within this many standard deviations.
+const NINETY_FIVE = Math.sqrt(5.991);
+const STEPS = [0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000];
+
+export class GroundMap {
+  constructor(node) {
+    this.node = node;
+    this.half = [125, 125];
+    this.zoom = 1;
+    this.centre = [0, 0];
+    this.beams = new Map();
+    this.scene = null;
+    this.picked = null;
+    this.back = svg("g");
+    this.trails = svg("g");
+    this.claims = svg("g");
+    this.marks = svg("g");
+    node.append(this.back, this.trails, this.claims, this.marks);
+    new ResizeObserver(() => this.redraw()).observe(node);
+    this.listen();
+  }
+
+  listen() {
+    const node = this.node;
+    const pointers = new Map();
+    node.addEventListener("wheel", (e) => {
+      e.preventDefault();
+      this.zoomBy(Math.exp(-e.deltaY * 0.0015), this.place(e));
+    }, { passive: false });
+    node.addEventListener("pointerdown", (e) => {
+      node.setPointerCapture(e.pointerId);
+      pointers.set(e.pointerId, [e.clientX, e.clientY]);
+      node.classList.add("drag");
+    });
+    node.addEventListener("pointermove", (e) => {
+      const before = pointers.get(e.pointerId);
+      if (!before) return;
+      const others = [...pointers].filter(([id]) => id !== e.pointerId).map(([, p]) => p);
+      if (others.length) {
+        const gap = (p) => Math.hypot(p[0] - others[0][0], p[1] - others[0][1]);
+        const now = [e.clientX, e.clientY];
+        this.zoomBy(gap(now) / Math.max(1, gap(before)), this.place(e));
+      } else {
+        this.centre[0] -= (e.clientX - before[0]) / this.scale;
+        this.centre[1] += (e.clientY - before[1]) / this.scale;
+      }
+      pointers.set(e.pointerId, [e.clientX, e.clientY]);
+      this.redraw();
+    });
+    const end = (e) => {
+      pointers.delete(e.pointerId);
+      if (!pointers.size) node.classList.remove("drag");
+    };
+    node.addEventListener("pointerup", end);
+    node.addEventListener("pointercancel", end);
+    node.addEventListener("keydown", (e) => {
+      const step = 40 / this.scale;
+      const moves = { ArrowLeft: [-step, 0], ArrowRight: [step, 0], ArrowUp: [0, step], ArrowDown: [0, -step] };
+      if (moves[e.key]) {
+        e.preventDefault();
+        this.centre[0] += moves[e.key][0];
+        this.centre[1] += moves[e.key][1];
+        this.redraw();
+      }
+    });
+  }
+
+  // Ground position under a pointer.
+  place(e) {
+    const box = this.node.getBoundingClientRect();
+    const dx = e.clientX - box.left - box.width / 2;
+    const dy = e.clientY - box.top - box.height / 2;
+    return [this.centre[0] + dx / this.scale, this.centre[1] - dy / this.scale];
+  }
+
+  zoomBy(factor, about = this.centre) {
+    const before = this.zoom;
+    this.zoom = Math.min(400, Math.max(0.5, this.zoom * factor));
+    const kept = before / this.zoom;
+    this.centre = this.centre.map((c, k) => about[k] + (c - about[k]) * kept);
+    this.redraw();
+  }
+
+  all() {
+    this.zoom = 1;
+    this.centre = [0, 0];
+    this.picked = null;
+    this.redraw();
+  }
+
+  pick(place) {
+    this.picked = place;
+    const inside = place.every((p, k) => Math.abs(p - this.centre[k]) < (0.45 * [this.width, this.height][k]) / this.scale);
+    if (!inside) this.centre = [...place];
+    this.redraw();
+  }
+
+  show(scene) {
+    this.scene = scene;
+    this.half = scene.half;
+    this.redraw();
+  }
+
+  px([x, y]) {
+    return [this.width / 2 + (x - this.centre[0]) * this.scale, this.height / 2 - (y - this.centre[1]) * this.scale];
+  }
+
+  redraw() {
+    const { width, height } = this.node.getBoundingClientRect();
+    if (!this.scene || width < 10) return;
+    this.width = width;
+    this.height = height;
+    const room = Math.min(width / (2.16 * this.half[0]), height / (2.16 * this.half[1]));
+    this.scale = room * this.zoom;
+    this.drawBack();
+    this.drawTrails();
+    this.drawClaims();
+    this.drawBeams();
+  }
+
+  drawBack() {
+    const [left, top] = this.px([-this.half[0], this.half[1]]);
+    const [right, bottom] = this.px([this.half[0], -this.half[1]]);
+    const step = STEPS.find((s) => s * this.scale >= 70) ?? 1000;
+    const nodes = [svg("rect", { class: "view", x: left, y: top, width: right - left, height: bottom - top })];
+    const [x0, y0] = [this.centre[0] - this.width / 2 / this.scale, this.centre[1] - this.height / 2 / this.scale];
+    const [x1, y1] = [this.centre[0] + this.width / 2 / this.scale, this.centre[1] + this.height / 2 / this.scale];
+    const round = (v) => +v.toFixed(1);
+    for (let x = Math.ceil(x0 / step) * step; x <= x1; x += step) {
+      const [px] = this.px([x, 0]);
+      nodes.push(svg("line", { class: round(x) === 0 ? "axis" : "grid", x1: px, x2: px, y1: Math.max(0, top), y2: Math.min(this.height, bottom) }));
+      if (px > 30 && px < this.width - 90) nodes.push(svg("text", { class: "tick", x: px + 4, y: this.height - 6 }, `${round(x)}`));
+    }
+    for (let y = Math.ceil(y0 / step) * step; y <= y1; y += step) {
+      const [, py] = this.px([0, y]);
+      nodes.push(svg("line", { class: round(y) === 0 ? "axis" : "grid", y1: py, y2: py, x1: Math.max(0, left), x2: Math.min(this.width, right) }));
+      if (py > 14 && py < this.height - 24) nodes.push(svg("text", { class: "tick", x: 6, y: py - 4 }, `${round(y)}`));
+    }
+    const [cx, cy] = this.px([0, 0]);
+    nodes.push(svg("path", { class: "nadir", d: `M${cx - 9} ${cy}h18M${cx} ${cy - 9}v18` }, svg("title", {}, "the UAV's nadir")));
+    const long = step * this.scale;
+    nodes.push(
+      svg("path", { class: "scale-bar", d: `M${this.width - 14 - long} ${this.height - 16}v6h${long}v-6` }),
+      svg("text", { class: "scale", x: this.width - 14 - long / 2, y: this.height - 18, "text-anchor": "middle" }, `${step} m`),
+    );
+    this.back.replaceChildren(...nodes);
+  }
+
+  drawTrails() {
+    const nodes = [];
+    for (const trail of this.scene.trails) {
+      // Older pieces are fainter.
+      const pieces = 4;
+      const size = Math.ceil(trail.points.length / pieces);
+      for (let k = 0; k < pieces; k++) {
+        const part = trail.points.slice(k * size, (k + 1) * size + 1);
+        if (part.length < 2) continue;
+        const points = part.map((p) => this.px(p).map((v) => v.toFixed(1)).join(",")).join(" ");
+        nodes.push(svg("polyline", { class: `trail ${trail.status}`, points, "stroke-opacity": 0.15 + 0.15 * k }));
+      }
+    }
+    this.trails.replaceChildren(...nodes);
+  }
+
+  drawClaims() {
+    const nodes = [];
+    const seen = new Map(this.scene.emitters.filter((e) => e.user).map((e) => [e.user, e]));
+    const unseen = new Set(this.scene.unseen);
+    for (const claim of this.scene.claims) {
+      const beam = seen.get(claim.user);
+      if (!beam && !unseen.has(claim.user)) continue;
+      const at = this.px([claim.x_m, claim.y_m]);
+      if (beam) {
+        const to = this.px([beam.x_m, beam.y_m]);
+        const off = Math.hypot(to[0] - at[0], to[1] - at[1]);
+        if (off > 12) nodes.push(svg("line", { class: `tie ${beam.status}`, x1: at[0], y1: at[1], x2: to[0], y2: to[1] }));
+      }
+      nodes.push(svg("circle", { class: beam ? "claim" : "claim unseen-user", cx: at[0], cy: at[1], r: 10.5 }));
+      if (!beam) nodes.push(svg("text", { class: "claim-name", x: at[0] + 15, y: at[1] + 4 }, `${claim.user} not seen`));
+      else if (beam.status === "mismatch") nodes.push(svg("text", { class: "claim-name", x: at[0] + 15, y: at[1] + 4 }, `${claim.user} says here`));
+    }
+    this.claims.replaceChildren(...nodes);
+  }
+
+  drawBeams() {
+    const claims = new Map(this.scene.claims.map((c) => [c.user, c]));
+    const gone = new Set(this.beams.keys());
+    for (const e of this.scene.emitters) {
+      gone.delete(e.track);
+      let g = this.beams.get(e.track);
+      if (!g || g.status !== e.status) {
+        g?.node.remove();
+        g = this.makeBeam(e);
+        this.beams.set(e.track, g);
+      }
+      const [x, y] = this.px([e.x_m, e.y_m]);
+      g.node.setAttribute("transform", `translate(${x.toFixed(1)} ${y.toFixed(1)})`);
+      if (e.cov_m2) {
+        const { major, minor, turn } = axes(e.cov_m2);
+        const size = (v) => Math.min(2000, v * NINETY_FIVE * this.scale).toFixed(1);
+        g.ellipse.setAttribute("rx", size(major));
+        g.ellipse.setAttribute("ry", size(minor));
+        g.ellipse.setAttribute("transform", `rotate(${-turn})`);
+      }
+      const claim = claims.get(e.user);
+      const off = claim ? Math.hypot(claim.x_m - e.x_m, claim.y_m - e.y_m) : null;
+      const label = {
+        unclaimed: `nobody claims beam ${e.track}`,
+        mismatch: `${e.user} · ${off === null ? "" : `${metres(off)} m off`}`,
+        pending: e.user ?? `beam ${e.track}`,
+        verified: e.user,
+      }[e.status];
+      if (g.text.textContent !== label) g.text.textContent = label;
+      const flip = x > this.width - 170;
+      g.text.setAttribute("x", flip ? -16 : 16);
+      g.text.setAttribute("text-anchor", flip ? "end" : "start");
+    }
+    for (const track of gone) {
+      this.beams.get(track).node.remove();
+      this.beams.delete(track);
+    }
+    this.pickMark?.remove();
+    if (this.picked) {
+      const [cx, cy] = this.px(this.picked);
+      this.pickMark = svg("circle", { class: "pick", cx, cy, r: 20 });
+      this.marks.append(this.pickMark);
+    }
+  }
+
+  makeBeam(e) {
+    const ellipse = svg("ellipse", { class: "ellipse fill edge" });
+    const text = svg("text", { y: 4.5 });
+    const node = svg("g", { class: `beam ${e.status}` }, ellipse);
+    if (e.status === "unclaimed") node.append(svg("circle", { class: "ping", r: 18 }));
+    node.append(...shape(e.status), text);
+    this.marks.append(node);
+    return { node, ellipse, text, status: e.status };
+  }
+}
+
+// Standard deviations along the principal axes, m, and the major axis' angle from +x, degrees.
+function axes([[a, b], [, c]]) {
+  const mean = (a + c) / 2;
+  const spread = Math.hypot((a - c) / 2, b);
+  const turn = (Math.atan2(2 * b, a - c) / 2) * (180 / Math.PI);
+  return { major: Math.sqrt(Math.max(0, mean + spread)), minor: Math.sqrt(Math.max(0, mean - spread)), turn };
+}
