@@ -8,11 +8,15 @@ use serde::{Deserialize, Serialize};
 pub struct Claim {
     #[schema(value_type = String, format = DateTime)]
     pub time: Timestamp,
+    #[schema(min_length = 1, max_length = 64)]
     pub user: String,
+    #[schema(minimum = -1e7, maximum = 1e7)]
     pub x_m: f64,
+    #[schema(minimum = -1e7, maximum = 1e7)]
     pub y_m: f64,
     /// Standard deviation per axis of the claimed position.
     #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schema(minimum = 0)]
     pub sigma_m: Option<f64>,
     #[serde(default)]
     pub state: ClaimState,

@@ -22,14 +22,24 @@ pub const ALERTS_OPEN: &str = "oapwatch_alerts_open";
 /// Label `outcome`: accepted, malformed, refused.
 pub const CLAIMS: &str = "oapwatch_claims_total";
 pub const CLAIMS_LAST: &str = "oapwatch_claims_last_timestamp_seconds";
-/// Label `outcome`: delivered, failed, disabled.
-pub const WEBHOOK_DELIVERIES: &str = "oapwatch_webhook_deliveries_total";
-pub const WEBHOOKS_QUEUED: &str = "oapwatch_webhook_queued";
-pub const WEBHOOK_OLDEST: &str = "oapwatch_webhook_oldest_queued_age_seconds";
-pub const JOURNAL_SIZE: &str = "oapwatch_journal_size_bytes";
-pub const JOURNAL_ERRORS: &str = "oapwatch_journal_errors_total";
+/// Labels `endpoint` and `outcome`.
+pub const WEBHOOK_ATTEMPTS: &str = "oapwatch_webhook_attempts_total";
+/// Label `endpoint`, as of the three.
+pub const WEBHOOK_QUEUED: &str = "oapwatch_webhook_queued";
+pub const WEBHOOK_OLDEST: &str = "oapwatch_webhook_oldest_queued_seconds";
+pub const WEBHOOK_DEAD_LETTERS: &str = "oapwatch_webhook_dead_letters";
+pub const JOURNAL_BYTES: &str = "oapwatch_journal_bytes";
 /// 1 while alerts reach the disk.
-pub const JOURNAL_HEALTHY: &str = "oapwatch_journal_healthy";
+pub const JOURNAL_WRITABLE: &str = "oapwatch_journal_writable";
+pub const JOURNAL_UNWRITTEN: &str = "oapwatch_journal_unwritten_events";
+pub const JOURNAL_LOST: &str = "oapwatch_journal_events_lost_total";
+pub const JOURNAL_FAILURES: &str = "oapwatch_journal_write_failures_total";
+pub const JOURNAL_WRITE_SECONDS: &str = "oapwatch_journal_write_seconds";
+pub const SOURCE_CONNECTED: &str = "oapwatch_source_connected";
+pub const SOURCE_OPENED: &str = "oapwatch_source_opened_total";
+pub const SOURCE_FRAMES_LOST: &str = "oapwatch_source_frames_lost_total";
+/// Label `fault`.
+pub const SOURCE_FAULTS: &str = "oapwatch_source_faults_total";
 /// Labels `method`, `route` (the pattern, never the path) and `status`.
 pub const HTTP_REQUESTS: &str = "oapwatch_http_requests_total";
 /// Label `route`.
@@ -87,16 +97,31 @@ pub fn describe() {
     g!(ALERTS_OPEN, "Alerts not yet cleared, by kind.");
     c!(CLAIMS, "Claims received, by outcome.");
     g!(CLAIMS_LAST, Unit::Seconds, "Unix time of the newest claim accepted.");
-    c!(WEBHOOK_DELIVERIES, "Webhook delivery attempts, by outcome.");
-    g!(WEBHOOKS_QUEUED, "Webhook deliveries that wait.");
+    c!(WEBHOOK_ATTEMPTS, "Webhook delivery attempts, by endpoint and outcome.");
+    g!(WEBHOOK_QUEUED, "Webhook deliveries that wait.");
     g!(
         WEBHOOK_OLDEST,
         Unit::Seconds,
         "Age of the oldest webhook delivery that waits."
     );
-    g!(JOURNAL_SIZE, Unit::Bytes, "Size of the journal on disk.");
-    c!(JOURNAL_ERRORS, "Writes to the journal that failed.");
-    g!(JOURNAL_HEALTHY, "1 while alerts reach the disk, else 0.");
+    g!(
+        WEBHOOK_DEAD_LETTERS,
+        "Webhook deliveries given up on and kept for a replay."
+    );
+    g!(JOURNAL_BYTES, Unit::Bytes, "Size of the journal on disk.");
+    g!(JOURNAL_WRITABLE, "1 while alerts reach the disk, else 0.");
+    g!(JOURNAL_UNWRITTEN, "Alert events in memory that the disk has not taken.");
+    c!(JOURNAL_LOST, "Alert events that found disk and memory full.");
+    c!(JOURNAL_FAILURES, "Writes to the journal that failed.");
+    h!(
+        JOURNAL_WRITE_SECONDS,
+        Unit::Seconds,
+        "Time of one transaction of the journal."
+    );
+    g!(SOURCE_CONNECTED, "1 while the camera is open, else 0.");
+    c!(SOURCE_OPENED, "Times the camera was opened.");
+    c!(SOURCE_FRAMES_LOST, "Frames the driver lost before we saw them.");
+    c!(SOURCE_FAULTS, "Faults of the camera, by kind.");
     c!(HTTP_REQUESTS, "Requests answered, by method, route and status.");
     h!(HTTP_SECONDS, Unit::Seconds, "Time to answer a request, by route.");
     g!(HTTP_CONNECTIONS, "Open connections.");

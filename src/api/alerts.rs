@@ -28,6 +28,7 @@ pub struct ListQuery {
     #[param(minimum = 1, maximum = 1000)]
     limit: Option<usize>,
     /// `next_cursor` of the page before
+    #[param(pattern = r"^[0-9a-f]{1,15}-[0-9a-f]{1,15}$")]
     cursor: Option<String>,
 }
 

@@ -10,6 +10,7 @@ use super::problem::Problem;
 use super::respond;
 use super::state::{Command, State};
 use crate::claim::Claim;
+use crate::{claims, metric};
 
 /// Claims taken from one body.
 const MAX_CLAIMS: usize = 20_000;
@@ -60,26 +61,28 @@ pub(super) fn send(state: &State, command: Command) -> Result<(), Problem> {
     })
 }
 
-/// Claims of a body with the line each stands on: one JSON object over any number of lines, or one a line.
+/// Claims of a body with the line each stands on: one JSON object over any number of lines, or one a line. The fields
+/// are always the documented ones, whatever names the log has for them.
 fn parse(body: &[u8], intake: &mut Intake) -> Vec<(usize, Claim)> {
-    if let Ok(claim) = serde_json::from_slice::<Claim>(body) {
+    let names = claims::Config::default();
+    if let Ok(claim) = claims::parse_line(body, &names) {
         return vec![(1, claim)];
     }
-    let mut claims = Vec::new();
+    let mut found = Vec::new();
     for (k, line) in body.split(|b| *b == b'\n').enumerate() {
         if line.trim_ascii().is_empty() {
             continue;
         }
-        if claims.len() == MAX_CLAIMS {
+        if found.len() == MAX_CLAIMS {
             intake.refuse(k + 1, format!("more than {MAX_CLAIMS} claims in one body"));
             continue;
         }
-        match serde_json::from_slice::<Claim>(line) {
-            Ok(claim) => claims.push((k + 1, claim)),
+        match claims::parse_line(line, &names) {
+            Ok(claim) => found.push((k + 1, claim)),
             Err(e) => intake.refuse(k + 1, e.to_string()),
         }
     }
-    claims
+    found
 }
 
 /// Claims come as JSON or NDJSON. Clients that say nothing, or name no more than curl does by itself, are believed.
@@ -115,6 +118,7 @@ fn check_media_type(headers: &HeaderMap) -> Result<(), Problem> {
         (Claim = "application/json"), (String = "application/x-ndjson"))),
     responses(
         (status = 200, description = "At least one claim was taken", body = Intake),
+        (status = 409, description = "The claims contradict, or are older than, what is known; `reasons` says which", body = Problem, content_type = "application/problem+json"),
         (status = 413, description = "The body is too large", body = Problem, content_type = "application/problem+json"),
         (status = 415, description = "Neither JSON nor NDJSON", body = Problem, content_type = "application/problem+json"),
         (status = 422, description = "No claim was taken; `reasons` says why", body = Problem, content_type = "application/problem+json"),
@@ -130,6 +134,7 @@ pub async fn post(
     let mut intake = Intake::default();
     let (lines, claims): (Vec<_>, Vec<_>) = parse(&body, &mut intake).into_iter().unzip();
     let sent = claims.len();
+    metrics::counter!(metric::CLAIMS, "outcome" => "malformed").increment(intake.refused as u64);
     if sent > 0 {
         let (reply, answer) = oneshot::channel();
         send(&state, Command::Claims { claims, reply })?;
@@ -147,5 +152,11 @@ pub async fn post(
         Some(first) => format!("no claim was taken; line {}: {}", first.line, first.reason),
         None => "the body holds no claim".to_owned(),
     };
-    Err(Problem::refused(intake, detail))
+    // Claims that could be read are refused for what is known already: another request may well be taken.
+    let status = if sent > 0 {
+        StatusCode::CONFLICT
+    } else {
+        StatusCode::UNPROCESSABLE_ENTITY
+    };
+    Err(Problem::refused(status, intake, detail))
 }

@@ -23,12 +23,12 @@ pub struct Moment {
     #[schema(value_type = String, format = DateTime)]
     pub time: Timestamp,
     pub frame: u64,
-    pub emitters: Vec<Past>,
+    pub emitters: Vec<PastBeam>,
 }
 
 /// One beam in the past.
 #[derive(Clone, Debug, PartialEq, Serialize, utoipa::ToSchema)]
-pub struct Past {
+pub struct PastBeam {
     pub track: u64,
     /// Metres, to the centimetre.
     pub x_m: f32,
@@ -58,7 +58,7 @@ impl History {
             self.moments.pop_front();
         }
         let centimetres = |x: f64| ((x * 100.0).round() / 100.0) as f32;
-        let past = report.emitters.iter().take(BEAMS_KEPT).map(|e| Past {
+        let past = report.emitters.iter().take(BEAMS_KEPT).map(|e| PastBeam {
             track: e.track,
             x_m: centimetres(e.x_m),
             y_m: centimetres(e.y_m),

@@ -25,6 +25,7 @@ mod snapshot;
 mod sse;
 mod state;
 mod stream;
+mod webhooks;
 mod websocket;
 
 pub use auth::TokenError;
@@ -62,7 +63,7 @@ fn router(state: State, config: &Config, tokens: Arc<auth::Tokens>) -> Router {
     let per_second = NonZeroU32::new(config.requests_per_second).unwrap_or(NonZeroU32::MIN);
     let rates = Arc::new(guard::Rates::new(per_second));
     routes
-        .merge(openapi::serve(description))
+        .merge(openapi::serve(description, tokens.required()))
         .route("/", get(page::index))
         .route("/page/{*path}", get(page::asset))
         .fallback(|| async { StatusCode::NOT_FOUND })

@@ -7,7 +7,7 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::state::State;
-use super::{alerts, claims, frame, positions, probes, sse, websocket};
+use super::{alerts, claims, frame, positions, probes, sse, webhooks, websocket};
 
 #[derive(OpenApi)]
 #[openapi(
@@ -46,13 +46,20 @@ pub fn router() -> (Router<State>, utoipa::openapi::OpenApi) {
         .routes(routes!(frame::frame_png))
         .routes(routes!(websocket::websocket))
         .routes(routes!(sse::events))
+        .routes(routes!(webhooks::list))
+        .routes(routes!(webhooks::dead_letters))
+        .routes(routes!(webhooks::replay))
+        .routes(routes!(webhooks::enable))
         .routes(routes!(probes::healthz))
         .routes(routes!(probes::readyz))
         .routes(routes!(probes::metrics))
         .split_for_parts()
 }
 
-/// Serves the description.
-pub fn serve(description: utoipa::openapi::OpenApi) -> Router<State> {
+/// Serves the description; where no token is asked for, it asks for none.
+pub fn serve(mut description: utoipa::openapi::OpenApi, token_required: bool) -> Router<State> {
+    if !token_required {
+        description.security = None;
+    }
     Router::new().route("/openapi.json", get(move || async move { Json(description) }))
 }

@@ -77,7 +77,7 @@ fn colour(share: f64) -> Rgb<u8> {
 
 /// Distance, in picture pixels, of a point from the outline of a mark.
 fn outline(status: PositionStatus, dx: f64, dy: f64) -> f64 {
-    let radius = 11.0;
+    let radius = 13.0;
     let circle = (dx.hypot(dy) - radius).abs();
     match status {
         PositionStatus::Verified => circle,
@@ -94,13 +94,14 @@ fn outline(status: PositionStatus, dx: f64, dy: f64) -> f64 {
 }
 
 fn mark(picture: &mut RgbImage, [cx, cy]: [f64; 2], status: PositionStatus) {
-    let ink = match status {
-        PositionStatus::Verified => Rgb([86, 180, 233]),
-        PositionStatus::Pending => Rgb([255, 255, 255]),
-        PositionStatus::Mismatch => Rgb([240, 228, 66]),
-        PositionStatus::Unclaimed => Rgb([255, 80, 60]),
+    let black = Rgb([0, 0, 0]);
+    let (ink, halo) = match status {
+        PositionStatus::Verified => (Rgb([86, 180, 233]), black),
+        PositionStatus::Pending => (Rgb([255, 255, 255]), black),
+        PositionStatus::Mismatch => (Rgb([240, 228, 66]), black),
+        PositionStatus::Unclaimed => (Rgb([255, 255, 255]), Rgb([225, 40, 20])),
     };
-    let reach = 20;
+    let reach = 24;
     for py in (cy as i64 - reach)..=(cy as i64 + reach) {
         for px in (cx as i64 - reach)..=(cx as i64 + reach) {
             let (Ok(x), Ok(y)) = (u32::try_from(px), u32::try_from(py)) else {
@@ -110,10 +111,10 @@ fn mark(picture: &mut RgbImage, [cx, cy]: [f64; 2], status: PositionStatus) {
                 continue;
             }
             let distance = outline(status, px as f64 + 0.5 - cx, py as f64 + 0.5 - cy);
-            if distance < 1.2 {
+            if distance < 1.5 {
                 picture.put_pixel(x, y, ink);
-            } else if distance < 2.4 {
-                picture.put_pixel(x, y, Rgb([0, 0, 0]));
+            } else if distance < 3.0 {
+                picture.put_pixel(x, y, halo);
             }
         }
     }

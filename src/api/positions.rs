@@ -92,18 +92,18 @@ pub struct HistoryQuery {
 
 /// Positions of the past, oldest first.
 #[derive(Debug, Serialize, utoipa::ToSchema)]
-pub struct Past {
+pub struct Moments {
     moments: Vec<Moment>,
 }
 
 /// Where the beams were during the last hour, once a second
 #[utoipa::path(get, path = "/v1/history", tag = "positions", params(HistoryQuery),
     responses(
-        (status = 200, description = "Moments, oldest first", body = Past),
+        (status = 200, description = "Moments, oldest first", body = Moments),
         (status = 400, description = "A parameter cannot be read", body = Problem, content_type = "application/problem+json"),
     ))]
 pub async fn history(Shared(state): Shared<State>, Query(query): Query<HistoryQuery>) -> Result<Response, Problem> {
     let limit = super::extract::within("limit", query.limit.unwrap_or(3600), 1, 3600)?;
     let moments = state.feed.history(|h| h.after(query.since, limit));
-    Ok(respond::json(&Past { moments }))
+    Ok(respond::json(&Moments { moments }))
 }

@@ -22,6 +22,7 @@ pub struct Problem {
     pub detail: String,
     /// Claims refused, with reasons, where claims were sent.
     #[serde(flatten)]
+    #[schema(ignore)]
     pub intake: Option<Box<Intake>>,
     #[serde(skip)]
     retry_after_s: Option<u64>,
@@ -44,10 +45,10 @@ impl Problem {
     }
 
     /// A body of which no claim was taken.
-    pub fn refused(intake: Intake, detail: String) -> Self {
+    pub fn refused(status: StatusCode, intake: Intake, detail: String) -> Self {
         Self {
             intake: Some(Box::new(intake)),
-            ..Self::new(StatusCode::UNPROCESSABLE_ENTITY, detail)
+            ..Self::new(status, detail)
         }
     }
 

@@ -9,7 +9,7 @@ use std::task::{Context, Poll};
 use std::time::{Duration, SystemTime};
 
 use axum_server::Handle;
-use axum_server::accept::Accept;
+use axum_server::accept::{Accept, DefaultAcceptor};
 use axum_server::tls_rustls::{RustlsAcceptor, RustlsConfig};
 use hyper_util::rt::{TokioExecutor, TokioTimer};
 use hyper_util::server::conn::auto;
@@ -107,17 +107,25 @@ impl Server {
         let app = super::router(state, &self.config, self.tokens.clone());
         let service = app.into_make_service_with_connect_info::<SocketAddr>();
         let patience = self.config.patience();
-        let limited = Limited {
-            connections: Arc::new(Semaphore::new(self.config.max_connections)),
-            patience,
-        };
+        let connections = Arc::new(Semaphore::new(self.config.max_connections));
         let mut server = axum_server::from_tcp(listener)?.handle(handle);
         *server.http_builder() = protocol(patience);
         let outcome = match self.tls {
-            None => server.acceptor(limited).serve(service).await,
+            None => {
+                let limited = Limited {
+                    inner: DefaultAcceptor::new(),
+                    connections,
+                    patience,
+                };
+                server.acceptor(limited).serve(service).await
+            }
             Some(tls) => {
-                let acceptor = RustlsAcceptor::new(tls.config).handshake_timeout(patience);
-                server.acceptor(acceptor.acceptor(limited)).serve(service).await
+                let limited = Limited {
+                    inner: RustlsAcceptor::new(tls.config).handshake_timeout(patience),
+                    connections,
+                    patience,
+                };
+                server.acceptor(limited).serve(service).await
             }
         };
         upkeep.abort();
@@ -211,55 +219,75 @@ async fn keep_up(metrics: metrics_exporter_prometheus::PrometheusHandle, tokens:
     }
 }
 
-/// Turns connections away above a limit, and cuts those that stall.
+/// Turns connections away above a limit, before any handshake, and cuts those that stall.
 #[derive(Clone)]
-struct Limited {
+struct Limited<A> {
+    inner: A,
     connections: Arc<Semaphore>,
     patience: Duration,
 }
 
-impl<S> Accept<TcpStream, S> for Limited {
-    type Stream = Connection;
-    type Service = S;
-    type Future = std::future::Ready<io::Result<(Connection, S)>>;
+impl<A, S> Accept<TcpStream, S> for Limited<A>
+where
+    A: Accept<TcpStream, S, Future: Send + 'static>,
+    A::Stream: AsyncRead + AsyncWrite + 'static,
+{
+    type Stream = Connection<A::Stream>;
+    type Service = A::Service;
+    type Future = Pin<Box<dyn Future<Output = io::Result<(Self::Stream, Self::Service)>> + Send>>;
 
     fn accept(&self, stream: TcpStream, service: S) -> Self::Future {
         let Ok(permit) = self.connections.clone().try_acquire_owned() else {
             metrics::counter!(metric::HTTP_REFUSED, "reason" => "connections").increment(1);
-            return std::future::ready(Err(io::ErrorKind::ConnectionRefused.into()));
+            return Box::pin(std::future::ready(Err(io::ErrorKind::ConnectionRefused.into())));
         };
+        let counted = Counted::open();
         let socket = socket2::SockRef::from(&stream);
-        let prepared = socket
+        if let Err(e) = socket
             .set_send_buffer_size(SEND_BUFFER)
-            .and(socket.set_tcp_nodelay(true));
-        if let Err(e) = prepared {
-            return std::future::ready(Err(e));
+            .and(socket.set_tcp_nodelay(true))
+        {
+            return Box::pin(std::future::ready(Err(e)));
         }
-        let mut stream = TimeoutStream::new(stream);
-        stream.set_write_timeout(Some(self.patience));
-        let connection = Connection {
-            stream: Box::pin(stream),
-            _permit: permit,
-            _counted: Counted::open(),
-        };
-        std::future::ready(Ok((connection, service)))
+        let patience = self.patience;
+        let accepted = self.inner.accept(stream, service);
+        Box::pin(async move {
+            let (stream, service) = accepted.await?;
+            let mut stream = TimeoutStream::new(stream);
+            stream.set_write_timeout(Some(patience));
+            stream.set_read_timeout(Some(patience));
+            let connection = Connection {
+                stream: Box::pin(stream),
+                is_silent: true,
+                _permit: permit,
+                _counted: counted,
+            };
+            Ok((connection, service))
+        })
     }
 }
 
 /// One client's connection, counted as long as it lives, upgraded to a WebSocket or not.
-struct Connection {
-    stream: Pin<Box<TimeoutStream<TcpStream>>>,
+struct Connection<S> {
+    stream: Pin<Box<TimeoutStream<S>>>,
+    /// Nothing has been read yet. Once something has, hyper's own clock watches the header, and a stream's pings the rest.
+    is_silent: bool,
     _permit: OwnedSemaphorePermit,
     _counted: Counted,
 }
 
-impl AsyncRead for Connection {
+impl<S: AsyncRead + AsyncWrite> AsyncRead for Connection<S> {
     fn poll_read(mut self: Pin<&mut Self>, cx: &mut Context<'_>, buf: &mut ReadBuf<'_>) -> Poll<io::Result<()>> {
-        self.stream.as_mut().poll_read(cx, buf)
+        let outcome = self.stream.as_mut().poll_read(cx, buf);
+        if self.is_silent && outcome.is_ready() {
+            self.is_silent = false;
+            self.stream.as_mut().set_read_timeout_pinned(None);
+        }
+        outcome
     }
 }
 
-impl AsyncWrite for Connection {
+impl<S: AsyncRead + AsyncWrite> AsyncWrite for Connection<S> {
     fn poll_write(mut self: Pin<&mut Self>, cx: &mut Context<'_>, buf: &[u8]) -> Poll<io::Result<usize>> {
         self.stream.as_mut().poll_write(cx, buf)
     }

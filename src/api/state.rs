@@ -9,6 +9,7 @@ use super::frame::Pictures;
 use crate::claim::Claim;
 use crate::journal::Journal;
 use crate::monitor::Alert;
+use crate::notify::Notifier;
 
 /// What the handlers work with. The daemon builds it; cloning is cheap.
 #[derive(Clone)]
@@ -20,6 +21,8 @@ pub struct State {
     pub metrics: PrometheusHandle,
     /// The model is loaded and the pipeline runs; `/readyz` asks for good frames besides.
     pub ready: Arc<AtomicBool>,
+    /// Webhook status and replay; none where no webhook is spoken of.
+    pub(super) notifier: Option<Notifier>,
     pub(super) pictures: Arc<Pictures>,
     /// Turns true when the server stops, for streams to say goodbye.
     pub(super) stopping: watch::Sender<bool>,
@@ -39,9 +42,15 @@ impl State {
             journal,
             metrics,
             ready,
+            notifier: None,
             pictures: Arc::default(),
             stopping: watch::Sender::new(false),
         }
+    }
+
+    pub fn with_webhooks(mut self, notifier: Notifier) -> Self {
+        self.notifier = Some(notifier);
+        self
     }
 }
 

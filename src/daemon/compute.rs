@@ -198,6 +198,7 @@ impl Compute {
         let s = &self.state;
         let health = self.journal.health();
         let counts = self.pipeline.claims.counts();
+        metrics::counter!(metric::CLAIMS, "outcome" => "accepted").absolute(counts.accepted);
         Status {
             version: env!("CARGO_PKG_VERSION"),
             started_at: s.started_at,

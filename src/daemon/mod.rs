@@ -107,6 +107,7 @@ impl Daemon {
         let (commands, orders) = mpsc::channel(COMMANDS);
         let ready = Arc::new(AtomicBool::new(false));
         let state = api::State::new(feed, commands, self.journal.clone(), metrics, ready.clone());
+        let state = state.with_webhooks(notifier.clone());
 
         let source = &self.config.source;
         let log = self.config.claims.log.as_deref();

@@ -136,7 +136,7 @@ async fn claims_are_counted_and_refused_one_by_one() {
     let post = |body: &str| Client::new().post(fake.url("/v1/claims")).body(body.to_owned()).send();
     let good =
         r#"{"time":"2026-11-21T08:00:00.000Z","user":"u-17","x_m":12.5,"y_m":-80.0,"sigma_m":1.0,"state":"active"}"#;
-    let far = r#"{"time":"2026-11-21T08:00:00Z","user":"u-18","x_m":1e9,"y_m":0}"#;
+    let far = r#"{"time":"2026-11-21T08:00:00Z","user":"u-18","x_m":1e6,"y_m":0}"#;
 
     let one = post(good).await.unwrap();
     assert_eq!(one.status(), StatusCode::OK);
@@ -155,6 +155,8 @@ async fn claims_are_counted_and_refused_one_by_one() {
         .collect();
     assert_eq!(lines, [3, 4]);
 
+    let detail = problem(post(far).await.unwrap(), 409).await;
+    assert!(detail.contains("x_m"), "{detail}");
     let detail = problem(post("not json").await.unwrap(), 422).await;
     assert!(detail.contains("line 1"), "{detail}");
     problem(post("").await.unwrap(), 422).await;

@@ -1,0 +1,112 @@
+use axum::extract::State as Shared;
+use axum::http::StatusCode;
+use axum::response::Response;
+use serde::{Deserialize, Serialize};
+
+use super::extract::{Path, Query};
+use super::problem::Problem;
+use super::respond;
+use super::state::State;
+use crate::journal::DeadLetter;
+use crate::notify::{AskError, EndpointStatus, Notifier};
+
+/// Dead letters listed at most.
+const MAX_LETTERS: usize = 1000;
+
+/// How each webhook fares.
+#[derive(Debug, Serialize, utoipa::ToSchema)]
+pub struct Endpoints {
+    webhooks: Vec<EndpointStatus>,
+}
+
+/// Deliveries given up on, oldest first.
+#[derive(Debug, Serialize, utoipa::ToSchema)]
+pub struct Letters {
+    dead_letters: Vec<DeadLetter>,
+}
+
+/// What a replay put back into the queue.
+#[derive(Debug, Serialize, utoipa::ToSchema)]
+pub struct Replayed {
+    queued: u64,
+}
+
+#[derive(Debug, Deserialize, utoipa::IntoParams)]
+#[into_params(parameter_in = Query)]
+#[serde(deny_unknown_fields)]
+pub struct ReplayQuery {
+    /// One dead letter; all of them when left out
+    seq: Option<u64>,
+}
+
+fn notifier(state: &State, name: &str) -> Result<Notifier, Problem> {
+    let none = || Problem::not_found(format!("there is no webhook {name:?}"));
+    state.notifier.clone().ok_or_else(none)
+}
+
+impl From<AskError> for Problem {
+    fn from(error: AskError) -> Self {
+        match error {
+            AskError::Unknown(_) => Self::not_found(error.to_string()),
+            AskError::ReadOnly | AskError::Stopping | AskError::Journal(_) => {
+                Self::later(StatusCode::SERVICE_UNAVAILABLE, 5, error.to_string())
+            }
+        }
+    }
+}
+
+/// How each webhook fares, without its secret and without the query of its URL
+#[utoipa::path(get, path = "/v1/webhooks", tag = "webhooks",
+    responses((status = 200, description = "In the order of the config", body = Endpoints)))]
+pub async fn list(Shared(state): Shared<State>) -> Response {
+    let webhooks = state.notifier.as_ref().map(Notifier::status).unwrap_or_default();
+    respond::json(&Endpoints { webhooks })
+}
+
+/// Deliveries that the retry schedule gave up on
+#[utoipa::path(get, path = "/v1/webhooks/{name}/dead-letters", tag = "webhooks",
+    params(("name" = String, Path, description = "The webhook's name")),
+    responses(
+        (status = 200, description = "Oldest first, a thousand at most", body = Letters),
+        (status = 400, description = "The path cannot be read", body = Problem, content_type = "application/problem+json"),
+        (status = 404, description = "There is no such webhook", body = Problem, content_type = "application/problem+json"),
+        (status = 503, description = "The journal cannot be read", body = Problem, content_type = "application/problem+json"),
+    ))]
+pub async fn dead_letters(Shared(state): Shared<State>, Path(name): Path<String>) -> Result<Response, Problem> {
+    let notifier = notifier(&state, &name)?;
+    let read = tokio::task::spawn_blocking(move || notifier.dead_letters(&name, MAX_LETTERS)).await;
+    let dead_letters = read.expect("a read does not panic")?;
+    Ok(respond::json(&Letters { dead_letters }))
+}
+
+/// Sends dead letters again
+#[utoipa::path(post, path = "/v1/webhooks/{name}/replay", tag = "webhooks",
+    params(("name" = String, Path, description = "The webhook's name"), ReplayQuery),
+    responses(
+        (status = 200, description = "How many were put back into the queue", body = Replayed),
+        (status = 400, description = "A parameter cannot be read", body = Problem, content_type = "application/problem+json"),
+        (status = 404, description = "There is no such webhook", body = Problem, content_type = "application/problem+json"),
+        (status = 503, description = "The journal cannot be written now", body = Problem, content_type = "application/problem+json"),
+    ))]
+pub async fn replay(
+    Shared(state): Shared<State>,
+    Path(name): Path<String>,
+    Query(query): Query<ReplayQuery>,
+) -> Result<Response, Problem> {
+    let queued = notifier(&state, &name)?.replay(&name, query.seq).await?;
+    Ok(respond::json(&Replayed { queued }))
+}
+
+/// Sends again to a receiver that had answered 410 Gone
+#[utoipa::path(post, path = "/v1/webhooks/{name}/enable", tag = "webhooks",
+    params(("name" = String, Path, description = "The webhook's name")),
+    responses(
+        (status = 204, description = "It is sent to again"),
+        (status = 400, description = "The path cannot be read", body = Problem, content_type = "application/problem+json"),
+        (status = 404, description = "There is no such webhook", body = Problem, content_type = "application/problem+json"),
+        (status = 503, description = "The daemon is stopping", body = Problem, content_type = "application/problem+json"),
+    ))]
+pub async fn enable(Shared(state): Shared<State>, Path(name): Path<String>) -> Result<StatusCode, Problem> {
+    notifier(&state, &name)?.enable(&name).await?;
+    Ok(StatusCode::NO_CONTENT)
+}

@@ -1,0 +1,138 @@
+//! The page in a real browser on the real daemon: an eavesdropper appears, is acknowledged, is gone; the daemon restarts.
+
+mod browser;
+
+use std::net::TcpListener;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+
+use browser::Browser;
+
+/// The built-in scene's eavesdropper comes after five seconds and stays for eight, every half minute.
+const PATIENCE: Duration = Duration::from_secs(45);
+
+struct Daemon(Child);
+
+impl Daemon {
+    fn start(config: &Path) -> Self {
+        let child = Command::new(env!("CARGO_BIN_EXE_oapwatch"))
+            .args(["run", "--config"])
+            .arg(config)
+            .stdout(Stdio::null())
+            .stderr(Stdio::null())
+            .spawn()
+            .expect("the daemon starts");
+        Self(child)
+    }
+}
+
+impl Drop for Daemon {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+async fn until(browser: &mut Browser, what: &str, condition: &str) {
+    let started = Instant::now();
+    while browser.eval(condition).await != true {
+        assert!(started.elapsed() < PATIENCE, "{what}: {condition} never came true");
+        tokio::time::sleep(Duration::from_millis(50)).await;
+    }
+}
+
+#[tokio::test]
+async fn an_eavesdropper_comes_is_acknowledged_and_goes_and_a_restart_is_survived() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let port = TcpListener::bind("127.0.0.1:0")
+        .and_then(|l| l.local_addr())
+        .expect("a free port")
+        .port();
+    let config = dir.path().join("oapwatch.toml");
+    let text = format!("[api]\nlisten = \"127.0.0.1:{port}\"\n[journal]\npath = \"journal.db\"\n");
+    std::fs::write(&config, text).expect("the config is written");
+    let daemon = Daemon::start(&config);
+    let Some(mut page) = Browser::open(&dir.path().join("profile"), &format!("http://127.0.0.1:{port}/")).await else {
+        return;
+    };
+
+    until(
+        &mut page,
+        "the page is live",
+        "document.getElementById('link').textContent === 'live'",
+    )
+    .await;
+    until(
+        &mut page,
+        "users are verified",
+        "document.querySelectorAll('#map .beam.verified').length >= 3",
+    )
+    .await;
+    let card = "#list li.unclaimed_emitter.open";
+    until(
+        &mut page,
+        "the eavesdropper is listed",
+        &format!("!!document.querySelector('{card}')"),
+    )
+    .await;
+    until(
+        &mut page,
+        "and drawn",
+        "!!document.querySelector('#map .beam.unclaimed .ping')",
+    )
+    .await;
+    until(
+        &mut page,
+        "the frame is shown",
+        "document.getElementById('frame').naturalWidth >= 512",
+    )
+    .await;
+    page.screenshot("eavesdropper").await;
+
+    page.eval(&format!("document.querySelector('{card} .acts button').click()"))
+        .await;
+    let acknowledged = "!!document.querySelector('#list li.unclaimed_emitter.acknowledged')";
+    until(&mut page, "the acknowledgement is shown", acknowledged).await;
+    until(
+        &mut page,
+        "the eavesdropper goes",
+        "!document.querySelector('#list li.unclaimed_emitter')",
+    )
+    .await;
+    page.eval("document.getElementById('past').click()").await;
+    until(
+        &mut page,
+        "its alert is history",
+        "!!document.querySelector('#list li.unclaimed_emitter.cleared')",
+    )
+    .await;
+
+    drop(daemon);
+    until(
+        &mut page,
+        "the loss is said",
+        "document.getElementById('link').textContent === 'disconnected'",
+    )
+    .await;
+    until(&mut page, "in words", "!document.getElementById('banner').hidden").await;
+    let _daemon = Daemon::start(&config);
+    until(
+        &mut page,
+        "the page comes back",
+        "document.getElementById('link').textContent === 'live'",
+    )
+    .await;
+    until(
+        &mut page,
+        "with what was",
+        "!!document.querySelector('#list li.unclaimed_emitter.cleared')",
+    )
+    .await;
+    assert_eq!(page.errors(), Vec::<String>::new());
+}
+
+/// Where pictures of the page go, if anybody wants them.
+fn pictures() -> Option<PathBuf> {
+    std::env::var_os("OAPWATCH_TEST_PICTURES").map(PathBuf::from)
+}
