@@ -135,7 +135,7 @@ pub fn describe() {
         FRAMES_DROPPED,
         FRAMES_UNUSABLE,
         STREAM_POSITIONS_MISSED,
-        JOURNAL_ERRORS,
+        JOURNAL_FAILURES,
     ] {
         counter!(name).increment(0);
     }

@@ -229,8 +229,8 @@ struct Limited<A> {
 
 impl<A, S> Accept<TcpStream, S> for Limited<A>
 where
-    A: Accept<TcpStream, S, Future: Send + 'static>,
-    A::Stream: AsyncRead + AsyncWrite + 'static,
+    A: Accept<TcpStream, S, Future: Send + 'static, Service: Send + 'static>,
+    A::Stream: AsyncRead + AsyncWrite + Send + 'static,
 {
     type Stream = Connection<A::Stream>;
     type Service = A::Service;

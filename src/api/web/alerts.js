@@ -119,10 +119,9 @@ export class Alerts {
     const wasOpen = known?.node.querySelector("details")?.open;
     const mark = ICON[alert.kind] ? icon(ICON[alert.kind]) : alert.kind === "user_unseen" ? claimIcon(true) : icon("pending");
     const when = el("span", {}, this.when(alert));
-    const where = [];
-    if (alert.user) where.push(el("strong", {}, alert.user), " ");
-    if (alert.x_m !== null) where.push(`at ${metres(alert.x_m)}, ${metres(alert.y_m)} m`);
-    if (alert.claimed?.x_m !== undefined) where.push(`${where.length ? "; " : ""}claims ${metres(alert.claimed.x_m)}, ${metres(alert.claimed.y_m)} m`);
+    const where = alert.user ? [el("strong", {}, alert.user)] : [];
+    if (alert.x_m !== null) where.push(` at ${metres(alert.x_m)}, ${metres(alert.y_m)} m`);
+    if (alert.claimed?.x_m !== undefined) where.push(`${alert.x_m !== null ? "," : ""} claims ${metres(alert.claimed.x_m)}, ${metres(alert.claimed.y_m)} m`);
     const rows = Object.entries(alert.evidence ?? {}).map(([k, v]) => fact(k, v));
     rows.push(["severity", alert.severity], ["from frame", `${alert.source.frame} (${alert.source.kind})`], ["id", alert.id]);
     const table = el("table", {}, el("tbody", {}, ...rows.map(([k, v]) => el("tr", {}, el("td", {}, k), el("td", {}, v)))));

@@ -172,7 +172,7 @@ function facts() {
     ["Frames", `${s.source.rate_hz.toFixed(1)} /s`],
     ["Latency", `${micros(s.latency.median_us)}`, "", `99 % within ${micros(s.latency.p99_us)}`],
     ["Dropped", `${s.frames.dropped}`, "", `${s.frames.captured} captured, ${s.frames.unusable} unusable`],
-    ["Claims", claimAge === null ? "none" : `${s.claims.users} users, ${lasting(claimAge)} ago`, "", `${s.claims.accepted} accepted, ${s.claims.malformed} malformed${s.claims.log ? `, from ${s.claims.log}` : ""}`],
+    ["Claims", s.claims.users || claimAge !== null ? `${s.claims.users} users${claimAge === null ? "" : `, ${lasting(claimAge)} ago`}` : "none", "", `${s.claims.accepted} accepted, ${s.claims.malformed} malformed${s.claims.log ? `, from ${s.claims.log}` : ""}`],
     ["Journal", s.journal.healthy ? (s.journal.place === "memory" ? "memory" : "on disk") : "failing", s.journal.healthy ? "" : "bad", s.journal.fault ?? s.journal.place],
     ["Webhooks", s.webhooks.length ? (failing ? `${failing} failing, ${queued} queued` : `${queued} queued`) : "none", failing ? "warn" : ""],
   ];

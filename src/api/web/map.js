@@ -134,7 +134,7 @@ export class GroundMap {
     for (let x = Math.ceil(x0 / step) * step; x <= x1; x += step) {
       const [px] = this.px([x, 0]);
       nodes.push(svg("line", { class: round(x) === 0 ? "axis" : "grid", x1: px, x2: px, y1: Math.max(0, top), y2: Math.min(this.height, bottom) }));
-      if (px > 30 && px < this.width - 90) nodes.push(svg("text", { class: "tick", x: px + 4, y: this.height - 6 }, `${round(x)}`));
+      if (px > 30 && px < this.width - 60 - step * this.scale) nodes.push(svg("text", { class: "tick", x: px + 4, y: this.height - 6 }, `${round(x)}`));
     }
     for (let y = Math.ceil(y0 / step) * step; y <= y1; y += step) {
       const [, py] = this.px([0, y]);

@@ -13,7 +13,7 @@ export const KIND = {
 
 export const metres = (v) => (v === null || v === undefined ? "" : v.toFixed(Math.abs(v) < 100 ? 2 : 1));
 
-export const clock = (ms) => new Date(ms).toLocaleTimeString([], { hour: "2-digit", minute: "2-digit", second: "2-digit" });
+export const clock = (ms) => new Date(ms).toLocaleTimeString([], { hour: "2-digit", minute: "2-digit", second: "2-digit", hourCycle: "h23" });
 
 export function lasting(ms) {
   const s = Math.max(0, Math.round(ms / 1000));
@@ -34,7 +34,14 @@ export function fact(key, value) {
   const parts = key.split("_");
   const unit = parts.length > 1 ? UNITS[parts.at(-1)] : undefined;
   if (unit) parts.pop();
+  if (unit === "J" && typeof value === "number") return [parts.join(" "), joules(value)];
   return [parts.join(" "), said(value) + (unit && typeof value === "number" ? ` ${unit}` : "")];
+}
+
+function joules(value) {
+  const prefixes = [[1, ""], [1e-3, "m"], [1e-6, "µ"], [1e-9, "n"], [1e-12, "p"]];
+  const [size, prefix] = prefixes.find(([p]) => Math.abs(value) >= p) ?? prefixes.at(-1);
+  return `${+(value / size).toPrecision(3)} ${prefix}J`;
 }
 
 function said(value) {
