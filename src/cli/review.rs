@@ -1,11 +1,105 @@
-use super::Outcome;
+use std::io::Write;
+use std::path::PathBuf;
+use std::time::Duration;
+
+use anyhow::anyhow;
+
+use super::{Failure, Outcome};
+use crate::claims::{Store, read_log};
+use crate::config::Config;
+use crate::frames::{self, Next, SourceKind};
+use crate::monitor::{AlertEvent, Monitor, Observation, Source};
+use crate::{claims, estimate};
 
 #[derive(Debug, clap::Args)]
 pub struct Args {
+    /// Config with a replay source
     #[arg(long)]
-    config: std::path::PathBuf,
+    config: PathBuf,
 }
 
-pub fn run(_args: Args) -> Outcome {
-    Err(super::Failure::other(anyhow::anyhow!("review is not built yet")))
+/// Runs the daemon's chain over a recording. A claim stands from its own time on, so that the same input gives the
+/// same bytes however fast it is read.
+pub fn run(args: Args) -> Outcome {
+    let mut config = Config::load(&args.config).map_err(Failure::config)?;
+    config.monitor.validate().map_err(Failure::config)?;
+    config.claims.validate().map_err(Failure::config)?;
+    let camera = config.optics.camera().map_err(Failure::config)?;
+    if config.source.kind != SourceKind::Replay {
+        return Err(Failure::config(anyhow!(
+            "source.kind: review needs \"replay\", found {:?}",
+            config.source.kind.name()
+        )));
+    }
+    config.source.speed = 0.0;
+    config.source.r#loop = false;
+    let mut estimator = estimate::build(&config.estimator, &camera).map_err(Failure::config)?;
+    let mut source = frames::open(&config.source, &camera).map_err(|e| match e.is_config() {
+        true => Failure::config(e),
+        false => Failure::input(e),
+    })?;
+    let mut upcoming = claims_of(&config.claims)?.into_iter().peekable();
+    let mut store = Store::new(&config.claims);
+    let mut monitor = Monitor::new(
+        &config.monitor,
+        &config.claims,
+        &camera,
+        Source {
+            kind: config.source.kind.name().into(),
+            file: source.file().map(|f| f.display().to_string()),
+            rate_hz: config.source.rate_hz,
+        },
+    );
+    let mut out = std::io::BufWriter::new(std::io::stdout().lock());
+    loop {
+        let report = match source.next(Duration::from_secs(1)) {
+            Next::Frame(frame, with_frame) => {
+                while let Some(claim) = upcoming.next_if(|c| c.time <= frame.time) {
+                    store.insert(claim, frame.time);
+                }
+                for claim in with_frame {
+                    store.insert(claim, frame.time);
+                }
+                let result = estimator.estimate(&frame);
+                let seen = Observation {
+                    frame: frame.index,
+                    time: frame.time,
+                    result: result.as_ref(),
+                    digest: frame.digest(),
+                };
+                monitor.step(seen, &mut store)
+            }
+            Next::Unusable { index, time, reason } => {
+                while let Some(claim) = upcoming.next_if(|c| c.time <= time) {
+                    store.insert(claim, time);
+                }
+                monitor.unusable(index, time, &reason, &mut store)
+            }
+            Next::Nothing => continue,
+            Next::End => break,
+        };
+        print(&mut out, &report.events).map_err(Failure::other)?;
+    }
+    out.flush().map_err(Failure::other)
+}
+
+fn claims_of(config: &claims::Config) -> Result<Vec<claims::Claim>, Failure> {
+    let Some(path) = &config.log else {
+        return Ok(Vec::new());
+    };
+    let log = read_log(path, config).map_err(|e| {
+        Failure::input(anyhow!("claims log {}: expected a readable file, found: {e}", path.display()))
+    })?;
+    for refused in &log.refused {
+        eprintln!("oapwatch: {}:{}: {}; skipped", path.display(), refused.line, refused.error);
+    }
+    Ok(log.claims)
+}
+
+fn print(out: &mut impl Write, events: &[AlertEvent]) -> std::io::Result<()> {
+    for event in events {
+        serde_json::to_writer(&mut *out, event)?;
+        out.write_all(b"\n")?;
+    }
+    Ok(())
 }
