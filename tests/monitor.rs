@@ -270,3 +270,46 @@ fn the_same_story_gives_the_same_bytes() {
     assert!(!one.is_empty());
     assert_eq!(one, other);
 }
+
+#[test]
+fn a_shift_of_everybody_is_our_own_pose() {
+    for (seed, shift) in [[8.0, 0.0], [0.0, -3.5], [20.0, 20.0]].into_iter().enumerate() {
+        let mut story = Story::new(seed as u64, crowd());
+        story.shift = Box::new(move |t| if t < 10.0 { [0.0, 0.0] } else { shift });
+        let told = tell(&story);
+        told.expect(&[(PoseInconsistent, None, 10.0, 12.0)]);
+        assert!(told.reports.last().unwrap().emitters.iter().all(|e| e.status == PositionStatus::Verified));
+    }
+}
+
+#[test]
+fn a_pose_that_wanders_within_limits_is_corrected_silently() {
+    let mut story = Story::new(3, crowd());
+    story.seconds = 60.0;
+    story.shift = Box::new(|t| [1.5 * (0.2 * t).sin(), 1.0 * (0.13 * t).cos()]);
+    tell(&story).expect(&[]);
+}
+
+#[test]
+fn a_few_liars_are_mismatches_and_not_our_pose() {
+    for seed in SEEDS {
+        let mut actors = crowd();
+        for (k, place) in [(1, [0.0, -50.0]), (4, [0.0, 50.0])] {
+            actors[k] = Actor::new(&format!("u-{k}"), move |_| place)
+                .claim(move |t| Some(if t < 10.0 { place } else { [place[0] + 9.0, place[1]] }));
+        }
+        tell(&Story::new(seed, actors)).expect(&[
+            (PositionMismatch, Some("u-1"), 10.0, 11.5),
+            (PositionMismatch, Some("u-4"), 10.0, 11.5),
+        ]);
+    }
+}
+
+#[test]
+fn an_intruder_is_alerted_while_the_pose_is_off() {
+    let mut actors = crowd();
+    actors.push(Actor::intruder(|t| (t >= 20.0).then_some([20.0, 0.0])));
+    let mut story = Story::new(2, actors);
+    story.shift = Box::new(|t| if t < 10.0 { [0.0, 0.0] } else { [7.0, 3.0] });
+    tell(&story).expect(&[(PoseInconsistent, None, 10.0, 12.0), (UnclaimedEmitter, None, 20.0, 21.0)]);
+}

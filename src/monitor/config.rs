@@ -16,8 +16,9 @@ pub struct Config {
     pub claims_stale_s: f64,
     /// Seconds a beam may stay on after its user's claim says "ended".
     pub ended_grace_s: f64,
-    /// A common shift of all users up to this is corrected; a larger one is an alert.
-    pub pose_limit_m: f64,
+    /// A common shift of all users up to this is corrected; a larger one is an alert. Half the tolerated distance when
+    /// left out.
+    pub pose_limit_m: Option<f64>,
     /// Longest time that a cause which comes and goes is held open before it counts as cleared.
     pub cool_down_s: f64,
 }
@@ -40,7 +41,7 @@ impl Default for Config {
             sensor_lost_s: 1.0,
             claims_stale_s: 5.0,
             ended_grace_s: 3.0,
-            pose_limit_m: 2.0,
+            pose_limit_m: None,
             cool_down_s: 60.0,
         }
     }
@@ -57,7 +58,7 @@ impl Config {
             ("sensor_lost_s", self.sensor_lost_s),
             ("claims_stale_s", self.claims_stale_s),
             ("ended_grace_s", self.ended_grace_s),
-            ("pose_limit_m", self.pose_limit_m),
+            ("pose_limit_m", self.pose_limit_m.unwrap_or(1.0)),
             ("cool_down_s", self.cool_down_s),
         ];
         for (field, found) in positive {

@@ -5,6 +5,7 @@ mod alert;
 mod book;
 mod config;
 mod motion;
+mod pose;
 mod report;
 mod residuals;
 mod sight;

@@ -1,6 +1,7 @@
 use jiff::Timestamp;
 use nalgebra::{Matrix2, Vector2};
 
+use super::pose::Witness;
 use super::residuals::Residuals;
 use crate::claims::{Claim, ClaimState, Standing, seconds};
 
@@ -15,7 +16,7 @@ pub(super) const CLAIM_LIFE_S: f64 = 60.0;
 #[derive(Clone, Debug)]
 pub(super) struct Asserted {
     pub claim: Claim,
-    /// Where the claim puts the beam, our own pose error included.
+    /// Where the claim puts the beam; our own pose error is added once the frame has told it.
     pub position: Vector2<f64>,
     /// Variance per axis.
     pub variance: f64,
@@ -32,18 +33,12 @@ pub(super) struct Asserted {
 
 impl Asserted {
     /// `largest_sigma_m` bounds what a claim may say of its own error: a lie there must not hide a lie about the place.
-    pub fn new(
-        standing: &Standing,
-        now: Timestamp,
-        shift: Vector2<f64>,
-        default_sigma_m: f64,
-        largest_sigma_m: f64,
-    ) -> Self {
+    pub fn new(standing: &Standing, now: Timestamp, default_sigma_m: f64, largest_sigma_m: f64) -> Self {
         let claim = standing.claim;
         let age_s = seconds(claim.time, now).max(0.0);
         let sigma = claim.sigma_m.unwrap_or(default_sigma_m).clamp(0.01, largest_sigma_m);
         Self {
-            position: Vector2::new(claim.x_m, claim.y_m) + shift,
+            position: Vector2::new(claim.x_m, claim.y_m),
             variance: sigma * sigma,
             age_s,
             slack_m: (FREE_SPEED_M_S + standing.pace_m_s.min(FASTEST_M_S)) * age_s,
@@ -52,6 +47,15 @@ impl Asserted {
             period_s: standing.period_s,
             came: standing.came,
             claim: claim.clone(),
+        }
+    }
+
+    /// The claim as a witness of our own pose: reach for its error and for a step since it was made.
+    pub fn witness(&self) -> Witness {
+        Witness {
+            claimed: Vector2::new(self.claim.x_m, self.claim.y_m),
+            variance: self.variance,
+            reach_m: 0.5 + 3.0 * self.variance.sqrt() + 0.3 * self.slack_m.min(10.0),
         }
     }
 

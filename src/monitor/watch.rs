@@ -6,6 +6,7 @@ use serde_json::{Value, json};
 
 use super::book::{Book, Cause, Finding};
 use super::motion::mahalanobis2;
+use super::pose::Pose;
 use super::residuals::surprise;
 use super::sight::Sight;
 use super::thresholds::Thresholds;
@@ -51,8 +52,7 @@ pub struct Monitor {
     users: BTreeMap<String, User>,
     sight: Sight,
     book: Book,
-    /// Common offset of beams from claims.
-    shift: Vector2<f64>,
+    pose: Pose,
     first: Option<Timestamp>,
     first_claim: Option<Timestamp>,
     /// Typical seconds between a user's claims, and from a claim's own time to its arrival.
@@ -76,7 +76,7 @@ impl Monitor {
             users: BTreeMap::new(),
             sight: Sight::default(),
             book: Book::new(source.kind, source.file, config.cool_down_s),
-            shift: Vector2::zeros(),
+            pose: Pose::default(),
             first: None,
             first_claim: None,
             period_s: None,
@@ -98,7 +98,7 @@ impl Monitor {
         self.first.get_or_insert(now);
         let dt = self.time.map_or(0.0, |t| seconds(t, now)).max(0.0);
         self.time = Some(self.time.map_or(now, |t| t.max(now)));
-        let asserted = self.assert(claims, now);
+        let mut asserted = self.assert(claims, now);
         let lit = asserted
             .iter()
             .filter(|a| !a.ended)
@@ -109,6 +109,7 @@ impl Monitor {
         if let Some(estimate) = self.sight.judge(&seen, lit) {
             let detections = Detection::of(estimate, &self.camera);
             self.tracks.step(now, &detections, dt);
+            self.find_pose(&mut asserted, dt);
             let answers = self.answer(&asserted, now);
             self.weigh(&asserted, &answers, now);
             self.decide(&asserted, answers, claims, now);
@@ -164,7 +165,7 @@ impl Monitor {
         let tolerated = self.config.tolerated_distance_m;
         claims
             .standing()
-            .map(|s| Asserted::new(&s, now, self.shift, self.default_sigma_m, tolerated))
+            .map(|s| Asserted::new(&s, now, self.default_sigma_m, tolerated))
             .filter(|a| self.bears(a))
             .map(|mut a| {
                 a.expected = !a.ended && self.must_be_seen(&a);
@@ -187,6 +188,21 @@ impl Monitor {
     fn must_be_seen(&self, a: &Asserted) -> bool {
         let off = self.config.tolerated_distance_m + a.slack_m + 3.0 * a.variance.sqrt();
         self.is_near_view(a.position, (self.spot_m() - off).min(0.0))
+    }
+
+    /// Covariance of what all of a user's residuals share: our own pose and what is systematic in the positions.
+    fn floor(&self) -> Matrix2<f64> {
+        Matrix2::identity() * (SYSTEMATIC_M.powi(2) + self.pose.variance())
+    }
+
+    /// Learns our own pose error from the frame and moves the claims by it.
+    fn find_pose(&mut self, asserted: &mut [Asserted], dt: f64) {
+        let beams: Vec<Vector2<f64>> = self.tracks.all.iter().filter(|t| t.hit).map(|t| t.motion.position()).collect();
+        let witnesses: Vec<_> = asserted.iter().filter(|a| a.expected).map(Asserted::witness).collect();
+        self.pose.update(&beams, &witnesses, dt);
+        for a in asserted {
+            a.position += self.pose.shift();
+        }
     }
 
     fn spot_m(&self) -> f64 {
@@ -243,7 +259,7 @@ impl Monitor {
     fn weigh(&mut self, asserted: &[Asserted], answers: &[Option<u64>], now: Timestamp) {
         let tolerated = self.config.tolerated_distance_m;
         let gate = self.thresholds.level(asserted.len() as f64);
-        let floor = Matrix2::identity() * SYSTEMATIC_M.powi(2);
+        let floor = self.floor();
         for (a, answer) in asserted.iter().zip(answers) {
             let hidden = answer.is_none() && self.is_hidden(a);
             let user = self.users.entry(a.claim.user.clone()).or_default();
@@ -267,7 +283,7 @@ impl Monitor {
             if a.ended {
                 continue;
             }
-            let claimed = Vector2::new(a.claim.x_m, a.claim.y_m) + self.shift;
+            let claimed = Vector2::new(a.claim.x_m, a.claim.y_m) + self.pose.shift();
             if user.residuals.newest().is_none_or(|t| t < a.claim.time) {
                 match track.at(a.claim.time) {
                     Some(then) if track.confirmed && !track.merged => {
@@ -457,7 +473,7 @@ impl Monitor {
 
     fn decide_users(&mut self, asserted: &[Asserted], answers: &[Option<u64>], _claims: &Store, now: Timestamp) {
         let tolerated = self.config.tolerated_distance_m;
-        let floor = Matrix2::identity() * SYSTEMATIC_M.powi(2);
+        let floor = self.floor();
         let each = (asserted.len() * super::residuals::WINDOWS.len()) as f64;
         let level = self.thresholds.level(each);
         let level_unseen = self.thresholds.level(asserted.len() as f64);
@@ -556,6 +572,7 @@ impl Monitor {
         } else if blind_s == 0.0 {
             self.book.absent(&lost, now);
         }
+        self.watch_pose(now);
         let stale = Cause::Whole(AlertKind::ClaimsStale);
         let period = self.period_s.unwrap_or(0.0);
         let limit = self.config.claims_stale_s.max(5.0 * period);
@@ -576,6 +593,30 @@ impl Monitor {
                     .report(&stale, Finding::new(severity, evidence), now, self.frame);
             }
             _ => self.book.absent(&stale, now),
+        }
+    }
+
+    fn watch_pose(&mut self, now: Timestamp) {
+        let cause = Cause::Whole(AlertKind::PoseInconsistent);
+        let limit = self.config.pose_limit_m.unwrap_or(0.5 * self.config.tolerated_distance_m);
+        let shift = self.pose.shift();
+        let (agreeing, of) = self.pose.support();
+        let surprise = surprise(shift, &self.floor(), limit);
+        let level = self.thresholds.level(1.0);
+        let is_open = self.book.is_open(&cause);
+        if surprise > level || (is_open && shift.norm() > 0.9 * limit) {
+            let severity = if shift.norm() > 4.0 * limit { Severity::Critical } else { Severity::Warning };
+            let evidence = json!({
+                "shift_m": [shift.x, shift.y],
+                "limit_m": limit,
+                "users_agreeing": agreeing,
+                "users": of,
+                "surprise": surprise,
+                "threshold": level,
+            });
+            self.book.report(&cause, Finding::new(severity, evidence), now, self.frame);
+        } else {
+            self.book.absent(&cause, now);
         }
     }
 

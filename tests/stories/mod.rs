@@ -94,6 +94,10 @@ pub struct Story {
     pub detected: f64,
     /// Beams nearer than this come as one detection between them, m.
     pub resolution_m: f64,
+    /// Chance of a spurious detection somewhere in a frame.
+    pub ghosts: f64,
+    /// Share of a claim's variance that wanders over a minute instead of being fresh in each claim.
+    pub claim_wander: f64,
     pub shift: Box<dyn Fn(f64) -> [f64; 2]>,
     pub sensor: Box<dyn Fn(f64) -> Sensor>,
     /// When a claim made at a time comes in; `None` loses it.
@@ -111,6 +115,8 @@ impl Story {
             position_std_m: 0.02,
             detected: 0.998,
             resolution_m: 1.5,
+            ghosts: 0.0,
+            claim_wander: 0.0,
             shift: Box::new(|_| [0.0, 0.0]),
             sensor: Box::new(|_| Sensor::Fine),
             delivery: Box::new(Some),
@@ -136,6 +142,69 @@ pub fn crowd() -> Vec<Actor> {
             actor
         })
         .collect()
+}
+
+/// A random-waypoint walk inside the view: legs at 0.3 to 2.5 m/s, a third of the stops a minute's rest.
+pub fn wander(seed: u64, seconds: f64) -> impl Fn(f64) -> [f64; 2] + Clone + 'static {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    let mut place = || [rng.random_range(-110.0..110.0), rng.random_range(-110.0..110.0f64)];
+    let (mut here, mut stops) = (place(), Vec::new());
+    let mut legs = ChaCha8Rng::seed_from_u64(seed ^ 0x1e65);
+    let mut t = 0.0;
+    while t < seconds {
+        stops.push((t, here));
+        if legs.random::<f64>() < 0.33 {
+            t += legs.random_range(5.0..60.0);
+            stops.push((t, here));
+        }
+        let next = place();
+        t += (next[0] - here[0]).hypot(next[1] - here[1]) / legs.random_range(0.3..2.5);
+        here = next;
+    }
+    stops.push((t, here));
+    let stops = std::rc::Rc::new(stops);
+    move |t: f64| {
+        let after = stops.partition_point(|(s, _)| *s <= t).clamp(1, stops.len() - 1);
+        let ((ta, a), (tb, b)) = (stops[after - 1], stops[after]);
+        let share = ((t - ta) / (tb - ta).max(1e-9)).clamp(0.0, 1.0);
+        [a[0] + share * (b[0] - a[0]), a[1] + share * (b[1] - a[1])]
+    }
+}
+
+/// Honest users that join and leave; their claims' errors wander, their beams are missed now and then.
+pub fn honest(seed: u64, seconds: f64) -> Story {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed ^ 0x0a0e57);
+    let users = rng.random_range(3..10);
+    let actors = (0..users)
+        .map(|k| {
+            let path = wander(seed * 16 + k, seconds);
+            let mut actor = Actor::new(&format!("u-{k}"), path.clone());
+            actor.sigma_m = rng.random_range(0.2..1.2);
+            actor.states_sigma = rng.random::<f64>() < 0.9;
+            actor.phase_s = rng.random_range(0.0..1.0);
+            if rng.random::<f64>() < 0.3 {
+                let joins: f64 = rng.random_range(5.0..0.4 * seconds);
+                let leaves: f64 = rng.random_range(0.6 * seconds..0.95 * seconds);
+                let beam = path.clone();
+                // The network admits a user before the beam comes on, and notes the end when it goes off.
+                actor.phase_s = joins;
+                let on = joins + rng.random_range(0.0..0.5);
+                let off = leaves + rng.random_range(0.0..1.5);
+                actor.ended_at = Some(leaves);
+                actor = actor.beam(move |t| (on..off).contains(&t).then(|| beam(t)));
+            }
+            actor
+        })
+        .collect();
+    let mut story = Story::new(seed, actors);
+    story.seconds = seconds;
+    story.detected = 0.995;
+    story.ghosts = 0.002;
+    story.claim_wander = 0.5;
+    story.position_std_m = 10f64.powf(rng.random_range(-2.0..0.0));
+    let (a, b) = (rng.random_range(0.0..0.5), rng.random_range(0.02..0.5));
+    story.shift = Box::new(move |t| [a * (b * t).sin(), a * (0.7 * b * t).cos()]);
+    story
 }
 
 pub fn start() -> Timestamp {
@@ -222,6 +291,9 @@ fn detect(story: &Story, t: f64, rng: &mut ChaCha8Rng) -> Vec<Emitter> {
         let fading = Normal::<f64>::new(1.0, 0.25).unwrap().sample(rng).clamp(0.3, 2.5);
         spots.push((p, actor.energy_j * fading));
     }
+    if rng.random::<f64>() < story.ghosts {
+        spots.push(([rng.random_range(-120.0..120.0), rng.random_range(-120.0..120.0)], 1e-3));
+    }
     let mut merged: Vec<([f64; 2], f64)> = Vec::new();
     'spots: for (p, energy) in spots {
         for (q, sum) in &mut merged {
@@ -259,12 +331,19 @@ pub fn claims(story: &Story) -> Vec<(f64, Claim)> {
     let mut all = Vec::new();
     for actor in &story.actors {
         let Some(user) = &actor.user else { continue };
-        let error = Normal::new(0.0, actor.sigma_m).unwrap();
+        let fresh = Normal::new(0.0, actor.sigma_m * (1.0 - story.claim_wander).sqrt()).unwrap();
+        // First-order Gauss-Markov with a correlation time of one minute.
+        let keeps = (-actor.period_s / 60.0).exp();
+        let stationary = actor.sigma_m * story.claim_wander.sqrt();
+        let drift = Normal::new(0.0, stationary * (1.0 - keeps * keeps).sqrt()).unwrap();
+        let begin = Normal::new(0.0, stationary).unwrap();
+        let mut wander = [begin.sample(&mut rng), begin.sample(&mut rng)];
         let mut t = actor.phase_s;
         let mut over = false;
         while t < story.seconds && !over {
             over = actor.ended_at.is_some_and(|end| t >= end);
-            let (ex, ey) = (error.sample(&mut rng), error.sample(&mut rng));
+            wander = wander.map(|w| keeps * w + drift.sample(&mut rng));
+            let (ex, ey) = (wander[0] + fresh.sample(&mut rng), wander[1] + fresh.sample(&mut rng));
             if let Some([x, y]) = (actor.claim)(t)
                 && let Some(comes) = (story.delivery)(t)
             {
