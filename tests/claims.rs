@@ -81,7 +81,11 @@ fn rotation_loses_nothing_of_the_old_file() {
     append(&log.path, &line("b", 1));
     fs::rename(&log.path, log.path.with_extension("1")).unwrap();
     append(&log.path.with_extension("1"), &line("c", 2));
-    assert_eq!(users(&log.follower.poll().unwrap()), ["b", "c"], "the old name is gone, the file is not");
+    assert_eq!(
+        users(&log.follower.poll().unwrap()),
+        ["b", "c"],
+        "the old name is gone, the file is not"
+    );
     append(&log.path, &line("d", 3));
     let poll = log.follower.poll().unwrap();
     assert_eq!(users(&poll), ["d"]);
@@ -107,13 +111,23 @@ fn truncation_and_a_rewrite_in_place_start_again() {
 #[test]
 fn malformed_lines_are_named_once_and_skipped() {
     let mut log = log();
-    let text = format!("{}not json\n\n{}{}\n{}", line("a", 0), line("b", 1), "x".repeat(LONGEST_LINE + 9), line("c", 2));
+    let text = format!(
+        "{}not json\n\n{}{}\n{}",
+        line("a", 0),
+        line("b", 1),
+        "x".repeat(LONGEST_LINE + 9),
+        line("c", 2)
+    );
     append(&log.path, &text);
     let poll = log.follower.poll().unwrap();
     assert_eq!(users(&poll), ["a", "b", "c"]);
     let lines: Vec<u64> = poll.refused.iter().map(|r| r.line).collect();
     assert_eq!(lines, [2, 5]);
-    assert!(poll.refused[1].error.to_string().contains("longer than"), "{}", poll.refused[1].error);
+    assert!(
+        poll.refused[1].error.to_string().contains("longer than"),
+        "{}",
+        poll.refused[1].error
+    );
     assert!(log.follower.poll().unwrap().refused.is_empty());
     append(&log.path, "{}\n");
     assert_eq!(log.follower.poll().unwrap().refused[0].line, 7);
@@ -153,7 +167,10 @@ fn the_store_tells_apart_new_late_repeated_and_contradicting_claims() {
     assert_eq!(store.position_at("a", at(0.0)).unwrap(), [1.0, 0.0]);
     assert_eq!(store.position_at("nobody", at(0.0)), None);
     let counts = store.counts();
-    assert_eq!((counts.accepted, counts.late, counts.duplicate, counts.conflicting), (2, 1, 1, 1));
+    assert_eq!(
+        (counts.accepted, counts.late, counts.duplicate, counts.conflicting),
+        (2, 1, 1, 1)
+    );
 }
 
 #[test]

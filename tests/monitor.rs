@@ -278,7 +278,11 @@ fn a_shift_of_everybody_is_our_own_pose() {
         story.shift = Box::new(move |t| if t < 10.0 { [0.0, 0.0] } else { shift });
         let told = tell(&story);
         told.expect(&[(PoseInconsistent, None, 10.0, 12.0)]);
-        assert!(told.reports.last().unwrap().emitters.iter().all(|e| e.status == PositionStatus::Verified));
+        let last = told.reports.last().unwrap();
+        assert!(
+            last.emitters.iter().all(|e| e.status == PositionStatus::Verified),
+            "{last:#?}"
+        );
     }
 }
 
@@ -311,5 +315,8 @@ fn an_intruder_is_alerted_while_the_pose_is_off() {
     actors.push(Actor::intruder(|t| (t >= 20.0).then_some([20.0, 0.0])));
     let mut story = Story::new(2, actors);
     story.shift = Box::new(|t| if t < 10.0 { [0.0, 0.0] } else { [7.0, 3.0] });
-    tell(&story).expect(&[(PoseInconsistent, None, 10.0, 12.0), (UnclaimedEmitter, None, 20.0, 21.0)]);
+    tell(&story).expect(&[
+        (PoseInconsistent, None, 10.0, 12.0),
+        (UnclaimedEmitter, None, 20.0, 21.0),
+    ]);
 }

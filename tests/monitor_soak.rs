@@ -42,8 +42,15 @@ fn honest_scenes_raise_nothing() {
 #[ignore = "minutes; see the file's head"]
 fn a_million_honest_frames() {
     let began = Instant::now();
-    let (frames, raised) = soak(number("OAPWATCH_SOAK_FRAMES", 1_000_000), number("OAPWATCH_SOAK_SEED", 1000));
-    println!("{frames} honest frames in {:.0} s: {} stories with alerts", began.elapsed().as_secs_f64(), raised.len());
+    let (frames, raised) = soak(
+        number("OAPWATCH_SOAK_FRAMES", 1_000_000),
+        number("OAPWATCH_SOAK_SEED", 1000),
+    );
+    println!(
+        "{frames} honest frames in {:.0} s: {} stories with alerts",
+        began.elapsed().as_secs_f64(),
+        raised.len()
+    );
     for (seed, events) in raised.iter().take(20) {
         println!("story {seed}:\n{events}");
     }
@@ -74,7 +81,10 @@ fn intrusion(seed: u64) -> Story {
     actors.push(Actor::intruder(move |t| {
         let s = t - 5.0;
         // Walks towards the middle's side, so that it stays in view.
-        let step = [-place[0].signum() * f64::abs(v[0]) * s, -place[1].signum() * f64::abs(v[1]) * s];
+        let step = [
+            -place[0].signum() * f64::abs(v[0]) * s,
+            -place[1].signum() * f64::abs(v[1]) * s,
+        ];
         (s >= 0.0).then_some([place[0] + step[0], place[1] + step[1]])
     }));
     let mut story = Story::new(seed, actors);
@@ -115,7 +125,16 @@ fn drift(seed: u64) -> Story {
 fn the_power_of_the_tests() {
     let n = number("OAPWATCH_SOAK_STORIES", 3000);
     let seed = number("OAPWATCH_SOAK_SEED", 1000);
-    println!("intruder within 1 s: {}", power(n, seed, UnclaimedEmitter, 5.0, 6.0, intrusion));
-    println!("2 m beyond within 1 s: {}", power(n, seed, PositionMismatch, 5.0, 6.05, step_out));
-    println!("drift within 1 m: {}", power(n / 10, seed, PositionMismatch, 55.0, 65.0, drift));
+    println!(
+        "intruder within 1 s: {}",
+        power(n, seed, UnclaimedEmitter, 5.0, 6.0, intrusion)
+    );
+    println!(
+        "2 m beyond within 1 s: {}",
+        power(n, seed, PositionMismatch, 5.0, 6.05, step_out)
+    );
+    println!(
+        "drift within 1 m: {}",
+        power(n / 10, seed, PositionMismatch, 55.0, 65.0, drift)
+    );
 }

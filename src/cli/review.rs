@@ -88,10 +88,18 @@ fn claims_of(config: &claims::Config) -> Result<Vec<claims::Claim>, Failure> {
         return Ok(Vec::new());
     };
     let log = read_log(path, config).map_err(|e| {
-        Failure::input(anyhow!("claims log {}: expected a readable file, found: {e}", path.display()))
+        Failure::input(anyhow!(
+            "claims log {}: expected a readable file, found: {e}",
+            path.display()
+        ))
     })?;
     for refused in &log.refused {
-        eprintln!("oapwatch: {}:{}: {}; skipped", path.display(), refused.line, refused.error);
+        eprintln!(
+            "oapwatch: {}:{}: {}; skipped",
+            path.display(),
+            refused.line,
+            refused.error
+        );
     }
     Ok(log.claims)
 }

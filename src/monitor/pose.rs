@@ -21,6 +21,7 @@ pub(super) struct Pose {
     variance: f64,
     agreeing: usize,
     witnesses: usize,
+    averaged_s: f64,
 }
 
 const QUORUM: f64 = 2.0 / 3.0;
@@ -30,7 +31,9 @@ const SEARCH_M: f64 = 60.0;
 /// Witnesses that take part in a search, which costs their fourth power.
 const MOST_SEARCHED: usize = 16;
 /// Claims' errors are averaged over this time, s.
-const SMOOTHING_S: f64 = 5.0;
+const SMOOTHING_S: f64 = 20.0;
+/// Share of the variance of claims that is common to neighbours in time, and so outlives the averaging.
+const COMMON_SHARE: f64 = super::residuals::COMMON_SHARE;
 
 impl Default for Pose {
     fn default() -> Self {
@@ -39,6 +42,7 @@ impl Default for Pose {
             variance: 0.0,
             agreeing: 0,
             witnesses: 0,
+            averaged_s: 0.0,
         }
     }
 }
@@ -58,8 +62,8 @@ impl Pose {
         (self.agreeing, self.witnesses)
     }
 
-    /// Takes one frame's beams, m, after `dt` seconds.
-    pub fn update(&mut self, beams: &[Vector2<f64>], witnesses: &[Witness], dt: f64) {
+    /// Takes one frame's beams, m, after `dt` seconds; each user claims every `period_s`.
+    pub fn update(&mut self, beams: &[Vector2<f64>], witnesses: &[Witness], dt: f64, period_s: f64) {
         self.witnesses = witnesses.len();
         let quorum = ((witnesses.len() as f64 * QUORUM).ceil() as usize).max(FEWEST);
         if witnesses.len() < quorum || beams.len() < quorum {
@@ -84,12 +88,17 @@ impl Pose {
         self.agreeing = offsets.len();
         let n = offsets.len() as f64;
         let target = median(&offsets);
-        let gain = if is_new { 1.0 } else { (dt / SMOOTHING_S).clamp(0.0, 1.0) };
-        self.shift += (target - self.shift) * gain;
-        // The median's variance is π/2 times the mean's. Claims change slowly against frames, so that smoothing over
-        // frames is not counted as averaging.
+        self.averaged_s = if is_new { dt } else { self.averaged_s + dt };
+        // The plain mean at first, then an exponential one.
+        let gain = (dt / self.averaged_s.min(SMOOTHING_S)).clamp(0.0, 1.0);
+        if dt > 0.0 || is_new {
+            self.shift += (target - self.shift) * if is_new { 1.0 } else { gain };
+        }
+        // The median's variance is π/2 times the mean's; an exponential mean over τ averages 2τ worth of claims.
         let mean_variance = witnesses.iter().map(|w| w.variance).sum::<f64>() / witnesses.len() as f64;
-        self.variance = std::f64::consts::FRAC_PI_2 * mean_variance / n;
+        let claims = (2.0 * self.averaged_s.min(SMOOTHING_S) / period_s.max(0.01)).max(1.0);
+        let kept = COMMON_SHARE + (1.0 - COMMON_SHARE) / claims;
+        self.variance = std::f64::consts::FRAC_PI_2 * mean_variance / n * kept;
     }
 }
 
@@ -151,7 +160,12 @@ mod tests {
 
     fn grid(n: usize) -> Vec<Vector2<f64>> {
         (0..n)
-            .map(|k| Vector2::new(37.0 * (k % 3) as f64 + 3.0 * k as f64, 41.0 * (k / 3) as f64 - 5.0 * k as f64))
+            .map(|k| {
+                Vector2::new(
+                    37.0 * (k % 3) as f64 + 3.0 * k as f64,
+                    41.0 * (k / 3) as f64 - 5.0 * k as f64,
+                )
+            })
             .collect()
     }
 
@@ -172,7 +186,7 @@ mod tests {
         let shift = Vector2::new(9.0, -4.0);
         let claims: Vec<_> = beams.iter().map(|b| b - shift).collect();
         let mut pose = Pose::default();
-        pose.update(&beams, &witnesses(&claims), 0.1);
+        pose.update(&beams, &witnesses(&claims), 0.1, 1.0);
         assert!((pose.shift() - shift).norm() < 1e-9);
         assert_eq!(pose.support(), (6, 6));
     }
@@ -187,7 +201,7 @@ mod tests {
             }
             let mut pose = Pose::default();
             for _ in 0..200 {
-                pose.update(&beams, &witnesses(&claims), 0.1);
+                pose.update(&beams, &witnesses(&claims), 0.1, 1.0);
             }
             assert!(pose.shift().norm() < 1e-9, "{lie}: {:?}", pose.shift());
         }
@@ -200,7 +214,7 @@ mod tests {
         beams.push(Vector2::new(60.0, 60.0));
         beams.remove(1);
         let mut pose = Pose::default();
-        pose.update(&beams, &witnesses(&claims), 0.1);
+        pose.update(&beams, &witnesses(&claims), 0.1, 1.0);
         assert_eq!(pose.shift(), Vector2::zeros());
         assert_eq!(pose.support(), (5, 6));
     }

@@ -9,12 +9,11 @@ use super::motion::largest_eigenvalue;
 pub(super) const WINDOWS: [usize; 6] = [1, 2, 4, 8, 16, 32];
 /// Share of a claim's variance that is common to its neighbours in time (satellite errors wander over minutes) and so
 /// does not average out.
-const COMMON_SHARE: f64 = 0.25;
+pub(super) const COMMON_SHARE: f64 = 0.25;
 
 /// One claim held against where its beam was at the claim's own time.
 #[derive(Clone, Copy, Debug)]
 struct Residual {
-    time: Timestamp,
     offset: Vector2<f64>,
     /// Covariance of the beam's position.
     beam: Matrix2<f64>,
@@ -38,12 +37,25 @@ pub(super) struct Excess {
     pub window: usize,
 }
 
-/// Surprise of an offset whose mean must lie within `radius_m` of zero. If it does, the chance of a surprise above s is at
-/// most e⁻ˢ: the distance from a convex set is no more than the distance from the point of it that is true, whose square
-/// is χ² of two degrees.
+/// Surprise of an offset whose mean must lie within `radius_m` of zero: if it does, the chance of a surprise above s is at
+/// most e⁻ˢ. Two bounds, of which the sharper holds. The distance from a convex set is no more than the distance from the
+/// point of it that is true, whose square is χ² of two degrees: s = t²/2, t in standard deviations beyond the disc. And
+/// where the disc is wide against the error, its edge is nearly straight: the worst honest offset lies on the edge, and
+/// averaging the one-sided tail Q over the transverse error (Laplace's method) gives Q(t)/√(1 − t·σ/radius).
 pub(super) fn surprise(offset: Vector2<f64>, cov: &Matrix2<f64>, radius_m: f64) -> f64 {
-    let outside = (offset.norm() - radius_m).max(0.0);
-    0.5 * outside * outside / largest_eigenvalue(cov).max(1e-12)
+    let sigma = largest_eigenvalue(cov).max(1e-12).sqrt();
+    let t = (offset.norm() - radius_m).max(0.0) / sigma;
+    let whole = 0.5 * t * t;
+    // Far out Q underflows; there the general bound is plenty.
+    if !(1.0..=30.0).contains(&t) {
+        return whole;
+    }
+    let curvature = 1.0 - t * sigma / radius_m;
+    if curvature < 0.5 {
+        return whole;
+    }
+    let tail = 0.5 * libm::erfc(t * std::f64::consts::FRAC_1_SQRT_2);
+    whole.max(-tail.ln() + 0.5 * curvature.ln())
 }
 
 impl Residuals {
@@ -54,12 +66,7 @@ impl Residuals {
 
     pub fn push(&mut self, time: Timestamp, offset: Vector2<f64>, beam: Matrix2<f64>, claim: f64) {
         self.newest = Some(time);
-        self.kept.push_back(Residual {
-            time,
-            offset,
-            beam,
-            claim,
-        });
+        self.kept.push_back(Residual { offset, beam, claim });
         if self.kept.len() > WINDOWS[WINDOWS.len() - 1] {
             self.kept.pop_front();
         }
@@ -105,9 +112,58 @@ impl Residuals {
                 .take(n)
                 .all(|r| r.offset.norm() <= radius_m + (r.claim + largest_eigenvalue(&r.beam)).sqrt())
     }
+}
 
-    /// Time of the oldest kept claim.
-    pub fn since(&self) -> Option<Timestamp> {
-        self.kept.front().map(|r| r.time)
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// P(|r| > radius + t·σ) for r ~ N((radius, 0), σ²) by the midpoint rule over the transverse error.
+    fn exact(t: f64, sigma: f64, radius: f64) -> f64 {
+        let reach = radius + t * sigma;
+        let upper = |x: f64| 0.5 * libm::erfc(x * std::f64::consts::FRAC_1_SQRT_2);
+        let (n, span) = (20_000, 10.0);
+        (0..n)
+            .map(|k| {
+                let y = -span + (f64::from(k) + 0.5) * 2.0 * span / f64::from(n);
+                let density = (-0.5 * y * y).exp() / std::f64::consts::TAU.sqrt();
+                let inside = (reach * reach - (sigma * y).powi(2)).max(0.0).sqrt();
+                density * (upper((inside - radius) / sigma) + upper((inside + radius) / sigma)) * 2.0 * span
+                    / f64::from(n)
+            })
+            .sum()
+    }
+
+    #[test]
+    fn a_surprise_bounds_its_own_probability() {
+        for sigma in [0.05, 0.2, 0.4, 1.0, 5.0] {
+            for t in [1.5, 3.0, 5.0, 7.0] {
+                let s = surprise(
+                    Vector2::new(5.0 + t * sigma, 0.0),
+                    &(Matrix2::identity() * sigma * sigma),
+                    5.0,
+                );
+                let p = exact(t, sigma, 5.0);
+                // Laplace's method drops terms of relative order (t·σ/radius)²: a few per cent here.
+                assert!(p <= 1.1 * (-s).exp(), "σ {sigma}, t {t}: {p} above e^-{s}");
+                assert!(s >= 0.5 * t * t);
+            }
+        }
+    }
+
+    #[test]
+    fn many_small_offsets_weigh_what_one_cannot() {
+        let stamp = Timestamp::UNIX_EPOCH;
+        let mut r = Residuals::default();
+        let none = Matrix2::zeros();
+        r.push(stamp, Vector2::new(6.0, 0.0), none, 0.25);
+        let one = r.excess(5.0, &none).surprise;
+        for _ in 0..15 {
+            r.push(stamp, Vector2::new(6.0, 0.0), none, 0.25);
+        }
+        let many = r.excess(5.0, &none);
+        assert!(many.surprise > 2.0 * one && many.window == 16, "{one} {many:?}");
+        // But not without limit: a common error does not average out.
+        assert!(many.surprise < 16.0 * one / 3.0);
     }
 }

@@ -8,7 +8,7 @@ const FAMILIES: f64 = 4.0;
 /// Log-likelihood levels that keep the operator's false alerts per month.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Thresholds {
-    tests_per_month: f64,
+    rate_hz: f64,
     allowed: f64,
 }
 
@@ -20,13 +20,22 @@ impl Thresholds {
             10.0
         };
         Self {
-            tests_per_month: rate * MONTH_S,
+            rate_hz: rate,
             allowed: config.false_alerts_per_month / FAMILIES,
         }
     }
 
     /// ln(1/α) for one of `each` like tests in every frame: by Bonferroni, `allowed` false ones a month in the mean.
     pub fn level(&self, each: f64) -> f64 {
-        (self.tests_per_month * each.max(1.0) / self.allowed).ln().max(3.0)
+        self.level_at(self.rate_hz, each)
+    }
+
+    /// The same for tests that happen every `period_s` (a claim's), at most once a frame.
+    pub fn level_every(&self, period_s: f64, each: f64) -> f64 {
+        self.level_at(self.rate_hz.min(1.0 / period_s.max(1e-6)), each)
+    }
+
+    fn level_at(&self, hz: f64, each: f64) -> f64 {
+        (hz * MONTH_S * each.max(1.0) / self.allowed).ln().max(3.0)
     }
 }

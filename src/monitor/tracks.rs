@@ -3,7 +3,7 @@ use std::collections::VecDeque;
 use jiff::Timestamp;
 use nalgebra::{Matrix2, Vector2};
 
-use super::motion::{Motion, mahalanobis2};
+use super::motion::{Motion, largest_eigenvalue, mahalanobis2};
 use crate::assign::assign;
 use crate::claims::seconds;
 use crate::estimate::{Estimate, Flags};
@@ -11,6 +11,8 @@ use crate::optics::Camera;
 
 /// Squared Mahalanobis gate of the association: χ² of two degrees exceeds it 4 times in 10⁶.
 const GATE: f64 = 25.0;
+/// Handicap, in squared Mahalanobis distance, of a track that has melted into another's spot.
+const SHARING: f64 = 4.0;
 /// Added to the gate per axis, m: a beam may turn between two frames faster than the motion model likes.
 const GATE_FLOOR_M: f64 = 0.4;
 /// What a fit's covariance leaves out (calibration, pixel gains), m.
@@ -31,7 +33,6 @@ pub(super) struct Detection {
     pub position: Vector2<f64>,
     pub cov: Matrix2<f64>,
     pub energy_j: f64,
-    pub energy_std_j: f64,
     pub flags: Flags,
     /// Distance within which a second emitter of like energy cannot be told apart, m.
     pub resolution_m: f64,
@@ -96,7 +97,6 @@ impl Detection {
                     position: Vector2::new(e.x_m, e.y_m),
                     cov,
                     energy_j: e.energy_j,
-                    energy_std_j: e.energy_std_j,
                     flags: e.flags,
                     resolution_m: resolution_m(camera, e.energy_j),
                     ghost: 0.0,
@@ -121,23 +121,23 @@ fn resolution_m(camera: &Camera, energy_j: f64) -> f64 {
     apart.max(0.5 * pitch).min(3.0 * sigma) * camera.ground_scale()
 }
 
-/// How probable it is that detection `i` is spurious: rare on its own, common where a spot may have been split in two or
-/// the frame is not what the model says.
+/// How probable it is that detection `i` is spurious: rare on its own, common where one spot may have been split in two.
+/// Even there it is no excuse for silence: nine detections in ten frames outweigh it, so that nobody gains more than a second
+/// by making the fit doubtful.
 fn ghost(detections: &[Detection], i: usize, camera: &Camera) -> f64 {
     const ALONE: f64 = 1e-3;
     const NEIGHBOURED: f64 = 1e-2;
-    const DOUBTFUL: f64 = 0.3;
+    const POORLY_FITTED: f64 = 0.03;
+    const UNRESOLVED: f64 = 0.1;
     let d = &detections[i];
-    let doubtful = Flags::UNRESOLVED | Flags::NO_CONVERGENCE | Flags::POOR_FIT;
-    if d.flags.intersects(doubtful) {
-        return DOUBTFUL;
-    }
     let nearest = (0..detections.len())
         .filter(|&j| j != i)
         .map(|j| (detections[j].position - d.position).norm())
         .fold(f64::INFINITY, f64::min);
-    if nearest < d.resolution_m {
-        DOUBTFUL
+    if d.flags.contains(Flags::UNRESOLVED) || nearest < d.resolution_m {
+        UNRESOLVED
+    } else if d.flags.intersects(Flags::NO_CONVERGENCE | Flags::POOR_FIT) {
+        POORLY_FITTED
     } else if nearest < 3.0 * camera.spot_sigma_m * camera.ground_scale() {
         NEIGHBOURED
     } else {
@@ -178,6 +178,7 @@ impl Track {
         self.motion.update(detection.position, detection.cov);
         self.last_hit = time;
         self.hit = true;
+        self.merged = false;
         self.missed_s = 0.0;
         self.score = (self.score + (DETECTED / detection.ghost).ln()).min(ceiling);
         self.detection = detection.clone();
@@ -193,6 +194,7 @@ impl Track {
 
     fn miss(&mut self, dt: f64, ghost: f64) {
         self.hit = false;
+        self.merged = false;
         self.missed_s += dt;
         self.score += ((1.0 - DETECTED) / (1.0 - ghost)).ln();
         self.note(false);
@@ -235,7 +237,6 @@ impl Tracks {
         }
         for track in &mut self.all {
             track.motion.predict(elapsed);
-            track.merged = false;
         }
         let mut owner: Vec<Option<usize>> = vec![None; detections.len()];
         // Confirmed tracks choose first: a newcomer's wide gate must not take an old track's detection.
@@ -246,8 +247,11 @@ impl Tracks {
             let columns: Vec<usize> = (0..detections.len()).filter(|&j| owner[j].is_none()).collect();
             let floor = Matrix2::identity() * GATE_FLOOR_M.powi(2);
             let matching = assign(rows.len(), columns.len(), GATE, |i, j| {
-                let (motion, d) = (&self.all[rows[i]].motion, &detections[columns[j]]);
-                mahalanobis2(d.position - motion.position(), motion.position_cov() + d.cov + floor)
+                let (track, d) = (&self.all[rows[i]], &detections[columns[j]]);
+                let spread = track.motion.position_cov() + d.cov + floor;
+                // A spot that two beams share stays with the one it was followed by.
+                let shares = if track.merged { SHARING } else { 0.0 };
+                mahalanobis2(d.position - track.motion.position(), spread) + shares
             });
             for (i, j) in matching.pairs {
                 owner[columns[j]] = Some(rows[i]);
@@ -259,10 +263,12 @@ impl Tracks {
                 hit[i] = Some(j);
             }
         }
+        // Spots that a known beam is followed by: only into such a one can another beam melt.
+        let followed: Vec<bool> = owner.iter().map(|o| o.is_some_and(|i| self.all[i].confirmed)).collect();
         for (track, found) in self.all.iter_mut().zip(&hit) {
             match *found {
                 Some(j) => track.take(time, &detections[j], self.score_ceiling),
-                None => track.miss_or_merge(detections, &owner, dt_s),
+                None => track.miss_or_merge(detections, &followed, dt_s),
             }
         }
         self.all.retain(|t| !t.is_over());
@@ -288,16 +294,16 @@ impl Tracks {
 impl Track {
     /// Without a detection of its own the beam may have melted into a neighbour's spot: it is then known to be there, as
     /// well as the two can be told apart.
-    fn miss_or_merge(&mut self, detections: &[Detection], owner: &[Option<usize>], dt_s: f64) {
+    fn miss_or_merge(&mut self, detections: &[Detection], followed: &[bool], dt_s: f64) {
+        let was_there = self.confirmed && (self.hit || self.merged);
         let here = self.motion.position();
-        let spread = self.motion.position_cov();
-        let neighbour = (0..detections.len()).filter(|&j| owner[j].is_some()).find(|&j| {
+        let spread = largest_eigenvalue(&self.motion.position_cov()).sqrt().min(1.0);
+        let neighbour = (0..detections.len()).filter(|&j| was_there && followed[j]).find(|&j| {
             let d = &detections[j];
-            let r = Matrix2::identity() * (0.5 * d.resolution_m + GATE_FLOOR_M).powi(2);
-            mahalanobis2(d.position - here, r + spread.map(|s| s.min(4.0))) < 9.0
+            (d.position - here).norm() < d.resolution_m + GATE_FLOOR_M + 3.0 * spread
         });
         match neighbour {
-            Some(j) if self.confirmed => {
+            Some(j) => {
                 let d = &detections[j];
                 self.motion
                     .update(d.position, d.cov + Matrix2::identity() * d.resolution_m.powi(2));
@@ -306,7 +312,7 @@ impl Track {
                 // Bounds a track that shadows another one: it lives a few times longer than one lost in the open.
                 self.missed_s += 0.2 * dt_s;
             }
-            _ => self.miss(dt_s, self.detection.ghost),
+            None => self.miss(dt_s, self.detection.ghost),
         }
     }
 }

@@ -17,6 +17,7 @@ use super::{
 };
 use crate::assign::assign;
 use crate::claims::{Store, seconds};
+use crate::estimate::Flags;
 use crate::optics::Camera;
 
 /// Squared Mahalanobis distance within which a beam can answer a claim.
@@ -197,9 +198,15 @@ impl Monitor {
 
     /// Learns our own pose error from the frame and moves the claims by it.
     fn find_pose(&mut self, asserted: &mut [Asserted], dt: f64) {
-        let beams: Vec<Vector2<f64>> = self.tracks.all.iter().filter(|t| t.hit).map(|t| t.motion.position()).collect();
+        let beams: Vec<Vector2<f64>> = self
+            .tracks
+            .all
+            .iter()
+            .filter(|t| t.hit)
+            .map(|t| t.motion.position())
+            .collect();
         let witnesses: Vec<_> = asserted.iter().filter(|a| a.expected).map(Asserted::witness).collect();
-        self.pose.update(&beams, &witnesses, dt);
+        self.pose.update(&beams, &witnesses, dt, self.period_s.unwrap_or(1.0));
         for a in asserted {
             a.position += self.pose.shift();
         }
@@ -475,7 +482,7 @@ impl Monitor {
         let tolerated = self.config.tolerated_distance_m;
         let floor = self.floor();
         let each = (asserted.len() * super::residuals::WINDOWS.len()) as f64;
-        let level = self.thresholds.level(each);
+        let level = self.thresholds.level_every(self.period_s.unwrap_or(0.0), each);
         let level_unseen = self.thresholds.level(asserted.len() as f64);
         for (a, answer) in asserted.iter().zip(answers) {
             let name = a.claim.user.clone();
@@ -598,14 +605,21 @@ impl Monitor {
 
     fn watch_pose(&mut self, now: Timestamp) {
         let cause = Cause::Whole(AlertKind::PoseInconsistent);
-        let limit = self.config.pose_limit_m.unwrap_or(0.5 * self.config.tolerated_distance_m);
+        let limit = self
+            .config
+            .pose_limit_m
+            .unwrap_or(0.5 * self.config.tolerated_distance_m);
         let shift = self.pose.shift();
         let (agreeing, of) = self.pose.support();
         let surprise = surprise(shift, &self.floor(), limit);
         let level = self.thresholds.level(1.0);
         let is_open = self.book.is_open(&cause);
         if surprise > level || (is_open && shift.norm() > 0.9 * limit) {
-            let severity = if shift.norm() > 4.0 * limit { Severity::Critical } else { Severity::Warning };
+            let severity = if shift.norm() > 4.0 * limit {
+                Severity::Critical
+            } else {
+                Severity::Warning
+            };
             let evidence = json!({
                 "shift_m": [shift.x, shift.y],
                 "limit_m": limit,
@@ -614,7 +628,8 @@ impl Monitor {
                 "surprise": surprise,
                 "threshold": level,
             });
-            self.book.report(&cause, Finding::new(severity, evidence), now, self.frame);
+            self.book
+                .report(&cause, Finding::new(severity, evidence), now, self.frame);
         } else {
             self.book.absent(&cause, now);
         }
@@ -660,7 +675,10 @@ impl Monitor {
                     energy_j: t.detection.energy_j,
                     user,
                     status,
-                    flags: t.detection.flags.names(),
+                    flags: match t.merged {
+                        true => (t.detection.flags | Flags::UNRESOLVED).names(),
+                        false => t.detection.flags.names(),
+                    },
                 }
             })
             .collect();
