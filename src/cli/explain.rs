@@ -1,10 +1,133 @@
-use super::Outcome;
+use std::fmt::Write;
+use std::hint::black_box;
+use std::path::PathBuf;
+use std::time::{Duration, Instant};
+
+use super::{Failure, Outcome, picture};
+use crate::scene::{Effect, Plan, Scene, Status};
 
 #[derive(Debug, clap::Args)]
 pub struct Args {
-    scene: std::path::PathBuf,
+    /// A scene file
+    scene: PathBuf,
+    /// Draw a frame with its truth into this SVG file
+    #[arg(long, value_name = "FILE.svg")]
+    picture: Option<PathBuf>,
+    /// Which frame to draw
+    #[arg(long, default_value_t = 0)]
+    frame: u64,
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
 }
 
-pub fn run(_args: Args) -> Outcome {
-    Err(super::Failure::other(anyhow::anyhow!("explain is not built yet")))
+/// Rounds of timing; the median is reported.
+const ROUNDS: usize = 15;
+/// Time that one round gives the whole plan.
+const ROUND: Duration = Duration::from_millis(4);
+
+pub fn run(args: Args) -> Outcome {
+    let scene = Scene::load(&args.scene).map_err(Failure::config)?;
+    let plan = Plan::compile(&scene, args.seed).map_err(Failure::config)?;
+    if let Some(path) = &args.picture {
+        picture::draw(path, &plan, args.frame).map_err(Failure::Other)?;
+    }
+    print!("{}", table(&scene, &plan, args.seed).map_err(Failure::config)?);
+    if let Some(path) = &args.picture {
+        println!("\nFrame {} is drawn in {}", args.frame, path.display());
+    }
+    Ok(())
+}
+
+fn table(scene: &Scene, plan: &Plan, seed: u64) -> Result<String, crate::scene::Error> {
+    let costs = costs(scene, plan, seed)?;
+    let camera = plan.camera();
+    let mut text = String::new();
+    let about = if scene.about.is_empty() {
+        "A scene"
+    } else {
+        &scene.about
+    };
+    let _ = writeln!(
+        text,
+        "{about}: {} × {} pixels, {} frames/s\n",
+        camera.x.n,
+        camera.y.n,
+        plan.rate_hz()
+    );
+    let _ = writeln!(text, "{:<16} {:<16} {:>12}  why", "effect", "", "µs a frame");
+    for decision in plan.decisions() {
+        let cost = costs.each.iter().find(|c| c.0 == decision.effect).map(|c| c.1);
+        let cost = match (decision.status, cost) {
+            (Status::On | Status::Folded, Some(us)) if us.abs() < costs.resolution => {
+                format!("< {:.1}", costs.resolution)
+            }
+            (Status::On | Status::Folded, Some(us)) => format!("{us:.1}"),
+            (Status::On | Status::Folded, None) => "in the rest".to_owned(),
+            (Status::Off | Status::BelowTolerance, _) => "0".to_owned(),
+        };
+        let (name, status) = (decision.effect.name(), decision.status.name());
+        let _ = writeln!(text, "{name:<16} {status:<16} {cost:>12}  {}", decision.reason);
+    }
+    let _ = writeln!(
+        text,
+        "\nA whole frame takes {:.1} µs on one thread. An effect's cost is what the frame gets cheaper",
+        costs.whole
+    );
+    let _ = writeln!(
+        text,
+        "without it (median of {ROUNDS} rounds); costs do not add up where effects share work."
+    );
+    Ok(text)
+}
+
+/// Microseconds a frame.
+struct Costs {
+    whole: f64,
+    each: Vec<(Effect, f64)>,
+    /// Half the interquartile range of the whole frame's time over the rounds, at least 0.1.
+    resolution: f64,
+}
+
+/// Times the plan against the plans of the scene without one effect each, in turns, so that a slow moment hits all alike.
+fn costs(scene: &Scene, plan: &Plan, seed: u64) -> Result<Costs, crate::scene::Error> {
+    let simulated = plan
+        .decisions()
+        .iter()
+        .filter(|d| matches!(d.status, Status::On | Status::Folded));
+    let removable = simulated.map(|d| d.effect).filter(|e| Effect::TABLES.contains(e));
+    let without: Vec<(Effect, Plan)> = removable
+        .map(|effect| Ok((effect, Plan::compile(&scene.without(effect), seed)?)))
+        .collect::<Result<_, crate::scene::Error>>()?;
+    let time = |plan: &Plan, frames: u64| {
+        let mut maker = plan.maker();
+        let start = Instant::now();
+        for k in 0..frames {
+            black_box(maker.frame(k));
+        }
+        start.elapsed().as_secs_f64() * 1e6 / frames as f64
+    };
+    let first = time(plan, 20);
+    let frames = (ROUND.as_secs_f64() * 1e6 / first).clamp(2.0, 500.0) as u64;
+    let mut whole = Vec::with_capacity(ROUNDS);
+    let mut saved = vec![Vec::with_capacity(ROUNDS); without.len()];
+    for _ in 0..ROUNDS {
+        for (saved, (_, other)) in saved.iter_mut().zip(&without) {
+            // A pair at a time: the machine's pace drifts over a round.
+            let with = time(plan, frames);
+            saved.push(with - time(other, frames));
+            whole.push(with);
+        }
+        whole.push(time(plan, frames));
+    }
+    whole.sort_by(f64::total_cmp);
+    let quartile = |q: usize| whole[whole.len() * q / 4];
+    let median = |mut values: Vec<f64>| {
+        values.sort_by(f64::total_cmp);
+        values[values.len() / 2]
+    };
+    Ok(Costs {
+        whole: quartile(2),
+        each: without.iter().map(|w| w.0).zip(saved.into_iter().map(median)).collect(),
+        resolution: (0.5 * (quartile(3) - quartile(1))).max(0.1),
+    })
 }

@@ -8,9 +8,11 @@ mod explain;
 mod failure;
 mod locate;
 mod man;
+mod picture;
 mod review;
 mod run;
 mod simulate;
+mod simulated_recording;
 mod tradeoff;
 
 use std::process::ExitCode;

@@ -4,10 +4,10 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use indicatif::{ProgressBar, ProgressStyle};
 use jiff::Timestamp;
-use rayon::prelude::*;
 
+use super::simulated_recording::Recording;
 use super::{Failure, Outcome};
-use crate::scene::{Element, Plan, Recording, Scene, SimulatedFrame};
+use crate::scene::{Plan, Scene};
 
 #[derive(Debug, clap::Args)]
 pub struct Args {
@@ -20,21 +20,12 @@ pub struct Args {
     /// The same seed gives the same frames
     #[arg(long, default_value_t = 0)]
     seed: u64,
-    /// Folder for frames.npy, truth.ndjson and claims.ndjson; made when it is not there, files in it are replaced
+    /// Folder for frames.npy (f8, J), truth.ndjson and claims.ndjson; made when it is not there, files are replaced
     #[arg(long)]
     out: PathBuf,
     /// Time of frame 0
     #[arg(long, default_value = "2026-01-01T00:00:00Z")]
     start: Timestamp,
-    /// Numbers in frames.npy: f4 is half the size, f8 the simulator's own bits
-    #[arg(long, value_enum, default_value_t = Dtype::F4)]
-    dtype: Dtype,
-}
-
-#[derive(Clone, Copy, Debug, clap::ValueEnum)]
-enum Dtype {
-    F4,
-    F8,
 }
 
 /// Pixels held in memory at a time, over all frames of a batch.
@@ -44,13 +35,9 @@ pub fn run(args: Args) -> Outcome {
     let scene = Scene::load(&args.scene).map_err(Failure::config)?;
     let plan = Plan::compile(&scene, args.seed).map_err(Failure::config)?;
     let plan = plan.starting_at(args.start);
-    let element = match args.dtype {
-        Dtype::F4 => Element::F4,
-        Dtype::F8 => Element::F8,
-    };
     let interrupted = watch_for_interrupt().map_err(Failure::other)?;
     let shape = plan.camera().shape();
-    let mut recording = Recording::create(&args.out, shape, element).map_err(Failure::other)?;
+    let mut recording = Recording::create(&args.out, shape).map_err(Failure::other)?;
 
     let style = "{bar:40} {pos}/{len} frames, {per_sec}, {eta} left";
     let bar = ProgressBar::new(args.frames).with_style(ProgressStyle::with_template(style).expect("a valid template"));
@@ -58,12 +45,7 @@ pub fn run(args: Args) -> Outcome {
     let mut next = 0;
     while next < args.frames && !interrupted.load(Ordering::Relaxed) {
         let end = args.frames.min(next + batch);
-        let frames: Vec<SimulatedFrame> = (next..end).into_par_iter().map(|k| plan.frame(k)).collect();
-        let written = frames
-            .iter()
-            .try_for_each(|f| recording.append(f))
-            .and_then(|()| recording.commit());
-        if let Err(e) = written {
+        if let Err(e) = recording.append(&plan.frames(next, end)) {
             bar.abandon();
             let kept = recording.frames();
             return Err(Failure::other(anyhow::Error::new(e).context(format!(

@@ -3,7 +3,7 @@ use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
-use super::effects::Effects;
+use super::effects::{Effect, Effects};
 use super::error::{Error, Field};
 use super::motion::{Motion, Schedule};
 use crate::{config, optics};
@@ -16,6 +16,8 @@ pub struct Scene {
     /// What the scene is for, in a sentence.
     pub about: String,
     pub rate_hz: f64,
+    /// Effects that change no pixel by more than this share of σ_n may be left out.
+    pub tolerance: f64,
     pub optics: optics::Config,
     pub link: LinkConfig,
     pub random_emitters: Option<RandomEmittersConfig>,
@@ -88,6 +90,13 @@ pub struct ClaimsConfig {
     pub period_s: f64,
     /// The standard deviation per axis that a claim states.
     pub sigma_m: Option<f64>,
+    /// Standard deviation per axis of the claimed position's error.
+    pub noise_m: f64,
+    /// A claim reaches the log this long after the time that it states, and up to `delay_spread_s` longer.
+    pub delay_s: f64,
+    pub delay_spread_s: f64,
+    /// Share of claims that never arrive.
+    pub lost: f64,
 }
 
 fn yes() -> bool {
@@ -99,6 +108,7 @@ impl Default for Scene {
         Self {
             about: String::new(),
             rate_hz: 1.0,
+            tolerance: 0.0,
             optics: optics::Config::default(),
             link: LinkConfig::default(),
             random_emitters: None,
@@ -128,6 +138,10 @@ impl Default for ClaimsConfig {
         Self {
             period_s: 1.0,
             sigma_m: Some(0.3),
+            noise_m: 0.0,
+            delay_s: 0.0,
+            delay_spread_s: 0.0,
+            lost: 0.0,
         }
     }
 }
@@ -154,19 +168,27 @@ impl Scene {
         toml::from_str(include_str!("../../config/scenes/builtin.toml")).expect("a test reads the embedded scene")
     }
 
+    /// The same scene without `effect`.
+    pub fn without(&self, effect: Effect) -> Self {
+        let mut scene = self.clone();
+        scene.effects.remove(effect);
+        if effect == Effect::Saturation {
+            scene.optics.saturation_j = None;
+        }
+        scene
+    }
+
     /// Checks every field that the optics do not check themselves.
     pub fn validate(&self) -> Result<(), Error> {
         let root = Field::new("");
         root.at("rate_hz").positive(self.rate_hz)?;
+        root.at("tolerance").non_negative(self.tolerance)?;
         self.optics.camera()?;
         self.link.validate(&root.at("link"), self.rate_hz)?;
         if let Some(random) = &self.random_emitters {
             random.validate(&root.at("random_emitters"))?;
         }
-        root.at("claims").at("period_s").positive(self.claims.period_s)?;
-        if let Some(sigma) = self.claims.sigma_m {
-            root.at("claims").at("sigma_m").positive(sigma)?;
-        }
+        self.claims.validate(&root.at("claims"))?;
         self.validate_names(&root)?;
         for (k, user) in self.user.iter().enumerate() {
             user.validate(&root.item("user", k))?;
@@ -225,19 +247,45 @@ fn validate_power(power_w: Option<f64>, field: &Field) -> Result<(), Error> {
 }
 
 impl LinkConfig {
+    /// T_int/T_coh, rounded, at least 1.
+    pub(super) fn coherence_times(&self) -> u32 {
+        (self.integration_time_s / self.coherence_time_s).round().max(1.0) as u32
+    }
+
     fn validate(&self, field: &Field, rate_hz: f64) -> Result<(), Error> {
         field.at("power_w").positive(self.power_w)?;
         field.at("beam_radius_m").positive(self.beam_radius_m)?;
         field.at("transmittance").fraction(self.transmittance)?;
         field.at("efficiency").fraction(self.efficiency)?;
-        field.at("coherence_time_s").positive(self.coherence_time_s)?;
+        let coherence = field.at("coherence_time_s").positive(self.coherence_time_s)?;
         let exposure = field.at("integration_time_s").positive(self.integration_time_s)?;
+        if exposure / coherence > 1e4 {
+            return Err(field
+                .at("coherence_time_s")
+                .refuse("at least integration_time_s/10000", coherence));
+        }
         if exposure * rate_hz > 1.0 + 1e-9 {
             return Err(field
                 .at("integration_time_s")
                 .refuse("at most 1/rate_hz, the time from frame to frame", exposure));
         }
         Ok(())
+    }
+}
+
+impl ClaimsConfig {
+    fn validate(&self, field: &Field) -> Result<(), Error> {
+        field.at("period_s").positive(self.period_s)?;
+        if let Some(sigma) = self.sigma_m {
+            field.at("sigma_m").positive(sigma)?;
+        }
+        field.at("noise_m").non_negative(self.noise_m)?;
+        for (name, delay) in [("delay_s", self.delay_s), ("delay_spread_s", self.delay_spread_s)] {
+            if field.at(name).non_negative(delay)? > 1000.0 * self.period_s {
+                return Err(field.at(name).refuse("at most 1000 periods", delay));
+            }
+        }
+        field.at("lost").fraction(self.lost).map(drop)
     }
 }
 

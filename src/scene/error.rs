@@ -41,9 +41,14 @@ impl Field {
         }
     }
 
+    /// `self[k]`.
+    pub(super) fn index(&self, k: usize) -> Self {
+        Self(format!("{}[{k}]", self.0))
+    }
+
     /// `self.name[k]`.
     pub(super) fn item(&self, name: &str, k: usize) -> Self {
-        self.at(&format!("{name}[{k}]"))
+        self.at(name).index(k)
     }
 
     pub(super) fn refuse(&self, expected: &'static str, found: impl std::fmt::Debug) -> Error {

@@ -1,24 +1,27 @@
 //! Floor 1: scene file → plan (only the effects it calls for) → frames with truth. Never uses `estimate`: the simulator
 //! must stay an independent judge of the estimator.
 
+mod average;
 mod config;
+mod detector;
 mod effects;
 mod error;
+mod light;
 mod motion;
 mod network;
 mod plan;
 mod population;
 mod process;
-mod recording;
 mod render;
+mod report;
 mod stream;
 mod truth;
 
 pub use config::{ClaimsConfig, IntruderConfig, LinkConfig, RandomEmittersConfig, Scene, UserConfig};
-pub use effects::Effects;
+pub use effects::*;
 pub use error::Error;
-pub use motion::{Motion, Schedule};
-pub use plan::Plan;
-pub use recording::{Element, Recording, WriteError};
-pub use stream::{Effect, Ledger};
+pub use motion::{Beside, Drift, Motion, Roam, Schedule, Walk};
+pub use plan::{Maker, Plan};
+pub use report::{Decision, Status};
+pub use stream::Ledger;
 pub use truth::{EmitterTruth, Role, SimulatedFrame, Truth};

@@ -1,15 +1,19 @@
-//! What the access network logs about its users.
+//! What the access network logs about its users: late, lost, noisy or plainly false, as the scene has it.
 
+use rand::RngExt;
+use rand_distr::{Distribution, StandardNormal};
+
+use super::Effect;
 use super::config::ClaimsConfig;
-use super::population::Population;
+use super::population::{Actor, Population};
+use super::report::{Decisions, Status};
+use super::stream::{Ledger, Streams};
 use super::truth::Role;
 use crate::claim::ClaimState;
 
 /// A claim before it has a calendar date.
 #[derive(Clone, Debug)]
 pub(super) struct Statement {
-    /// Arrival in the log, s.
-    pub arrival: f64,
     /// The time that it states, s.
     pub stated: f64,
     pub actor: usize,
@@ -23,7 +27,19 @@ pub(super) struct Network {
 }
 
 impl Network {
-    pub fn new(config: ClaimsConfig) -> Self {
+    pub fn new(config: ClaimsConfig, has_users: bool, decisions: &mut Decisions) -> Self {
+        let late = config.delay_s > 0.0 || config.delay_spread_s > 0.0;
+        for (effect, on) in [
+            (Effect::ClaimDelay, late),
+            (Effect::ClaimLoss, config.lost > 0.0),
+            (Effect::ClaimNoise, config.noise_m > 0.0),
+        ] {
+            match (on, has_users) {
+                (true, true) => decisions.note(effect, Status::On, "one draw a claim"),
+                (true, false) => decisions.note(effect, Status::Off, "nobody claims"),
+                (false, _) => decisions.note(effect, Status::Off, "not in the scene"),
+            }
+        }
         Self { config }
     }
 
@@ -32,32 +48,78 @@ impl Network {
     }
 
     /// Statements that arrive after `after` and not after `until` (s), in the order of their arrival.
-    pub fn arrivals(&self, population: &Population, after: f64, until: f64) -> Vec<Statement> {
-        let mut found = Vec::new();
-        for (actor, who) in population.actors.iter().enumerate() {
-            if who.role != Role::User {
+    pub fn arrivals(
+        &self,
+        population: &Population,
+        after: f64,
+        until: f64,
+        streams: Streams,
+        ledger: &Ledger,
+    ) -> Vec<Statement> {
+        let latest = self.config.delay_s + self.config.delay_spread_s;
+        let mut found: Vec<(f64, Statement)> = Vec::new();
+        for (index, actor) in population.actors.iter().enumerate() {
+            if actor.role != Role::User {
                 continue;
             }
-            for (start, end) in who.present.sessions(after, until) {
-                let period = self.config.period_s;
-                let first = ((after - start) / period).floor().max(0.0) as u64;
-                let ticks = (first..)
-                    .map(|n| start + n as f64 * period)
-                    .take_while(|t| *t <= until && *t < end);
-                let active = ticks.map(|t| (t, ClaimState::Active));
-                let ended = (end <= until).then_some((end, ClaimState::Ended));
-                for (stated, state) in active.chain(ended).filter(|(t, _)| *t > after) {
-                    found.push(Statement {
-                        arrival: stated,
+            for (stated, state) in self.statements(actor, after - latest, until) {
+                let Some(arrival) = self.arrival(actor, stated, streams, ledger) else {
+                    continue;
+                };
+                if arrival > after && arrival <= until {
+                    let at_m = self.heard(actor, population.claimed(index, stated), stated, streams, ledger);
+                    let statement = Statement {
                         stated,
-                        actor,
-                        at_m: population.claimed(actor, stated),
+                        actor: index,
+                        at_m,
                         state,
-                    });
+                    };
+                    found.push((arrival, statement));
                 }
             }
         }
-        found.sort_by(|a, b| a.arrival.total_cmp(&b.arrival).then(a.actor.cmp(&b.actor)));
+        found.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.actor.cmp(&b.1.actor)));
+        found.into_iter().map(|(_, statement)| statement).collect()
+    }
+
+    /// What a user states after `after` and not after `until`: where it is, from the start of each session on, and the end.
+    fn statements(&self, actor: &Actor, after: f64, until: f64) -> Vec<(f64, ClaimState)> {
+        let period = self.config.period_s;
+        let mut found = Vec::new();
+        for (start, end) in actor.present.sessions(after, until) {
+            let first = ((after - start) / period).floor().max(0.0) as u64;
+            let ticks = (first..).map(|n| start + n as f64 * period);
+            let active = ticks.take_while(|t| *t <= until && *t < end).filter(|t| *t > after);
+            found.extend(active.map(|t| (t, ClaimState::Active)));
+            if end > after && end <= until {
+                found.push((end, ClaimState::Ended));
+            }
+        }
         found
+    }
+
+    /// When a statement reaches the log, if ever.
+    fn arrival(&self, actor: &Actor, stated: f64, streams: Streams, ledger: &Ledger) -> Option<f64> {
+        let open = |effect| streams.open(effect, actor.entity, stated.to_bits(), ledger);
+        if self.config.lost > 0.0 && open(Effect::ClaimLoss).random::<f64>() < self.config.lost {
+            return None;
+        }
+        let mut arrival = stated + self.config.delay_s;
+        if self.config.delay_spread_s > 0.0 {
+            arrival += self.config.delay_spread_s * open(Effect::ClaimDelay).random::<f64>();
+        }
+        Some(arrival)
+    }
+
+    /// The position that the log gets for the one that was stated, m.
+    fn heard(&self, actor: &Actor, at_m: [f64; 2], stated: f64, streams: Streams, ledger: &Ledger) -> [f64; 2] {
+        if self.config.noise_m == 0.0 {
+            return at_m;
+        }
+        let mut stream = streams.open(Effect::ClaimNoise, actor.entity, stated.to_bits(), ledger);
+        at_m.map(|p| {
+            let z: f64 = StandardNormal.sample(&mut *stream);
+            p + self.config.noise_m * z
+        })
     }
 }

@@ -1,19 +1,26 @@
+use std::sync::Arc;
+
 use jiff::{SignedDuration, Timestamp};
 use ndarray::Array2;
+use rayon::prelude::*;
 
 use super::config::Scene;
-use super::effects::{Effects, ThermalNoise};
+use super::detector::Detector;
+use super::effects::{Fate, FrameLoss};
 use super::error::Error;
-use super::network::Network;
+use super::light::{Light, Moment, Shot};
+use super::network::{Network, Statement};
 use super::population::{Beam, Population};
 use super::render::{Renderer, Spot};
-use super::stream::{Effect, Ledger, Streams};
+use super::report::{Decision, Decisions, Status};
+use super::stream::{Ledger, Streams};
 use super::truth::{EmitterTruth, Role, SimulatedFrame, Truth};
+use super::{Effect, report};
 use crate::claim::Claim;
 use crate::frame::Frame;
-use crate::optics::Camera;
+use crate::optics::{Calibration, Camera};
 
-/// A scene compiled, with a seed, into the chain that makes its frames.
+/// A scene compiled, with a seed, into the cheapest chain that makes its frames.
 #[derive(Debug)]
 pub struct Plan {
     camera: Camera,
@@ -22,20 +29,25 @@ pub struct Plan {
     streams: Streams,
     population: Population,
     network: Network,
-    link: Link,
-    noise_std_j: Option<f64>,
+    light: Light,
+    detector: Detector,
+    frame_loss: Option<FrameLoss>,
+    decisions: Vec<Decision>,
 }
 
-/// From a beam to the energy of its spot.
+/// Makes frames of a plan one after the other, keeping its room to work in.
 #[derive(Debug)]
-struct Link {
-    /// T_int · η_s · τ · (2/(π w_z²)) · π r_a²: energy per watt of a beam that is straight above and does not miss, J/W.
-    straight_j_per_w: f64,
-    beam_radius_m: f64,
-    /// T_int/T_coh.
-    coherence_times: u32,
-    effects: Effects,
+pub struct Maker<'p> {
+    plan: &'p Plan,
+    ledger: Ledger,
+    beams: Vec<Beam>,
+    spots: Vec<Spot>,
+    shot: Shot,
+    renderer: Renderer,
 }
+
+/// Frames that a repeated frame looks back for one that was delivered.
+const LOOK_BACK: u64 = 1000;
 
 impl Plan {
     /// # Errors
@@ -44,25 +56,34 @@ impl Plan {
         scene.validate()?;
         let camera = scene.optics.camera()?;
         let streams = Streams { seed };
-        let link = &scene.link;
-        let thermal = &scene.effects.thermal_noise;
+        let ledger = Ledger::default();
+        let thermal = scene.effects.thermal_noise.as_ref().and_then(|t| t.std_j);
+        let mut decisions = Decisions::new(thermal.unwrap_or(camera.noise_std_j), scene.tolerance);
+        let population = Population::new(scene, streams, &ledger);
+        population.explain(&mut decisions);
+        let network = Network::new(scene.claims.clone(), !scene.user.is_empty(), &mut decisions);
+        let blur = format!("σ_eff = {:.4} mm, computed once", camera.spot_sigma_m * 1e3);
+        decisions.note(Effect::Blur, Status::Folded, blur);
+        let light = Light::new(scene, &camera, &population, streams, &mut decisions)?;
+        let detector = Detector::new(scene, &light, streams, &mut decisions)?;
+        let frame_loss = decisions
+            .weigh(Effect::FrameLoss, &scene.effects.frame_loss, |_| f64::INFINITY)
+            .cloned();
+        if frame_loss.is_some() {
+            decisions.note(Effect::FrameLoss, Status::On, "one draw a frame");
+        }
+        let mut decisions = decisions.made;
+        decisions.sort_by_key(|d| d.effect);
         Ok(Self {
             rate_hz: scene.rate_hz,
             start: Timestamp::UNIX_EPOCH,
             streams,
-            population: Population::new(scene, streams, &Ledger::default()),
-            network: Network::new(scene.claims.clone()),
-            noise_std_j: thermal.as_ref().map(|t| t.std_j.unwrap_or(camera.noise_std_j)),
-            link: Link {
-                straight_j_per_w: link.integration_time_s
-                    * link.efficiency
-                    * link.transmittance
-                    * 2.0
-                    * (camera.lens_radius_m / link.beam_radius_m).powi(2),
-                beam_radius_m: link.beam_radius_m,
-                coherence_times: (link.integration_time_s / link.coherence_time_s).round().max(1.0) as u32,
-                effects: scene.effects.clone(),
-            },
+            population,
+            network,
+            light,
+            detector,
+            frame_loss,
+            decisions,
             camera,
         })
     }
@@ -72,12 +93,30 @@ impl Plan {
         Self { start, ..self }
     }
 
+    /// The camera as its data sheet, `[optics]`, has it.
     pub fn camera(&self) -> &Camera {
         &self.camera
     }
 
+    /// What a perfect calibration of the camera would find.
+    pub fn calibration(&self) -> Calibration {
+        let lens = &self.light.lens;
+        Calibration {
+            distortion: lens.distortion,
+            spot_sigma_m: lens.spot_sigma_m,
+            spot_growth: lens.spot_growth,
+            noise_std_j: self.detector.noise_std_j().unwrap_or(lens.noise_std_j),
+            pixels: self.detector.maps(lens.shape()).map(Arc::new),
+        }
+    }
+
     pub fn rate_hz(&self) -> f64 {
         self.rate_hz
+    }
+
+    /// What is simulated, what is not, and why.
+    pub fn decisions(&self) -> &[report::Decision] {
+        &self.decisions
     }
 
     /// Time of frame `k`, the middle of its exposure: start + k/rate.
@@ -86,110 +125,44 @@ impl Plan {
     }
 
     /// Frame `k` with its truth and the claims that arrived since frame k − 1. Needs no other frame; the same seed gives
-    /// the same bits.
+    /// the same bits. For many frames on one thread, a [`Maker`] spares the allocations.
     pub fn frame(&self, k: u64) -> SimulatedFrame {
-        self.frame_counting(k, &Ledger::default())
+        self.maker().frame(k)
     }
 
-    /// [`Plan::frame`], entering in `ledger` how many random words each effect drew.
-    pub fn frame_counting(&self, k: u64, ledger: &Ledger) -> SimulatedFrame {
-        let t = self.seconds(k);
-        let mut beams = Vec::new();
-        self.population.beams(k, t, self.streams, ledger, &mut beams);
-
-        let mut pixels = Array2::zeros(self.camera.shape());
-        let slice = pixels.as_slice_mut().expect("a fresh array is contiguous");
-        let mut renderer = Renderer::new(&self.camera);
-        let mut emitters = Vec::with_capacity(beams.len());
-        for beam in &beams {
-            let energy_j = self.energy(beam, k, ledger);
-            let spot = Spot {
-                centre: self.camera.to_sensor(beam.ground),
-                energy_j,
-            };
-            renderer.add(&self.camera, spot, slice);
-            emitters.push(self.truth(beam, energy_j));
-        }
-        if let Some(std_j) = self.noise_std_j {
-            let mut stream = self.streams.open(Effect::ThermalNoise, 0, k, ledger);
-            ThermalNoise::add(std_j, slice, &mut *stream);
-        }
-
-        let time = self.time(k);
-        SimulatedFrame {
-            frame: Frame {
-                index: k,
-                time,
-                pixels,
-                masked: None,
-            },
-            truth: Truth {
-                frame: k,
-                time,
-                emitters,
-            },
-            claims: self.claims(k),
-        }
+    /// Frames `from` to `until` − 1 on all threads; the same bits on any number of them.
+    pub fn frames(&self, from: u64, until: u64) -> Vec<SimulatedFrame> {
+        let range = (from..until).into_par_iter();
+        range.map_init(|| self.maker(), |maker, k| maker.frame(k)).collect()
     }
 
-    /// Collected energy of a beam's whole spot in frame `k`, J (`lens_power_user`, integrated over T_int).
-    fn energy(&self, beam: &Beam, k: u64, ledger: &Ledger) -> f64 {
-        let link = &self.link;
-        let h = self.camera.altitude_m;
-        let length_m = h.hypot(beam.ground[0].hypot(beam.ground[1]));
-        let mut energy = link.straight_j_per_w * beam.power_w * h / length_m;
-        if let Some(attenuation) = &link.effects.attenuation {
-            energy *= attenuation.transmittance(length_m);
-        }
-        energy * self.averaged_factor(beam.entity, k, ledger)
-    }
-
-    /// Mean over the exposure of ρ·exp(−2‖r_p‖²/w_z²): one factor, because the spot stays where it is meanwhile.
-    fn averaged_factor(&self, entity: u64, k: u64, ledger: &Ledger) -> f64 {
-        let effects = &self.link.effects;
-        let mut fading = effects.fading.as_ref().map(|f| {
-            let stream = self.streams.open(Effect::Fading, entity, k, ledger);
-            (f.distribution(), stream)
-        });
-        let mut pointing = effects.pointing.as_ref().map(|p| {
-            let stream = self.streams.open(Effect::Pointing, entity, k, ledger);
-            (p, stream)
-        });
-        if fading.is_none() && pointing.is_none() {
-            return 1.0;
-        }
-        let w2 = self.link.beam_radius_m.powi(2);
-        let values = (0..self.link.coherence_times).map(|_| {
-            let rho = fading.as_mut().map_or(1.0, |(distribution, stream)| {
-                rand_distr::Distribution::sample(distribution, &mut **stream)
-            });
-            let captured = pointing.as_mut().map_or(1.0, |(pointing, stream)| {
-                libm::exp(-2.0 * pointing.squared_miss(&mut **stream) / w2)
-            });
-            rho * captured
-        });
-        values.sum::<f64>() / f64::from(self.link.coherence_times)
-    }
-
-    fn truth(&self, beam: &Beam, energy_j: f64) -> EmitterTruth {
-        let actor = beam.actor.map(|a| &self.population.actors[a]);
-        EmitterTruth {
-            x_m: beam.ground[0],
-            y_m: beam.ground[1],
-            energy_j,
-            user: actor.map(|a| a.name.clone()),
-            role: actor.map_or(Role::Random, |a| a.role),
-            in_view: self.camera.sees(beam.ground),
+    pub fn maker(&self) -> Maker<'_> {
+        Maker {
+            plan: self,
+            ledger: Ledger::default(),
+            beams: Vec::new(),
+            spots: Vec::new(),
+            shot: Shot::default(),
+            renderer: Renderer::default(),
         }
     }
 
     /// The claims that arrived after frame k − 1 and not after frame k.
     pub fn claims(&self, k: u64) -> Vec<Claim> {
-        let after = if k == 0 { f64::NEG_INFINITY } else { self.seconds(k - 1) };
+        self.claims_counting(k, &Ledger::default())
+    }
+
+    fn claims_counting(&self, k: u64, ledger: &Ledger) -> Vec<Claim> {
+        // Sessions that began before frame 0 say where they are with their next claim.
+        let after = if k == 0 {
+            -1.0 / self.rate_hz
+        } else {
+            self.seconds(k - 1)
+        };
         let arrivals = self
             .network
-            .arrivals(&self.population, after.max(-1e9), self.seconds(k));
-        let claim = |s: super::network::Statement| Claim {
+            .arrivals(&self.population, after, self.seconds(k), self.streams, ledger);
+        let claim = |s: Statement| Claim {
             time: self.date(s.stated),
             user: self.population.actors[s.actor].name.clone(),
             x_m: s.at_m[0],
@@ -200,6 +173,23 @@ impl Plan {
         arrivals.into_iter().map(claim).collect()
     }
 
+    /// What became of frame `k`, and the frame whose pixels arrive in its place.
+    fn fate(&self, k: u64, ledger: &Ledger) -> (Fate, u64) {
+        let Some(loss) = &self.frame_loss else {
+            return (Fate::Delivered, k);
+        };
+        let fate = |k| loss.fate(k, self.streams, ledger);
+        match fate(k) {
+            Fate::Repeated => {
+                let earlier = (k.saturating_sub(LOOK_BACK)..k)
+                    .rev()
+                    .find(|j| fate(*j) == Fate::Delivered);
+                earlier.map_or((Fate::Dropped, k), |j| (Fate::Repeated, j))
+            }
+            other => (other, k),
+        }
+    }
+
     fn seconds(&self, k: u64) -> f64 {
         k as f64 / self.rate_hz
     }
@@ -207,5 +197,94 @@ impl Plan {
     fn date(&self, seconds: f64) -> Timestamp {
         let since = SignedDuration::try_from_secs_f64(seconds).unwrap_or(SignedDuration::MAX);
         self.start.checked_add(since).unwrap_or(Timestamp::MAX)
+    }
+}
+
+impl Maker<'_> {
+    /// [`Plan::frame`].
+    pub fn frame(&mut self, k: u64) -> SimulatedFrame {
+        let plan = self.plan;
+        let mut pixels = Array2::zeros(plan.camera.shape());
+        let (fate, seen) = plan.fate(k, &self.ledger);
+        if seen != k {
+            self.expose(seen, pixels.as_slice_mut().expect("a fresh array is contiguous"));
+        }
+        // The truth is that of frame k, whatever the camera handed out.
+        let emitters = if seen == k && fate == Fate::Delivered {
+            self.expose(k, pixels.as_slice_mut().expect("a fresh array is contiguous"))
+        } else {
+            self.cast(k)
+        };
+        if fate == Fate::Dropped {
+            pixels.fill(f64::NAN);
+        }
+        let time = plan.time(k);
+        SimulatedFrame {
+            frame: Frame {
+                index: k,
+                time,
+                pixels,
+                masked: plan.detector.mask().cloned(),
+            },
+            truth: Truth {
+                frame: k,
+                time,
+                emitters,
+            },
+            claims: plan.claims_counting(k, &self.ledger),
+            fate,
+        }
+    }
+
+    /// Random words drawn so far.
+    pub fn ledger(&self) -> &Ledger {
+        &self.ledger
+    }
+
+    /// Adds what frame `k` reads out to `pixels`, zeros before, row-major (Ny, Nx), J.
+    fn expose(&mut self, k: u64, pixels: &mut [f64]) -> Vec<EmitterTruth> {
+        let emitters = self.cast(k);
+        let plan = self.plan;
+        for spot in &self.spots {
+            self.renderer.add(&plan.light.lens, spot, pixels);
+        }
+        let at = Moment {
+            k,
+            t: plan.seconds(k),
+            streams: plan.streams,
+            ledger: &self.ledger,
+        };
+        plan.detector.read(&plan.light.lens, at, &mut self.renderer, pixels);
+        emitters
+    }
+
+    /// Fills `self.spots` for frame `k`; gives who is there.
+    fn cast(&mut self, k: u64) -> Vec<EmitterTruth> {
+        let plan = self.plan;
+        let at = Moment {
+            k,
+            t: plan.seconds(k),
+            streams: plan.streams,
+            ledger: &self.ledger,
+        };
+        plan.population.beams(k, at.t, at.streams, at.ledger, &mut self.beams);
+        plan.light.open(at, &mut self.shot);
+        self.spots.clear();
+        let mut emitters = Vec::with_capacity(self.beams.len());
+        for beam in &self.beams {
+            let energy_j = plan
+                .light
+                .cast(beam, &plan.population, at, &mut self.shot, &mut self.spots);
+            let actor = beam.actor.map(|a| &plan.population.actors[a]);
+            emitters.push(EmitterTruth {
+                x_m: beam.ground[0],
+                y_m: beam.ground[1],
+                energy_j,
+                user: actor.map(|a| a.name.clone()),
+                role: actor.map_or(Role::Random, |a| a.role),
+                in_view: plan.light.lens.sees(beam.ground),
+            });
+        }
+        emitters
     }
 }

@@ -2,10 +2,12 @@
 
 use rand::RngExt;
 
+use super::Effect;
 use super::config::{RandomEmittersConfig, Scene};
 use super::motion::{Beside, Motion, Schedule};
 use super::process::GaussianProcess;
-use super::stream::{Effect, Ledger, Streams};
+use super::report::{Decisions, Status};
+use super::stream::{Ledger, Streams};
 use super::truth::Role;
 
 /// One beam in one frame.
@@ -29,7 +31,7 @@ pub(super) struct Actor {
     pub present: Schedule,
     beam: bool,
     power_w: f64,
-    entity: u64,
+    pub entity: u64,
 }
 
 /// A motion ready to be evaluated at any time.
@@ -39,6 +41,7 @@ enum Path {
     Roam {
         home_m: [f64; 2],
         spread_m: f64,
+        time_s: f64,
         axes: [GaussianProcess; 2],
     },
     Beside {
@@ -70,6 +73,7 @@ impl Population {
             Motion::Roam(roam) => Path::Roam {
                 home_m: roam.home_m,
                 spread_m: roam.spread_m,
+                time_s: roam.time_s,
                 axes: [0, 1].map(|axis| {
                     let mut stream = streams.open(Effect::Motion, entity, axis, ledger);
                     GaussianProcess::new(&mut *stream, roam.time_s)
@@ -118,6 +122,55 @@ impl Population {
         }
     }
 
+    /// Says who is there.
+    pub fn explain(&self, decisions: &mut Decisions) {
+        match &self.random {
+            Some(random) => {
+                let [low, high] = random.count;
+                let reason = format!("{low} to {high} emitters drawn anew for every frame");
+                decisions.note(Effect::Population, Status::On, reason);
+            }
+            None => decisions.note(Effect::Population, Status::Off, "not in the scene"),
+        }
+        let roaming = self
+            .actors
+            .iter()
+            .filter(|a| matches!(a.path, Path::Roam { .. }))
+            .count();
+        let moving = self.actors.iter().filter(|a| self.speed(&a.path) > 0.0).count();
+        match (moving, roaming) {
+            (0, _) => decisions.note(Effect::Motion, Status::Off, "nobody moves"),
+            (_, 0) => decisions.note(
+                Effect::Motion,
+                Status::On,
+                format!("{moving} move, each where its time says"),
+            ),
+            _ => {
+                let reason = format!("{moving} move, {roaming} of them at random, drawn once");
+                decisions.note(Effect::Motion, Status::On, reason);
+            }
+        }
+    }
+
+    /// No actor is faster, m/s; of a roaming one, four standard deviations.
+    pub fn top_speed(&self) -> f64 {
+        self.actors.iter().map(|a| self.speed(&a.path)).fold(0.0, f64::max)
+    }
+
+    fn speed(&self, path: &Path) -> f64 {
+        match path {
+            Path::Own(Motion::Walk(walk)) if walk.through_m.len() > 1 => walk.speed_m_s,
+            Path::Own(Motion::Drift(drift)) => drift.velocity_m_s[0].hypot(drift.velocity_m_s[1]),
+            Path::Own(_) => 0.0,
+            Path::Roam { spread_m, time_s, .. } => 4.0 * spread_m / time_s,
+            Path::Beside { actor, .. } => self.speed(&self.actors[*actor].path),
+            Path::AtClaimOf { actor, .. } => {
+                let user = &self.actors[*actor];
+                self.speed(user.claimed.as_ref().unwrap_or(&user.path))
+            }
+        }
+    }
+
     /// True position of an actor at `t` seconds, m.
     pub fn position(&self, actor: usize, t: f64) -> [f64; 2] {
         self.along(&self.actors[actor].path, t)
@@ -138,7 +191,9 @@ impl Population {
             Path::Own(Motion::Walk(walk)) => walk.at(t),
             Path::Own(Motion::Drift(drift)) => drift.at(t),
             Path::Own(_) => unreachable!("`new` resolves every other motion"),
-            Path::Roam { home_m, spread_m, axes } => [0, 1].map(|i| home_m[i] + spread_m * axes[i].at(t)),
+            Path::Roam {
+                home_m, spread_m, axes, ..
+            } => [0, 1].map(|i| home_m[i] + spread_m * axes[i].at(t)),
             Path::Beside { actor, offset_m } => shifted(self.position(*actor, t), *offset_m),
             Path::AtClaimOf { actor, offset_m } => shifted(self.claimed(*actor, t), *offset_m),
         }

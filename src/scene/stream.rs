@@ -9,24 +9,11 @@ use std::ops::{Deref, DerefMut};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-/// Everything that a scene can switch on. The numbers key the random streams: they never change.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
-#[repr(usize)]
-pub enum Effect {
-    Population = 0,
-    Motion = 1,
-    Attenuation = 2,
-    Fading = 3,
-    Pointing = 4,
-    ThermalNoise = 9,
-}
-
-/// Room for every discriminant of [`Effect`].
-const EFFECTS: usize = 32;
+use super::Effect;
 
 /// How many 32-bit words each effect has drawn.
 #[derive(Debug, Default)]
-pub struct Ledger([Cell<u64>; EFFECTS]);
+pub struct Ledger([Cell<u64>; Effect::ROOM]);
 
 impl Ledger {
     /// 32-bit random words that `effect` has drawn.

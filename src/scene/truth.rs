@@ -1,6 +1,7 @@
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 
+use super::Fate;
 use crate::claim::Claim;
 use crate::frame::Frame;
 
@@ -11,6 +12,8 @@ pub struct SimulatedFrame {
     pub truth: Truth,
     /// The claims that reached the network's log since the frame before, in the order of their arrival.
     pub claims: Vec<Claim>,
+    /// Whether the frame arrived; a live source hands on only the claims of one that did not.
+    pub fate: Fate,
 }
 
 /// Who was where in a frame.

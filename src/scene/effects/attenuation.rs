@@ -1,22 +1,26 @@
 use serde::{Deserialize, Serialize};
 
+use super::Table;
+use crate::optics::radiometry;
 use crate::scene::error::{Error, Field};
 
 /// Absorption and scattering along the path: g = exp(−κL) (Beer and Lambert). Valid for a path of uniform extinction.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Attenuation {
-    /// κ, 1/m.
+    /// κ, 1/m. Koschmieder: 3.9/visibility in the visible.
     pub kappa_per_m: f64,
 }
 
 impl Attenuation {
-    pub(in crate::scene) fn validate(&self, field: &Field) -> Result<(), Error> {
-        field.at("kappa_per_m").non_negative(self.kappa_per_m).map(drop)
-    }
-
     /// g over `length_m`.
     pub fn transmittance(&self, length_m: f64) -> f64 {
-        libm::exp(-self.kappa_per_m * length_m)
+        radiometry::path_transmission(self.kappa_per_m, length_m)
+    }
+}
+
+impl Table for Attenuation {
+    fn validate(&self, field: &Field) -> Result<(), Error> {
+        field.at("kappa_per_m").non_negative(self.kappa_per_m).map(drop)
     }
 }

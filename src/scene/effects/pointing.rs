@@ -2,10 +2,11 @@ use rand::Rng;
 use rand_distr::{Distribution, StandardNormal};
 use serde::{Deserialize, Serialize};
 
+use super::Table;
 use crate::scene::error::{Error, Field};
 
-/// The beam misses the lens by r_p, two independent N(μ_p, σ_p²): h = exp(−2‖r_p‖²/w_z²) (Farid and Hranilovic, 2007,
-/// eq. 9, for w_z ≫ r_a; the flat-irradiance form).
+/// The beam misses the lens by r_p, two independent N(μ_p, σ_p²); the lens then collects exp(−2‖r_p‖²/w_z²) of what it would
+/// (Farid and Hranilovic, 2007, eq. 9, for w_z ≫ r_a). With zero μ_p the mean is w_z²/(w_z² + 4σ_p²).
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Pointing {
@@ -17,11 +18,6 @@ pub struct Pointing {
 }
 
 impl Pointing {
-    pub(in crate::scene) fn validate(&self, field: &Field) -> Result<(), Error> {
-        field.at("jitter_m").non_negative(self.jitter_m)?;
-        field.at("boresight_m").finite_pair(self.boresight_m).map(drop)
-    }
-
     /// Draws ‖r_p‖², m².
     pub(in crate::scene) fn squared_miss<R: Rng + ?Sized>(&self, rng: &mut R) -> f64 {
         let axis = |mean: f64, rng: &mut R| {
@@ -29,5 +25,12 @@ impl Pointing {
             (mean + self.jitter_m * z).powi(2)
         };
         axis(self.boresight_m[0], rng) + axis(self.boresight_m[1], rng)
+    }
+}
+
+impl Table for Pointing {
+    fn validate(&self, field: &Field) -> Result<(), Error> {
+        field.at("jitter_m").non_negative(self.jitter_m)?;
+        field.at("boresight_m").finite_pair(self.boresight_m).map(drop)
     }
 }

@@ -2,6 +2,7 @@ use rand::Rng;
 use rand_distr::{Distribution, StandardNormal};
 use serde::{Deserialize, Serialize};
 
+use super::Table;
 use crate::scene::error::{Error, Field};
 
 /// Additive white Gaussian noise of the read-out, σ_n joules per pixel (`meas_total`).
@@ -13,15 +14,17 @@ pub struct ThermalNoise {
 }
 
 impl ThermalNoise {
-    pub(in crate::scene) fn validate(&self, field: &Field) -> Result<(), Error> {
-        self.std_j.map_or(Ok(()), |s| field.at("std_j").positive(s).map(drop))
-    }
-
     /// Adds noise of `std_j` to every pixel.
     pub(in crate::scene) fn add<R: Rng + ?Sized>(std_j: f64, pixels: &mut [f64], rng: &mut R) {
         for pixel in pixels {
             let z: f64 = StandardNormal.sample(rng);
             *pixel += std_j * z;
         }
+    }
+}
+
+impl Table for ThermalNoise {
+    fn validate(&self, field: &Field) -> Result<(), Error> {
+        self.std_j.map_or(Ok(()), |s| field.at("std_j").positive(s).map(drop))
     }
 }

@@ -1,0 +1,50 @@
+use rand::RngExt;
+use serde::{Deserialize, Serialize};
+
+use super::{Effect, Table};
+use crate::scene::error::{Error, Field};
+use crate::scene::stream::{Ledger, Streams};
+
+/// The link to the camera loses frames, or hands the last one out again, each frame with the given probability.
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct FrameLoss {
+    pub dropped: f64,
+    pub repeated: f64,
+}
+
+/// What became of a frame on its way.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Fate {
+    Delivered,
+    /// Nothing arrived; its pixels are NaN.
+    Dropped,
+    /// The pixels of the last frame that was delivered arrived again.
+    Repeated,
+}
+
+impl FrameLoss {
+    pub(in crate::scene) fn fate(&self, k: u64, streams: Streams, ledger: &Ledger) -> Fate {
+        let mut stream = streams.open(Effect::FrameLoss, 0, k, ledger);
+        let u: f64 = stream.random();
+        if u < self.dropped {
+            Fate::Dropped
+        } else if u < self.dropped + self.repeated {
+            Fate::Repeated
+        } else {
+            Fate::Delivered
+        }
+    }
+}
+
+impl Table for FrameLoss {
+    fn validate(&self, field: &Field) -> Result<(), Error> {
+        field.at("dropped").fraction(self.dropped)?;
+        field.at("repeated").fraction(self.repeated)?;
+        if self.dropped + self.repeated >= 1.0 {
+            return Err(field.at("repeated").refuse("less than 1 − dropped", self.repeated));
+        }
+        Ok(())
+    }
+}

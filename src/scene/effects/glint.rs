@@ -1,0 +1,44 @@
+use std::f64::consts::TAU;
+
+use serde::{Deserialize, Serialize};
+
+use super::Table;
+use crate::optics::Camera;
+use crate::scene::error::{Error, Field};
+use crate::scene::motion::Schedule;
+use crate::scene::render::Spot;
+
+/// A blot of light that is no beam: the sun's glint on water, or a lamp that blinds. A Gaussian of the given width and peak,
+/// where an emitter at `at_m` would be seen.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Glint {
+    pub at_m: [f64; 2],
+    /// Standard deviation, on the ground.
+    pub spread_m: f64,
+    /// Energy of the brightest pixel.
+    pub peak_j: f64,
+    #[serde(default)]
+    pub present: Schedule,
+}
+
+impl Glint {
+    pub(in crate::scene) fn spot(&self, camera: &Camera) -> Spot {
+        let sigma_m = self.spread_m / camera.ground_scale();
+        let pixel = camera.x.pitch_m * camera.y.pitch_m;
+        Spot {
+            centre: camera.to_sensor(self.at_m),
+            sigma_m,
+            energy_j: self.peak_j * TAU * sigma_m * sigma_m / pixel,
+        }
+    }
+}
+
+impl Table for Glint {
+    fn validate(&self, field: &Field) -> Result<(), Error> {
+        field.at("at_m").finite_pair(self.at_m)?;
+        field.at("spread_m").positive(self.spread_m)?;
+        field.at("peak_j").positive(self.peak_j)?;
+        self.present.validate(&field.at("present"))
+    }
+}

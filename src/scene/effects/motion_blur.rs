@@ -1,0 +1,16 @@
+use serde::{Deserialize, Serialize};
+
+use super::Table;
+use crate::scene::error::{Error, Field};
+
+/// Emitters move during the exposure; without it each stays where it is in the middle. A speed v smears the spot evenly over
+/// vT_int (on the ground), a variance of (vT_int)²/12.
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct MotionBlur {}
+
+impl Table for MotionBlur {
+    fn validate(&self, _field: &Field) -> Result<(), Error> {
+        Ok(())
+    }
+}
