@@ -92,7 +92,8 @@ fn a_drifting_user_leaves_the_claim_behind() {
             .unwrap();
         (truth.x_m - claim.x_m).hypot(truth.y_m - claim.y_m)
     };
-    assert!(off(0) < 0.1);
+    // The claim itself errs by 0.3 m an axis.
+    assert!(off(0) < 1.5);
     assert!(off(1200) > 10.0);
 }
 
