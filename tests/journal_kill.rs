@@ -84,7 +84,11 @@ fn child() {
     };
     let dir = Path::new(&dir);
     let round = std::env::var("OAPWATCH_KILL_ROUND").unwrap();
-    let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().unwrap();
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(2)
+        .enable_all()
+        .build()
+        .unwrap();
     runtime.block_on(async {
         let endpoints = webhook_in(dir);
         let subscriptions = endpoints.iter().map(Endpoint::subscription).collect();
@@ -135,7 +139,9 @@ async fn receive(State(seen): State<Seen>, headers: HeaderMap, body: Bytes) -> S
     let json: serde_json::Value = serde_json::from_slice(&body).unwrap();
     let text = |value: &serde_json::Value| value.as_str().unwrap().to_owned();
     let id = headers["webhook-id"].to_str().unwrap().to_owned();
-    seen.lock().unwrap().push((id, text(&json["data"]["id"]), text(&json["type"])));
+    seen.lock()
+        .unwrap()
+        .push((id, text(&json["data"]["id"]), text(&json["type"])));
     StatusCode::NO_CONTENT
 }
 
@@ -170,7 +176,9 @@ fn two_hundred_kills_lose_nothing_and_invent_nothing() {
         let reader = std::thread::spawn(move || {
             let mut lines = Vec::new();
             for line in out.split(b'\n') {
-                let Ok(Ok(line)) = line.map(String::from_utf8) else { break };
+                let Ok(Ok(line)) = line.map(String::from_utf8) else {
+                    break;
+                };
                 if let Some(said) = line.strip_prefix('@') {
                     lines.push(said.to_owned());
                     let _ = ready.send(());
@@ -181,7 +189,9 @@ fn two_hundred_kills_lose_nothing_and_invent_nothing() {
         let after_us = match round % 10 {
             0 => rng.random_range(0..30_000),
             _ => {
-                first.recv_timeout(Duration::from_secs(20)).expect("the child never began");
+                first
+                    .recv_timeout(Duration::from_secs(20))
+                    .expect("the child never began");
                 rng.random_range(0..60_000)
             }
         };
@@ -197,7 +207,11 @@ fn two_hundred_kills_lose_nothing_and_invent_nothing() {
             }
         }
     }
-    assert!(heard.len() as u64 > KILLS, "{} events in {KILLS} lives are no test", heard.len());
+    assert!(
+        heard.len() as u64 > KILLS,
+        "{} events in {KILLS} lives are no test",
+        heard.len()
+    );
 
     // What the journal holds: at least what was heard of, at most what was meant, each transaction whole.
     let endpoints = webhook_in(dir);
@@ -208,13 +222,23 @@ fn two_hundred_kills_lose_nothing_and_invent_nothing() {
         .query_row("PRAGMA integrity_check", [], |row| row.get(0))
         .unwrap();
     assert_eq!(integrity, "ok");
-    let stored: BTreeMap<u64, String> =
-        journal.events_after(0, usize::MAX >> 1).unwrap().iter().map(|e| (e.seq, word(&e.event))).collect();
+    let stored: BTreeMap<u64, String> = journal
+        .events_after(0, usize::MAX >> 1)
+        .unwrap()
+        .iter()
+        .map(|e| (e.seq, word(&e.event)))
+        .collect();
     for (seq, event) in &heard {
         assert_eq!(stored.get(seq), Some(event), "heard of, then lost");
     }
-    assert!(stored.values().all(|event| meant.contains(event)), "recorded, but never meant");
-    assert_eq!(stored.keys().copied().collect::<Vec<_>>(), (1..=stored.len() as u64).collect::<Vec<_>>());
+    assert!(
+        stored.values().all(|event| meant.contains(event)),
+        "recorded, but never meant"
+    );
+    assert_eq!(
+        stored.keys().copied().collect::<Vec<_>>(),
+        (1..=stored.len() as u64).collect::<Vec<_>>()
+    );
     let open: BTreeSet<String> = journal.open_alerts().unwrap().into_iter().map(|a| a.id).collect();
     let mut expected = BTreeSet::new();
     for event in stored.values() {
@@ -228,12 +252,15 @@ fn two_hundred_kills_lose_nothing_and_invent_nothing() {
 
     // A last life delivers what is left.
     let waiting = journal.waiting("receiver", 0).unwrap().len();
-    let (notifier, _task) = runtime.block_on(async {
-        notify::spawn(endpoints, journal.clone(), Clock::wall(), 1, std::future::pending())
-    });
+    let (notifier, _task) =
+        runtime.block_on(async { notify::spawn(endpoints, journal.clone(), Clock::wall(), 1, std::future::pending()) });
     let started = Instant::now();
     while notifier.status()[0].sent < stored.len() as u64 {
-        assert!(started.elapsed() < Duration::from_secs(20), "deliveries never complete: {:?}", notifier.status());
+        assert!(
+            started.elapsed() < Duration::from_secs(20),
+            "deliveries never complete: {:?}",
+            notifier.status()
+        );
         std::thread::sleep(Duration::from_millis(10));
     }
     let seen = seen.lock().unwrap();
@@ -241,7 +268,10 @@ fn two_hundred_kills_lose_nothing_and_invent_nothing() {
     let mut ids = BTreeSet::new();
     for (id, alert, kind) in seen.iter() {
         if ids.insert(id.clone()) {
-            first_seen.entry(alert.clone()).or_default().push(format!("{alert} {kind}"));
+            first_seen
+                .entry(alert.clone())
+                .or_default()
+                .push(format!("{alert} {kind}"));
         }
     }
     assert_eq!(ids.len(), stored.len(), "every event was delivered, under one id");
