@@ -17,7 +17,7 @@ const REJECT: f64 = 5.0;
 const SIGNIFICANT: f64 = 12.0;
 /// A beacon is absent, and a source that nobody surveyed is modelled, below and above this share of the median energy.
 const NOTABLE: f64 = 0.15;
-const MAX_ROUNDS: usize = 16;
+const MAX_ROUNDS: usize = 24;
 
 /// The fit's state.
 pub struct Fit<'a> {
@@ -52,8 +52,8 @@ impl Prior {
                 0.1 * half,
                 0.1,
                 0.1 / r.powi(2),
-                0.1 / r.powi(4),
-                0.1 / r.powi(6),
+                0.05 / r.powi(4),
+                0.02 / r.powi(6),
                 0.02 / r,
                 0.02 / r,
                 0.3,

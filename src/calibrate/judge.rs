@@ -41,10 +41,13 @@ pub fn score(estimator: &mut dyn Estimator, frames: &[(usize, &Array2<f64>)], be
             masked: None,
         };
         // A frame that cannot be used finds nobody, with either calibration.
-        let Ok(estimate) = estimator.estimate(&frame) else { continue };
+        let Ok(estimate) = estimator.estimate(&frame) else {
+            continue;
+        };
         let found = &estimate.emitters;
-        let distance2 =
-            |b: usize, e: usize| (here[b].ground_m[0] - found[e].x_m).powi(2) + (here[b].ground_m[1] - found[e].y_m).powi(2);
+        let distance2 = |b: usize, e: usize| {
+            (here[b].ground_m[0] - found[e].x_m).powi(2) + (here[b].ground_m[1] - found[e].y_m).powi(2)
+        };
         let matching = assign(here.len(), found.len(), CUTOFF_M * CUTOFF_M, distance2);
         squared.extend(matching.pairs.iter().map(|&(b, e)| distance2(b, e)));
     }

@@ -79,22 +79,36 @@ pub fn calibrate(
     if frames.len() < MIN_FRAMES {
         return Err(Error::TooLittle { frames: frames.len() });
     }
-    type Frames<'a> = Vec<(usize, (usize, &'a Array2<f64>))>;
-    let (held, fitted_to): (Frames, Frames) =
-        frames.iter().copied().enumerate().partition(|(k, _)| k % HELD_OUT == HELD_OUT / 2);
-    let strip = |list: Frames<'_>| list.into_iter().map(|(_, f)| f).collect::<Vec<_>>();
-    let (held, fitted_to) = (strip(held), strip(fitted_to));
-    let mut report = |stage| {
-        let progress = &mut *progress;
-        move |round, reduced_chi2, survey_std_m| progress(Progress { stage, round, reduced_chi2, survey_std_m })
+    let is_held = |k: usize| k % HELD_OUT == HELD_OUT / 2;
+    let part = |held: bool| -> Vec<(usize, &Array2<f64>)> {
+        let chosen = frames.iter().enumerate().filter(|(k, _)| is_held(*k) == held);
+        chosen.map(|(_, frame)| *frame).collect()
     };
-    let first = fit(camera, &fitted_to, beacons, &mut report("fitting to four frames in five"));
+    let (held, fitted_to) = (part(true), part(false));
+    let mut report = |stage, round, reduced_chi2, survey_std_m| {
+        progress(Progress {
+            stage,
+            round,
+            reduced_chi2,
+            survey_std_m,
+        });
+    };
+    let first = fit(camera, &fitted_to, beacons, &mut |round, chi2, std| {
+        report("fitting to four frames in five", round, chi2, std)
+    });
     let trial = first.calibration.applied_to(camera)?;
     let before = judge::score(&mut *build(camera)?, &held, beacons);
     let after = judge::score(&mut *build(&trial)?, &held, beacons);
-    let fitted = fit(&trial, frames, beacons, &mut report("fitting to all frames"));
+    let fitted = fit(&trial, frames, beacons, &mut |round, chi2, std| {
+        report("fitting to all frames", round, chi2, std)
+    });
     fitted.calibration.applied_to(camera)?;
-    Ok(Calibrated { fitted, frames: frames.len(), before, after })
+    Ok(Calibrated {
+        fitted,
+        frames: frames.len(),
+        before,
+        after,
+    })
 }
 
 /// Fits the device to frames of shape (Ny, Nx) in joules. `frames` pairs each frame with its number; `camera` is where

@@ -40,7 +40,11 @@ pub fn run(args: Args) -> Outcome {
             Err(e) => return Err(Failure::config(e)),
         }
     }
-    let camera = config.optics.camera().with_context(in_config).map_err(Failure::Config)?;
+    let camera = config
+        .optics
+        .camera()
+        .with_context(in_config)
+        .map_err(Failure::Config)?;
     let beacons = truth::read(&args.truth).map_err(Failure::input)?;
     let frames = read_frames(&args, &camera, &beacons)?;
     let list: Vec<(usize, &Array2<f64>)> = frames.iter().map(|(k, pixels)| (*k, pixels)).collect();
@@ -88,11 +92,7 @@ pub fn run(args: Args) -> Outcome {
 }
 
 /// The frames that have beacons.
-fn read_frames(
-    args: &Args,
-    camera: &Camera,
-    beacons: &[truth::Beacon],
-) -> Result<Vec<(usize, Array2<f64>)>, Failure> {
+fn read_frames(args: &Args, camera: &Camera, beacons: &[truth::Beacon]) -> Result<Vec<(usize, Array2<f64>)>, Failure> {
     let reader = npy::Reader::open(&args.frames, camera.joules_per_count).map_err(Failure::input)?;
     let (ny, nx) = reader.shape();
     if (ny, nx) != camera.shape() {
@@ -136,9 +136,18 @@ fn report(c: &Calibrated) -> Vec<String> {
         fitted.reduced_chi2
     )];
     if !fitted.rejected.is_empty() {
-        let named: Vec<String> = fitted.rejected.iter().take(NAMED).map(|b| format!("{}", b.line)).collect();
+        let named: Vec<String> = fitted
+            .rejected
+            .iter()
+            .take(NAMED)
+            .map(|b| format!("{}", b.line))
+            .collect();
         let more = fitted.rejected.len().saturating_sub(NAMED);
-        let tail = if more > 0 { format!(" and {more} more") } else { String::new() };
+        let tail = if more > 0 {
+            format!(" and {more} more")
+        } else {
+            String::new()
+        };
         lines.push(format!("rejected positions are on lines {}{tail}", named.join(", ")));
     }
     if !fitted.unexplained.is_empty() {

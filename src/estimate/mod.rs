@@ -3,6 +3,7 @@
 
 mod basis;
 mod config;
+mod corrected;
 mod emitter;
 mod fit;
 mod ground;
