@@ -115,12 +115,18 @@ impl Config {
 
     /// Reads a config; relative paths in it are taken from the file's own folder.
     pub fn load(path: &Path) -> Result<Self, Error> {
-        let mut config: Self = read_toml(path)?;
-        let base = path.parent().unwrap_or(Path::new("")).to_owned();
-        config.rebase(&base);
+        let mut config = Self::load_uncalibrated(path)?;
         if let Some(path) = &config.optics.calibration {
             config.optics.calibrated = Some(calibrate::file::read(path)?);
         }
+        Ok(config)
+    }
+
+    /// The same without reading the calibration that it names.
+    pub fn load_uncalibrated(path: &Path) -> Result<Self, Error> {
+        let mut config: Self = read_toml(path)?;
+        let base = path.parent().unwrap_or(Path::new("")).to_owned();
+        config.rebase(&base);
         Ok(config)
     }
 

@@ -13,11 +13,11 @@ use crate::optics::{Camera, Distortion, psf};
 const DEVICE: usize = Distortion::PARAMETERS + 2;
 /// Mahalanobis distance past which a beacon's position is not believed.
 const REJECT: f64 = 5.0;
-/// Energy over its standard deviation below which nothing was there.
-const SIGNIFICANT: f64 = 6.0;
-/// A source that nobody surveyed is modelled when it has this share of the beacons' median energy.
+/// Standard deviations of the residual that light without a spot must reach.
+const SIGNIFICANT: f64 = 12.0;
+/// A beacon is absent, and a source that nobody surveyed is modelled, below and above this share of the median energy.
 const NOTABLE: f64 = 0.15;
-const MAX_ROUNDS: usize = 16;
+const MAX_ROUNDS: usize = 24;
 
 /// The fit's state.
 pub struct Fit<'a> {
@@ -52,8 +52,8 @@ impl Prior {
                 0.1 * half,
                 0.1,
                 0.1 / r.powi(2),
-                0.1 / r.powi(4),
-                0.1 / r.powi(6),
+                0.05 / r.powi(4),
+                0.02 / r.powi(6),
                 0.02 / r,
                 0.02 / r,
                 0.3,
@@ -121,6 +121,7 @@ impl<'a> Fit<'a> {
         let camera = &self.camera;
         self.shots.par_iter_mut().for_each(|shot| solve_energies(shot, camera));
         self.fit_shots(12);
+        self.update_noise();
         self.tidy_spots();
         let mut quiet = 0;
         for round in 0..MAX_ROUNDS {
@@ -131,8 +132,8 @@ impl<'a> Fit<'a> {
             if round == 2 || round == 5 {
                 self.tidy_spots();
             }
+            self.update_noise();
             if round >= 2 {
-                self.update_noise();
                 if let Some(maps) = maps::estimate(&self.camera, &self.shots) {
                     self.camera.pixels = Some(std::sync::Arc::new(maps));
                 }
@@ -347,7 +348,7 @@ impl<'a> Fit<'a> {
             .for_each(|(shot, normal)| {
                 for _ in 0..12 {
                     let kept = shot.spots.len();
-                    drop_dark(shot, normal);
+                    drop_dark(shot, normal, tether, NOTABLE * typical);
                     let added = add_missing(shot, camera, NOTABLE * typical);
                     if shot.spots.len() == kept && !added {
                         break;
@@ -467,16 +468,16 @@ fn solve_energies(shot: &mut Shot, camera: &Camera) {
     }
 }
 
-fn drop_dark(shot: &mut Shot, normal: &Normal) {
-    let local = shot.local_columns();
-    let h = Mat::from_fn(local.len(), local.len(), |a, b| normal.gram[(local[a], local[b])]);
+/// Drops the spots that surely have less energy than `least_j`: two that overlap may share theirs out at will.
+fn drop_dark(shot: &mut Shot, normal: &Normal, tether_m2: f64, least_j: f64) {
+    let (h, _) = shot.tethered(normal, tether_m2);
     let Some(solver) = Scaled::new(&h, 1e-12) else { return };
-    let inverse = solver.solve_many(&Mat::identity(local.len(), local.len()));
+    let inverse = solver.solve_many(&Mat::identity(h.nrows(), h.nrows()));
     let mut i = 0;
     shot.spots.retain(|spot| {
         let std = inverse[(3 * i + 2, 3 * i + 2)].max(0.0).sqrt();
         i += 1;
-        spot.energy_j > SIGNIFICANT * std
+        spot.energy_j + 3.0 * std > least_j
     });
 }
 
@@ -519,7 +520,7 @@ fn add_missing(shot: &mut Shot, camera: &Camera, least_j: f64) -> bool {
         return false;
     };
     let apart = |s: &Spot| (s.sensor_m[0] - sensor_m[0]).hypot(s.sensor_m[1] - sensor_m[1]) > 1.5 * sigma;
-    if strength < 2.0 * SIGNIFICANT * camera.noise_std_j || energy_j < least_j || !shot.spots.iter().all(apart) {
+    if strength < SIGNIFICANT * camera.noise_std_j || energy_j < least_j || !shot.spots.iter().all(apart) {
         return false;
     }
     shot.spots.push(Spot {

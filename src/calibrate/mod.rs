@@ -2,13 +2,16 @@
 
 mod bundle;
 pub mod file;
+mod judge;
 mod maps;
 mod shot;
 pub mod truth;
 
 use ndarray::Array2;
 
-use crate::optics::{Calibration, Camera};
+use crate::estimate::{self, Estimator};
+use crate::optics::{Calibration, CalibrationError, Camera};
+pub use judge::Score;
 use shot::Shot;
 use truth::Beacon;
 
@@ -26,6 +29,86 @@ pub struct Fitted {
     pub rejected: Vec<Beacon>,
     /// Frames that nothing explained.
     pub unexplained: Vec<usize>,
+}
+
+/// A calibration with what it was held to.
+#[derive(Clone, Debug)]
+pub struct Calibrated {
+    /// Fitted to all frames.
+    pub fitted: Fitted,
+    pub frames: usize,
+    /// The camera as it was, on the held-out frames.
+    pub before: Score,
+    /// The camera as fitted to the other frames, on the held-out frames.
+    pub after: Score,
+}
+
+/// Why there is no calibration.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    #[error("expected at least {MIN_FRAMES} frames with positions in view, found {frames}")]
+    TooLittle { frames: usize },
+    #[error(transparent)]
+    Estimator(#[from] estimate::ConfigError),
+    #[error("the frames and positions lead to no usable calibration: {0}")]
+    Unusable(#[from] CalibrationError),
+}
+
+/// How far a fit is.
+#[derive(Clone, Copy, Debug)]
+pub struct Progress {
+    pub stage: &'static str,
+    pub round: usize,
+    pub reduced_chi2: f64,
+    pub survey_std_m: f64,
+}
+
+/// With fewer frames there is nothing to hold out.
+const MIN_FRAMES: usize = 5;
+/// One frame in this many is held out.
+const HELD_OUT: usize = 5;
+
+/// Fits to four frames in five, judges on the fifth with the estimators that `build` makes, and fits again to all.
+pub fn calibrate(
+    camera: &Camera,
+    frames: &[(usize, &Array2<f64>)],
+    beacons: &[Beacon],
+    build: &mut dyn FnMut(&Camera) -> Result<Box<dyn Estimator>, estimate::ConfigError>,
+    progress: &mut dyn FnMut(Progress),
+) -> Result<Calibrated, Error> {
+    if frames.len() < MIN_FRAMES {
+        return Err(Error::TooLittle { frames: frames.len() });
+    }
+    let is_held = |k: usize| k % HELD_OUT == HELD_OUT / 2;
+    let part = |held: bool| -> Vec<(usize, &Array2<f64>)> {
+        let chosen = frames.iter().enumerate().filter(|(k, _)| is_held(*k) == held);
+        chosen.map(|(_, frame)| *frame).collect()
+    };
+    let (held, fitted_to) = (part(true), part(false));
+    let mut report = |stage, round, reduced_chi2, survey_std_m| {
+        progress(Progress {
+            stage,
+            round,
+            reduced_chi2,
+            survey_std_m,
+        });
+    };
+    let first = fit(camera, &fitted_to, beacons, &mut |round, chi2, std| {
+        report("fitting to four frames in five", round, chi2, std)
+    });
+    let trial = first.calibration.applied_to(camera)?;
+    let before = judge::score(&mut *build(camera)?, &held, beacons);
+    let after = judge::score(&mut *build(&trial)?, &held, beacons);
+    let fitted = fit(&trial, frames, beacons, &mut |round, chi2, std| {
+        report("fitting to all frames", round, chi2, std)
+    });
+    fitted.calibration.applied_to(camera)?;
+    Ok(Calibrated {
+        fitted,
+        frames: frames.len(),
+        before,
+        after,
+    })
 }
 
 /// Fits the device to frames of shape (Ny, Nx) in joules. `frames` pairs each frame with its number; `camera` is where

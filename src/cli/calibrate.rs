@@ -1,19 +1,191 @@
-use super::Outcome;
+use std::path::PathBuf;
+
+use anyhow::{Context, anyhow};
+use indicatif::{ProgressBar, ProgressStyle};
+use ndarray::Array2;
+
+use super::{Failure, Outcome};
+use crate::calibrate::{self, Calibrated, file, truth};
+use crate::config::Config;
+use crate::estimate;
+use crate::frames::npy;
+use crate::optics::Camera;
 
 #[derive(Debug, clap::Args)]
 pub struct Args {
+    /// The device as its data sheet has it; a calibration that it names is what the new one must beat
     #[arg(long)]
-    config: std::path::PathBuf,
+    config: PathBuf,
     /// NDJSON with the known positions of each frame
     #[arg(long)]
-    truth: std::path::PathBuf,
+    truth: PathBuf,
     /// Where to write the calibration
     #[arg(long)]
-    out: std::path::PathBuf,
+    out: PathBuf,
     /// FRAMES.npy
-    frames: std::path::PathBuf,
+    frames: PathBuf,
 }
 
-pub fn run(_args: Args) -> Outcome {
-    Err(super::Failure::other(anyhow::anyhow!("calibrate is not built yet")))
+/// Rejected lines of the truth file that the report names.
+const NAMED: usize = 20;
+
+pub fn run(args: Args) -> Outcome {
+    let mut config = Config::load_uncalibrated(&args.config).map_err(Failure::config)?;
+    let in_config = || args.config.display().to_string();
+    if let Some(path) = config.optics.calibration.take() {
+        match file::read(&path) {
+            Ok(calibration) => config.optics.calibrated = Some(calibration),
+            // The very file that is to be written now.
+            Err(file::Error::Io { source, .. }) if source.kind() == std::io::ErrorKind::NotFound => {}
+            Err(e) => return Err(Failure::config(e)),
+        }
+    }
+    let camera = config
+        .optics
+        .camera()
+        .with_context(in_config)
+        .map_err(Failure::Config)?;
+    let beacons = truth::read(&args.truth).map_err(Failure::input)?;
+    let frames = read_frames(&args, &camera, &beacons)?;
+    let list: Vec<(usize, &Array2<f64>)> = frames.iter().map(|(k, pixels)| (*k, pixels)).collect();
+
+    let style = ProgressStyle::with_template("{spinner} {msg}").expect("a valid template");
+    let bar = ProgressBar::new_spinner().with_style(style);
+    let mut progress = |p: calibrate::Progress| {
+        bar.set_message(format!(
+            "{}: round {}, reduced χ² {:.3}, positions within {:.3} m",
+            p.stage, p.round, p.reduced_chi2, p.survey_std_m
+        ));
+        bar.tick();
+    };
+    let mut build = |camera: &Camera| estimate::build(&config.estimator, camera);
+    // Fails here rather than after the fit.
+    build(&camera).with_context(in_config).map_err(Failure::Config)?;
+    let outcome = calibrate::calibrate(&camera, &list, &beacons, &mut build, &mut progress);
+    bar.finish_and_clear();
+    let calibrated = outcome.map_err(|e| match e {
+        calibrate::Error::TooLittle { .. } => {
+            Failure::Input(anyhow::Error::new(e).context(args.truth.display().to_string()))
+        }
+        calibrate::Error::Estimator(e) => Failure::Config(anyhow::Error::new(e).context(in_config())),
+        calibrate::Error::Unusable(_) => Failure::other(e),
+    })?;
+    for line in report(&calibrated) {
+        println!("{line}");
+    }
+    let (before, after) = (calibrated.before, calibrated.after);
+    if after.cost_m2 >= before.cost_m2 {
+        return Err(Failure::Other(anyhow!(
+            "{} was not written: on the {} held-out positions the new calibration is no better \
+             (mean squared error, misses counted as 25 m: {:.4} m² before, {:.4} m² after)",
+            args.out.display(),
+            before.beacons,
+            before.cost_m2,
+            after.cost_m2
+        )));
+    }
+    let mut remarks = vec!["Written by `oapwatch calibrate`; name it in [optics] calibration.".to_owned()];
+    remarks.extend(report(&calibrated));
+    file::write(&args.out, &file::render(&calibrated.fitted.calibration, &remarks)).map_err(Failure::other)?;
+    println!("written to {}", args.out.display());
+    Ok(())
+}
+
+/// The frames that have beacons.
+fn read_frames(args: &Args, camera: &Camera, beacons: &[truth::Beacon]) -> Result<Vec<(usize, Array2<f64>)>, Failure> {
+    let reader = npy::Reader::open(&args.frames, camera.joules_per_count).map_err(Failure::input)?;
+    let (ny, nx) = reader.shape();
+    if (ny, nx) != camera.shape() {
+        return Err(Failure::Input(anyhow!(
+            "{}: frames are {nx} × {ny} pixels, {} says {} × {}",
+            args.frames.display(),
+            args.config.display(),
+            camera.x.n,
+            camera.y.n
+        )));
+    }
+    let total = reader.frames();
+    let mut frames = Vec::new();
+    for (k, pixels) in reader.enumerate() {
+        let pixels = pixels.map_err(Failure::input)?;
+        if beacons.iter().any(|b| b.frame == k) {
+            frames.push((k, pixels));
+        }
+    }
+    if frames.is_empty() {
+        return Err(Failure::Input(anyhow!(
+            "{}: no position belongs to any of the {total} frames of {}; its first is for frame {}",
+            args.truth.display(),
+            args.frames.display(),
+            beacons.first().map_or(0, |b| b.frame)
+        )));
+    }
+    Ok(frames)
+}
+
+fn report(c: &Calibrated) -> Vec<String> {
+    let fitted = &c.fitted;
+    let k = &fitted.calibration;
+    let d = &k.distortion;
+    let mut lines = vec![format!(
+        "{} frames, {} positions believed, {} rejected, {} frames unexplained; reduced χ² {:.3}",
+        c.frames,
+        fitted.believed.len(),
+        fitted.rejected.len(),
+        fitted.unexplained.len(),
+        fitted.reduced_chi2
+    )];
+    if !fitted.rejected.is_empty() {
+        let named: Vec<String> = fitted
+            .rejected
+            .iter()
+            .take(NAMED)
+            .map(|b| format!("{}", b.line))
+            .collect();
+        let more = fitted.rejected.len().saturating_sub(NAMED);
+        let tail = if more > 0 {
+            format!(" and {more} more")
+        } else {
+            String::new()
+        };
+        lines.push(format!("rejected positions are on lines {}{tail}", named.join(", ")));
+    }
+    if !fitted.unexplained.is_empty() {
+        let named: Vec<String> = fitted.unexplained.iter().take(NAMED).map(usize::to_string).collect();
+        lines.push(format!("unexplained frames: {}", named.join(", ")));
+    }
+    lines.push(format!(
+        "principal point {:.4}, {:.4} mm; focal scale {:.6}; k1, k2, k3 {:.5}, {:.5}, {:.5}; p1, p2 {:.6}, {:.6}",
+        1e3 * d.principal_point_m[0],
+        1e3 * d.principal_point_m[1],
+        d.focal_scale,
+        d.radial[0],
+        d.radial[1],
+        d.radial[2],
+        d.tangential[0],
+        d.tangential[1]
+    ));
+    lines.push(format!(
+        "spot {:.5} mm on axis, {:+.2} % at the corner; noise {:.4e} J; positions scatter by {:.4} m beyond the noise",
+        1e3 * k.spot_sigma_m,
+        1e2 * k.spot_growth,
+        k.noise_std_j,
+        fitted.survey_std_m
+    ));
+    lines.push(match &k.pixels {
+        None => "too few frames for gain and dark maps".to_owned(),
+        Some(maps) => {
+            let n = maps.gain.len() as f64;
+            let gain = (maps.gain.iter().map(|g| (g - 1.0).powi(2)).sum::<f64>() / n).sqrt();
+            let bad = maps.bad.iter().filter(|b| **b).count();
+            format!("gain scatter {:.3} % rms; bad pixels: {bad}", 1e2 * gain)
+        }
+    });
+    for (name, s) in [("before", c.before), ("after", c.after)] {
+        lines.push(format!(
+            "{name}: held-out positions {}, missed {}, mean squared error of the found {:.5} m², median {:.5} m²",
+            s.beacons, s.missed, s.mse_m2, s.median_m2
+        ));
+    }
+    lines
 }

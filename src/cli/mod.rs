@@ -14,6 +14,7 @@ mod run;
 mod simulate;
 mod simulated_recording;
 mod tradeoff;
+mod training_data;
 
 use std::process::ExitCode;
 
@@ -49,6 +50,8 @@ enum Command {
     Calibrate(calibrate::Args),
     /// Measure what accuracy costs in time
     Tradeoff(tradeoff::Args),
+    /// Stream simulated frames with their truth to a network's trainer
+    TrainingData(training_data::Args),
     /// Validate a config or scene without running it
     Check(check::Args),
     /// List V4L2 devices with their formats and sizes
@@ -77,6 +80,7 @@ pub fn main() -> ExitCode {
         Command::Explain(args) => explain::run(args),
         Command::Calibrate(args) => calibrate::run(args),
         Command::Tradeoff(args) => tradeoff::run(args),
+        Command::TrainingData(args) => training_data::run(args),
         Command::Check(args) => check::run(args),
         Command::Devices(args) => devices::run(args),
         Command::Completions(args) => completions::run(args),

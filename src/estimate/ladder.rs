@@ -3,6 +3,7 @@
 use std::time::{Duration, Instant};
 
 use super::basis::Basis;
+use super::corrected::Corrected;
 use super::fit::{Fitter, Model, Nuisances};
 use super::noise::Inspection;
 use super::reading::Reading;
@@ -116,11 +117,12 @@ pub fn build(config: &Config, camera: &Camera) -> Result<Box<dyn Estimator>, Con
             found: budget,
         });
     }
-    Ok(Box::new(Analytic::new(
-        rung,
-        camera,
-        config.budget_ms.map(|ms| Duration::from_secs_f64(ms * 1e-3)),
-    )))
+    let budget = config.budget_ms.map(|ms| Duration::from_secs_f64(ms * 1e-3));
+    let estimator = Box::new(Analytic::new(rung, camera, budget));
+    Ok(match &camera.pixels {
+        Some(maps) => Box::new(Corrected::new(estimator, maps.clone(), camera.saturation_j)),
+        None => estimator,
+    })
 }
 
 /// A rung without a learned part.

@@ -4,6 +4,7 @@
 mod basis;
 mod bound;
 mod config;
+mod corrected;
 mod emitter;
 mod fit;
 mod ground;

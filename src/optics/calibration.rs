@@ -102,10 +102,10 @@ impl Calibration {
             self.noise_std_j,
             self.noise_std_j > 0.0,
         )?;
-        // Emitters are fitted up to 2σ outside the sensor.
+        // Emitters are also fitted a little outside the sensor; how the lens bends far out there is a guess anyway.
         let corner = |k: usize| {
             let half = [camera.x.half_width(), camera.y.half_width()][k];
-            half + 2.0 * self.spot_sigma_m + d.principal_point_m[k].abs()
+            half + (2.0 * self.spot_sigma_m).min(0.1 * half) + d.principal_point_m[k].abs()
         };
         let r_max = corner(0).hypot(corner(1)) / (camera.plane_distance_m * d.focal_scale);
         if !d.is_invertible(r_max) {

@@ -1,3 +1,4 @@
 //! Floor 4: studies: what accuracy costs in time, numerical stability, training data.
 
 pub mod tradeoff;
+pub mod samples;
