@@ -11,6 +11,7 @@ mod man;
 mod review;
 mod run;
 mod simulate;
+mod stability;
 mod tradeoff;
 
 use std::process::ExitCode;
@@ -47,6 +48,8 @@ enum Command {
     Calibrate(calibrate::Args),
     /// Measure what accuracy costs in time
     Tradeoff(tradeoff::Args),
+    /// Try the program on hard cases and print what holds
+    Stability(stability::Args),
     /// Validate a config or scene without running it
     Check(check::Args),
     /// List V4L2 devices with their formats and sizes
@@ -75,6 +78,7 @@ pub fn main() -> ExitCode {
         Command::Explain(args) => explain::run(args),
         Command::Calibrate(args) => calibrate::run(args),
         Command::Tradeoff(args) => tradeoff::run(args),
+        Command::Stability(args) => stability::run(args),
         Command::Check(args) => check::run(args),
         Command::Devices(args) => devices::run(args),
         Command::Completions(args) => completions::run(args),
