@@ -45,12 +45,14 @@ pub fn run(args: Args) -> Outcome {
     let text = markdown(&rows);
     println!("{text}");
     if let Some(path) = &args.out {
-        std::fs::write(path, &text)
-            .map_err(|e| Failure::other(anyhow::anyhow!("{}: {e}", path.display())))?;
+        std::fs::write(path, &text).map_err(|e| Failure::other(anyhow::anyhow!("{}: {e}", path.display())))?;
     }
     let broken = rows.iter().filter(|r| !r.holds).count();
     if broken > 0 {
-        return Err(Failure::other(anyhow::anyhow!("{broken} of {} promises do not hold", rows.len())));
+        return Err(Failure::other(anyhow::anyhow!(
+            "{broken} of {} promises do not hold",
+            rows.len()
+        )));
     }
     println!("All {} promises hold.", rows.len());
     Ok(())

@@ -79,14 +79,23 @@ fn unequal(ratio: f64) -> Case {
             let tally = observe(options, &camera, |rng| {
                 let [x, y] = anywhere(&camera, 6e-3, rng);
                 let sources = vec![
-                    Source { sensor_m: [x - 2e-3, y], energy_j: faint },
-                    Source { sensor_m: [x + 2e-3, y], energy_j: ratio * faint },
+                    Source {
+                        sensor_m: [x - 2e-3, y],
+                        energy_j: faint,
+                    },
+                    Source {
+                        sensor_m: [x + 2e-3, y],
+                        energy_j: ratio * faint,
+                    },
                 ];
                 (expose(&camera, &sources, rng), sources)
             });
             let (clean, stray) = tally.strays(&camera, LIMIT, |t| t.iter().map(|s| s.sensor_m).collect());
             let counted = tally.share_counted();
-            let remark = format!("both seen in {:.0} %; {stray} of {clean} clean positions astray", 100.0 * counted);
+            let remark = format!(
+                "both seen in {:.0} %; {stray} of {clean} clean positions astray",
+                100.0 * counted
+            );
             tally.observed(stray == 0 && counted >= 0.9, &remark)
         },
     )
@@ -115,7 +124,10 @@ fn at_edge(past: f64) -> Case {
             });
             let (clean, stray) = tally.strays(&camera, LIMIT, |t| t.iter().map(|s| s.sensor_m).collect());
             let counted = tally.share_counted();
-            let remark = format!("seen in {:.0} %; {stray} of {clean} clean positions astray", 100.0 * counted);
+            let remark = format!(
+                "seen in {:.0} %; {stray} of {clean} clean positions astray",
+                100.0 * counted
+            );
             tally.observed(stray == 0 && (!is_visible || counted >= 0.9), &remark)
         },
     )
@@ -142,12 +154,18 @@ fn at_corner() -> Case {
 }
 
 fn nobody() -> Case {
-    Case::new(GROUP, "nobody", "every peak is noise", "none found in 99 % of frames", |options| {
-        let camera = camera([64, 64], 1e-3);
-        let tally = observe(options, &camera, |rng| (expose(&camera, &[], rng), Vec::new()));
-        let alarms = options.frames - (tally.share_counted() * options.frames as f64).round() as usize;
-        tally.observed(alarms * 100 <= options.frames, &format!("{alarms} false alarms"))
-    })
+    Case::new(
+        GROUP,
+        "nobody",
+        "every peak is noise",
+        "none found in 99 % of frames",
+        |options| {
+            let camera = camera([64, 64], 1e-3);
+            let tally = observe(options, &camera, |rng| (expose(&camera, &[], rng), Vec::new()));
+            let alarms = options.frames - (tally.share_counted() * options.frames as f64).round() as usize;
+            tally.observed(alarms * 100 <= options.frames, &format!("{alarms} false alarms"))
+        },
+    )
 }
 
 fn faint() -> Case {
@@ -166,7 +184,10 @@ fn faint() -> Case {
                 (expose(&camera, &[source], rng), vec![source])
             });
             let (clean, stray) = tally.strays(&camera, LIMIT, |t| t.iter().map(|s| s.sensor_m).collect());
-            tally.observed(stray * 100 <= options.frames, &format!("{stray} of {clean} clean positions astray"))
+            tally.observed(
+                stray * 100 <= options.frames,
+                &format!("{stray} of {clean} clean positions astray"),
+            )
         },
     )
 }
@@ -217,7 +238,10 @@ fn line_of_five() -> Case {
                 (expose(&camera, &sources, rng), sources)
             });
             let (clean, stray) = tally.strays(&camera, LIMIT, |t| t.iter().map(|s| s.sensor_m).collect());
-            tally.observed(stray * 100 <= clean, &format!("{stray} of {clean} clean positions astray"))
+            tally.observed(
+                stray * 100 <= clean,
+                &format!("{stray} of {clean} clean positions astray"),
+            )
         },
     )
 }

@@ -2,7 +2,6 @@
 
 use std::sync::Arc;
 
-use ndarray::s;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
@@ -85,7 +84,10 @@ fn agreement(differences: impl Iterator<Item = f64>, limit: f64) -> Observed {
     let apart = all.iter().filter(|d| **d > limit).count();
     let worst = all.iter().copied().fold(0.0, f64::max);
     Observed {
-        happened: format!("{apart} of {} frames differ; the largest difference is {worst:.1e} σ", all.len()),
+        happened: format!(
+            "{apart} of {} frames differ; the largest difference is {worst:.1e} σ",
+            all.len()
+        ),
         holds: apart == 0,
     }
 }
@@ -109,7 +111,11 @@ fn unit(exponent: i32) -> Case {
                 frame.pixels *= scale;
                 let b = locate(options, &after, &frame);
                 let energies = |e: &Estimate, s: f64| e.emitters.iter().map(|e| e.energy_j * s).sum::<f64>();
-                let ratio = if a.emitters.is_empty() { 1.0 } else { energies(&b, 1.0) / energies(&a, scale) };
+                let ratio = if a.emitters.is_empty() {
+                    1.0
+                } else {
+                    energies(&b, 1.0) / energies(&a, scale)
+                };
                 let off = if (ratio - 1.0).abs() < 1e-9 { 0.0 } else { f64::INFINITY };
                 difference(&a, &b, |p| p).max(off)
             });
@@ -118,7 +124,10 @@ fn unit(exponent: i32) -> Case {
     )
 }
 
-fn mirrored(name: &'static str, turn: impl Fn(&Camera, &mut Frame) -> (Camera, fn([f64; 2]) -> [f64; 2]) + 'static) -> Case {
+fn mirrored(
+    name: &'static str,
+    turn: impl Fn(&Camera, &mut Frame) -> (Camera, fn([f64; 2]) -> [f64; 2]) + 'static,
+) -> Case {
     Case::new(
         GROUP,
         name,
@@ -192,7 +201,10 @@ fn threads() -> Case {
             let camera = Arc::new(camera([32, 32], 1e-3));
             let frames: Arc<Vec<Frame>> = Arc::new(scene(options, &camera).into_iter().map(|(f, _)| f).collect());
             let bits = |e: &Estimate| -> Vec<u64> {
-                let numbers = e.emitters.iter().flat_map(|e| [e.x_m, e.y_m, e.energy_j, e.cov_m2[0][0], e.cov_m2[0][1]]);
+                let numbers = e
+                    .emitters
+                    .iter()
+                    .flat_map(|e| [e.x_m, e.y_m, e.energy_j, e.cov_m2[0][0], e.cov_m2[0][1]]);
                 numbers.map(f64::to_bits).collect()
             };
             let expected: Vec<_> = frames.iter().map(|f| bits(&locate(options, &camera, f))).collect();
@@ -215,7 +227,12 @@ fn threads() -> Case {
             let differing = workers
                 .into_iter()
                 .map(|w| w.join().expect("no panic"))
-                .flat_map(|seen| seen.into_iter().zip(&expected).map(|(a, b)| usize::from(a != *b)).collect::<Vec<_>>())
+                .flat_map(|seen| {
+                    seen.into_iter()
+                        .zip(&expected)
+                        .map(|(a, b)| usize::from(a != *b))
+                        .collect::<Vec<_>>()
+                })
                 .sum::<usize>();
             Observed {
                 happened: format!("{differing} of {} answers differ", 4 * frames.len()),
@@ -246,7 +263,7 @@ fn no_worse_than_nothing() -> Case {
                     })
                     .collect();
                 let residual = &frame.pixels - &noiseless(&camera, &found).pixels;
-                let squares = |a: &ndarray::Array2<f64>| a.slice(s![.., ..]).iter().map(|v| v * v).sum::<f64>();
+                let squares = |a: &ndarray::Array2<f64>| a.iter().map(|v| v * v).sum::<f64>();
                 worst = worst.max(squares(&residual) / squares(&frame.pixels));
             }
             Observed {

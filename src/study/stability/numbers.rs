@@ -108,7 +108,8 @@ fn densities() -> Case {
                     let spread = law.scintillation_index().sqrt().min(1.0);
                     let step = 0.02 * spread.min(1.0);
                     let left = (40.0 / alpha.min(beta)).min(60.0 * spread.max(1.0 / alpha.min(beta)));
-                    let n = ((left + 12.0 * spread.max(0.02) + 6.0 * (1.0 + law.scintillation_index()).ln()) / step) as usize;
+                    let n = ((left + 12.0 * spread.max(0.02) + 6.0 * (1.0 + law.scintillation_index()).ln()) / step)
+                        as usize;
                     let integral: f64 = (0..n)
                         .map(|k| {
                             let u = k as f64 * step - left;
@@ -194,7 +195,8 @@ fn grazing() -> Case {
                     let back = geometry::ground_from_angles(h, angles)[0];
                     let allowed = 8.0 * f64::EPSILON * (1.0 + p / h);
                     let returns = allowed > 0.1 || (back - p).abs() <= allowed * p;
-                    let is_sound = length.is_finite() && (0.0..=1.0).contains(&cos) && angles[0] <= std::f64::consts::FRAC_PI_2;
+                    let is_sound =
+                        length.is_finite() && (0.0..=1.0).contains(&cos) && angles[0] <= std::f64::consts::FRAC_PI_2;
                     tried += 1;
                     if !(is_sound && returns) {
                         bad.push(format!("{p} m at {h} m: L {length}, cos {cos}, back {back}"));
@@ -244,7 +246,8 @@ fn huge_costs() -> Case {
             for c_max in [f64::MIN_POSITIVE, 1e-9, 1.0, 7.5, 1e300] {
                 let m = assign(12, 9, c_max, value);
                 tried += 1;
-                let is_whole = m.pairs.len() + m.unmatched_rows.len() == 12 && m.pairs.len() + m.unmatched_columns.len() == 9;
+                let is_whole =
+                    m.pairs.len() + m.unmatched_rows.len() == 12 && m.pairs.len() + m.unmatched_columns.len() == 9;
                 if !is_whole || m.pairs.iter().any(|&(i, j)| !(value(i, j) < c_max)) {
                     bad.push(format!("penalty {c_max:e}: {m:?}"));
                 }
@@ -255,16 +258,22 @@ fn huge_costs() -> Case {
 }
 
 fn empty_sides() -> Case {
-    Case::new(ASSIGNMENT, "0 × 5, 5 × 0, 0 × 0", "nothing to match", "everybody is left alone", |_| {
-        let alone = |r, c| {
-            let m = assign(r, c, 1.0, |_, _| 0.0);
-            m.pairs.is_empty() && m.unmatched_rows.len() == r && m.unmatched_columns.len() == c
-        };
-        Observed {
-            happened: "tried".to_owned(),
-            holds: alone(0, 5) && alone(5, 0) && alone(0, 0),
-        }
-    })
+    Case::new(
+        ASSIGNMENT,
+        "0 × 5, 5 × 0, 0 × 0",
+        "nothing to match",
+        "everybody is left alone",
+        |_| {
+            let alone = |r, c| {
+                let m = assign(r, c, 1.0, |_, _| 0.0);
+                m.pairs.is_empty() && m.unmatched_rows.len() == r && m.unmatched_columns.len() == c
+            };
+            Observed {
+                happened: "tried".to_owned(),
+                holds: alone(0, 5) && alone(5, 0) && alone(0, 0),
+            }
+        },
+    )
 }
 
 /// Costs (i + 1)(j + 1) make the nearest-first choice as bad as it can be.

@@ -12,7 +12,8 @@ pub fn markdown(rows: &[Row]) -> String {
             );
         }
         let holds = if row.holds { "yes" } else { "**no**" };
-        let cells = [row.name.as_str(), row.hard, row.expected, row.happened.as_str(), holds].map(|c| c.replace('|', "\\|"));
+        let cells =
+            [row.name.as_str(), row.hard, row.expected, row.happened.as_str(), holds].map(|c| c.replace('|', "\\|"));
         text += &format!("| {} |\n", cells.join(" | "));
     }
     text

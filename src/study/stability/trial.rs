@@ -10,7 +10,7 @@ use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal, Uniform};
 
 use super::{Observed, Options};
-use crate::estimate::{self, Error, Estimate, Estimator, Flags};
+use crate::estimate::{self, Error, Estimate, Flags};
 use crate::frame::Frame;
 use crate::optics::{Camera, Config, psf};
 
@@ -102,11 +102,7 @@ pub fn frame(pixels: Array2<f64>) -> Frame {
 }
 
 /// Shows the estimator `options.frames` frames that `make` draws.
-pub fn observe(
-    options: &Options,
-    camera: &Camera,
-    make: impl Fn(&mut ChaCha8Rng) -> (Frame, Vec<Source>),
-) -> Tally {
+pub fn observe(options: &Options, camera: &Camera, make: impl Fn(&mut ChaCha8Rng) -> (Frame, Vec<Source>)) -> Tally {
     let build = || estimate::build(&options.estimator, camera).expect("a known estimator");
     let mut estimator = build();
     let mut rng = ChaCha8Rng::seed_from_u64(options.seed);
@@ -118,7 +114,9 @@ pub fn observe(
             Ok(outcome) => {
                 tally.slowest = tally.slowest.max(start.elapsed());
                 if let Ok(estimate) = &outcome {
-                    tally.faults.extend(faults(estimate).into_iter().map(|f| format!("frame {k}: {f}")));
+                    tally
+                        .faults
+                        .extend(faults(estimate).into_iter().map(|f| format!("frame {k}: {f}")));
                 }
                 tally.sightings.push(Sighting { truth, outcome });
             }
@@ -136,14 +134,28 @@ pub fn faults(estimate: &Estimate) -> Vec<String> {
     let mut found = Vec::new();
     for (i, e) in estimate.emitters.iter().enumerate() {
         let [[a, b], [c, d]] = e.cov_m2;
-        let numbers = [e.x_m, e.y_m, a, b, c, d, e.energy_j, e.energy_std_j, e.sensor_m[0], e.sensor_m[1]];
+        let numbers = [
+            e.x_m,
+            e.y_m,
+            a,
+            b,
+            c,
+            d,
+            e.energy_j,
+            e.energy_std_j,
+            e.sensor_m[0],
+            e.sensor_m[1],
+        ];
         if !numbers.iter().all(|v| v.is_finite()) {
             found.push(format!("emitter {i} is not finite: {e:?}"));
         }
         // The determinant of a correlation matrix is off by its rounding, a few ulp of 1.
         let correlation2 = if b == 0.0 { 0.0 } else { (b / a) * (b / d) };
         if b != c || a < 0.0 || d < 0.0 || correlation2 > 1.0 + 1e-12 {
-            found.push(format!("emitter {i}'s covariance is not symmetric positive semi-definite: {:?}", e.cov_m2));
+            found.push(format!(
+                "emitter {i}'s covariance is not symmetric positive semi-definite: {:?}",
+                e.cov_m2
+            ));
         }
         if e.energy_j < 0.0 || e.energy_std_j < 0.0 {
             found.push(format!("emitter {i} has energy {} ± {}", e.energy_j, e.energy_std_j));
@@ -209,7 +221,11 @@ impl Tally {
     /// The tally in words, and whether it is free of panics and faults and `holds` besides.
     pub fn observed(&self, holds: bool, remark: &str) -> Observed {
         let (least, most) = self.counts();
-        let flagged = self.estimates().flat_map(|(_, e)| &e.emitters).filter(|e| e.flags.intersects(WARNING)).count();
+        let flagged = self
+            .estimates()
+            .flat_map(|(_, e)| &e.emitters)
+            .filter(|e| e.flags.intersects(WARNING))
+            .count();
         let mut happened = if least == most {
             format!("{least} found")
         } else {
