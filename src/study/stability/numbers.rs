@@ -104,12 +104,12 @@ fn densities() -> Case {
                             bad.push(format!("{law:?} at {rho}: {}", law.ln_density(rho)));
                         }
                     }
-                    // Over u = ln ρ the integrand falls as exp(min(α, β)·u) to the left and faster to the right.
-                    let spread = law.scintillation_index().sqrt().min(1.0);
-                    let step = 0.02 * spread.min(1.0);
-                    let left = (40.0 / alpha.min(beta)).min(60.0 * spread.max(1.0 / alpha.min(beta)));
-                    let n = ((left + 12.0 * spread.max(0.02) + 6.0 * (1.0 + law.scintillation_index()).ln()) / step)
-                        as usize;
+                    // Over u = ln ρ the integrand is bell-shaped about 0 and falls as exp(min(α, β)·u) to the left.
+                    let spread = (1.0 / alpha + 1.0 / beta).sqrt();
+                    let step = 0.1 * spread.min(1.0);
+                    let left = 10.0 * spread + 30.0 / alpha.min(beta);
+                    let right = 10.0 * spread + 6.0;
+                    let n = ((left + right) / step) as usize;
                     let integral: f64 = (0..n)
                         .map(|k| {
                             let u = k as f64 * step - left;
