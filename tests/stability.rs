@@ -1,6 +1,9 @@
 //! Every promise of the stability study's catalogue that holds in seconds, and the checks that the study cannot make of itself.
 
+mod reference;
+
 use oapwatch::estimate;
+use oapwatch::optics::Config;
 use oapwatch::study::stability::{Options, catalogue, markdown, trial};
 use proptest::prelude::*;
 
@@ -53,6 +56,51 @@ fn a_malformed_estimate_is_noticed() {
     assert!(broken(|e| e.cov_m2[0][0] = -1e-12));
     assert!(broken(|e| e.cov_m2[0][1] = 1e-9 + e.cov_m2[0][0]));
     assert!(broken(|e| e.energy_j = -1.0));
+}
+
+#[test]
+fn claimed_covariances_are_the_cramer_rao_bound_as_two_emitters_approach() {
+    let rows = reference::table(
+        include_str!("reference/bound.csv"),
+        ["d", "ratio", "xx", "xy", "yy", "energy"],
+    );
+    // One unit a pixel, σ and noise 1, ground and sensor alike.
+    let config = Config {
+        altitude_m: 1.0,
+        plane_distance_m: 1.0,
+        pixels: [16, 16],
+        sensor_size_m: [16.0, 16.0],
+        spot_sigma_m: Some(1.0),
+        noise_std_j: 1.0,
+        ..Config::default()
+    };
+    let camera = config.camera().expect("a valid camera");
+    // Below 0.5σ nobody can tell the two apart at this signal-to-noise ratio.
+    let resolvable = rows.into_iter().filter(|row| row[0] >= 0.5);
+    let errors = resolvable.flat_map(|[d, ratio, xx, xy, yy, energy]| {
+        let half = 0.5 * d / 2f64.sqrt();
+        let sources = [(-half, 1e3), (half, 1e3 * ratio)].map(|(shift, energy_j)| trial::Source {
+            sensor_m: [0.3 + shift, 0.3 + shift],
+            energy_j,
+        });
+        let mut estimator = estimate::build(&estimate::Config::default(), &camera).expect("the default");
+        let found = estimator
+            .estimate(&trial::noiseless(&camera, &sources))
+            .expect("a usable frame")
+            .emitters;
+        assert_eq!(found.len(), 2, "d = {d}, 1:{ratio}");
+        let first = found.iter().min_by(|a, b| a.x_m.total_cmp(&b.x_m)).expect("two");
+        let [[a, b], [_, c]] = first.cov_m2;
+        [
+            (a - xx) / xx,
+            (b - xy) / xx,
+            (c - yy) / yy,
+            first.energy_std_j.powi(2) / energy - 1.0,
+        ]
+        .map(f64::abs)
+    });
+    // The fit stops within 1e-3 of a standard deviation of the truth, where the bound itself changes by that much.
+    assert!(reference::quantiles("covariance against the bound", errors).max <= 1e-2);
 }
 
 proptest! {
