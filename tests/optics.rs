@@ -37,6 +37,40 @@ fn pixel_derivatives_are_exact_to_1e_12() {
 }
 
 #[test]
+fn hard_pixels_are_exact_to_1e_12() {
+    let rows = table(
+        include_str!("reference/hard_pixel.csv"),
+        ["lo_m", "hi_m", "centre_m", "sigma_m", "fraction", "d_centre", "d_sigma"],
+    );
+    let errors = rows
+        .into_iter()
+        .flat_map(|[lo, hi, c, s, fraction, d_centre, d_sigma]| {
+            let r = psf::pixel_response(lo, hi, c, s);
+            let scale = d_sigma.abs().max(fraction / s);
+            [
+                relative(r.fraction, fraction),
+                relative(r.d_centre, d_centre),
+                (r.d_sigma - d_sigma).abs() / scale,
+            ]
+        });
+    assert!(quantiles("hard pixels", errors).max <= 1e-12);
+}
+
+#[test]
+fn hard_gamma_gamma_densities_are_exact_to_1e_10() {
+    let rows = table(
+        include_str!("reference/hard_gamma_gamma.csv"),
+        ["alpha", "beta", "rho", "ln_density"],
+    );
+    // Where f is below 1e-300 an ulp of ln f is already 1e-13 of f; there the error is relative to ln f.
+    let errors = rows.into_iter().map(|[alpha, beta, rho, exact]| {
+        let error = GammaGamma { alpha, beta }.ln_density(rho) - exact;
+        error.abs() / (exact.abs() / 700.0).max(1.0)
+    });
+    assert!(quantiles("hard Gamma-Gamma densities", errors).max <= 1e-10);
+}
+
+#[test]
 fn response_and_fraction_are_the_same_number() {
     for [lo, hi, c, s, ..] in pixels() {
         assert_eq!(

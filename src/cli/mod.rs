@@ -13,6 +13,7 @@ mod review;
 mod run;
 mod simulate;
 mod simulated_recording;
+mod stability;
 mod tradeoff;
 mod training_data;
 
@@ -52,6 +53,8 @@ enum Command {
     Tradeoff(tradeoff::Args),
     /// Stream simulated frames with their truth to a network's trainer
     TrainingData(training_data::Args),
+    /// Try the program on hard cases and print what holds
+    Stability(stability::Args),
     /// Validate a config or scene without running it
     Check(check::Args),
     /// List V4L2 devices with their formats and sizes
@@ -81,6 +84,7 @@ pub fn main() -> ExitCode {
         Command::Calibrate(args) => calibrate::run(args),
         Command::Tradeoff(args) => tradeoff::run(args),
         Command::TrainingData(args) => training_data::run(args),
+        Command::Stability(args) => stability::run(args),
         Command::Check(args) => check::run(args),
         Command::Devices(args) => devices::run(args),
         Command::Completions(args) => completions::run(args),

@@ -68,6 +68,12 @@ pub(super) fn invert(l: &[f64], n: usize, out: &mut [f64]) {
         row[i] = 1.0;
         solve(l, n, row);
     }
+    // Each column is rounded on its own; what is handed on must be symmetric to the last bit.
+    for i in 0..n {
+        for j in 0..i {
+            out[j * n + i] = out[i * n + j];
+        }
+    }
 }
 
 #[cfg(test)]

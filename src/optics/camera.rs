@@ -101,7 +101,10 @@ impl Camera {
         let scale = self.altitude_m / (a * d - b * c);
         let j = [[scale * d, -scale * b], [-scale * c, scale * a]];
         let half: [[f64; 2]; 2] = j.map(|row| std::array::from_fn(|k| row[0] * cov[0][k] + row[1] * cov[1][k]));
-        half.map(|row| std::array::from_fn(|k| row[0] * j[k][0] + row[1] * j[k][1]))
+        let entry = |r: usize, k: usize| half[r][0] * j[k][0] + half[r][1] * j[k][1];
+        // The two off-diagonal entries would be rounded apart.
+        let off = entry(0, 1);
+        [[entry(0, 0), off], [off, entry(1, 1)]]
     }
 
     /// Whether a ground position is imaged onto the array (`fov_limits`).

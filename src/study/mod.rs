@@ -1,4 +1,5 @@
 //! Floor 4: studies: what accuracy costs in time, numerical stability, training data.
 
-pub mod tradeoff;
 pub mod samples;
+pub mod stability;
+pub mod tradeoff;

@@ -41,6 +41,7 @@ pub fn quantiles(what: &str, errors: impl Iterator<Item = f64>) -> Quantiles {
     result
 }
 
+#[allow(dead_code, reason = "each test file takes what it needs")]
 /// |value − exact|/|exact|, and 0 where both are 0.
 pub fn relative(value: f64, exact: f64) -> f64 {
     if value == exact {

@@ -1,0 +1,59 @@
+use std::path::PathBuf;
+
+use super::{Failure, Outcome};
+use crate::estimate;
+use crate::study::stability::{Options, catalogue, markdown};
+
+#[derive(Debug, clap::Args)]
+pub struct Args {
+    /// Frames of each kind
+    #[arg(long, value_name = "N", default_value_t = 20, value_parser = clap::value_parser!(u32).range(1..))]
+    frames: u32,
+    #[arg(long, value_name = "S", default_value_t = 1)]
+    seed: u64,
+    /// The estimator to try; the default one when left out
+    #[arg(long, value_name = "NAME")]
+    estimator: Option<String>,
+    /// Only cases whose group or name contains this
+    #[arg(long, value_name = "TEXT")]
+    only: Option<String>,
+    /// Write the tables to this file as Markdown as well
+    #[arg(long, value_name = "FILE")]
+    out: Option<PathBuf>,
+}
+
+pub fn run(args: Args) -> Outcome {
+    let options = Options {
+        frames: args.frames as usize,
+        seed: args.seed,
+        estimator: estimate::Config {
+            name: args.estimator,
+            ..estimate::Config::default()
+        },
+    };
+    if let Some(name) = &options.estimator.name {
+        estimate::rung(name).map_err(Failure::input)?;
+    }
+    let wanted = |text: &str| args.only.as_ref().is_none_or(|only| text.contains(only.as_str()));
+    let mut rows = Vec::new();
+    for case in catalogue() {
+        if wanted(case.group) || wanted(&case.name) {
+            eprintln!("{}: {}", case.group, case.name);
+            rows.push(case.run(&options));
+        }
+    }
+    let text = markdown(&rows);
+    println!("{text}");
+    if let Some(path) = &args.out {
+        std::fs::write(path, &text).map_err(|e| Failure::other(anyhow::anyhow!("{}: {e}", path.display())))?;
+    }
+    let broken = rows.iter().filter(|r| !r.holds).count();
+    if broken > 0 {
+        return Err(Failure::other(anyhow::anyhow!(
+            "{broken} of {} promises do not hold",
+            rows.len()
+        )));
+    }
+    println!("All {} promises hold.", rows.len());
+    Ok(())
+}

@@ -1,0 +1,109 @@
+//! Cameras that nobody builds, and units that nobody uses.
+
+use super::Case;
+use super::emitters::LIMIT;
+use super::trial::{Source, camera, energy, expose, observe};
+use crate::optics::{BlurConfig, Camera, Config};
+
+const GROUP: &str = "Sensors";
+
+pub(super) fn cases() -> Vec<Case> {
+    let mut cases = Vec::new();
+    for ratio in [1e-6, 1e-3, 0.03, 0.1, 0.3] {
+        cases.push(shows(
+            format!("σ_eff = {ratio} pixel"),
+            "the place within a pixel leaves no trace",
+            move || camera([32, 32], ratio * 0.03 / 32.0),
+        ));
+    }
+    for ratio in [0.5, 1.0, 10.0, 1e3] {
+        cases.push(shows(
+            format!("σ_eff = {ratio} sensor widths"),
+            "every place looks alike",
+            move || camera([32, 32], ratio * 0.03),
+        ));
+    }
+    for pixels in [[1, 1], [1, 64], [64, 1], [2, 2], [3, 5], [100, 100]] {
+        cases.push(shows(
+            format!("{} × {} pixels", pixels[0], pixels[1]),
+            "fewer numbers than unknowns, or more than usual",
+            move || camera(pixels, 1e-3),
+        ));
+    }
+    for pixels in [[64, 48], [10, 100], [100, 2]] {
+        cases.push(shows(
+            format!("{} × {} pixels on a square", pixels[0], pixels[1]),
+            "pixels that are not square",
+            move || camera(pixels, 1e-3),
+        ));
+    }
+    for (z, altitude) in [(1e-9, 300.0), (0.036, 1e9), (0.036, 1e-3), (1e3, 1e-6)] {
+        cases.push(shows(
+            format!("z = {z:e} m, h_u = {altitude:e} m"),
+            "ground and sensor differ by up to 3e11 in scale: grazing angles, or none",
+            move || Camera {
+                plane_distance_m: z,
+                altitude_m: altitude,
+                ..camera([32, 32], 1e-3)
+            },
+        ));
+    }
+    for (what, z) in [("z = f", 0.036), ("z → 0", 1e-12)] {
+        cases.push(shows(
+            format!("blur from the lens, {what}"),
+            "σ_eff from diffraction alone, or from the whole aperture",
+            move || {
+                Config {
+                    plane_distance_m: z,
+                    lens_radius_m: 0.002,
+                    pixels: [32, 32],
+                    blur: Some(BlurConfig {
+                        focal_length_m: 0.036,
+                        wavelength_m: 1.55e-6,
+                        sensor_sigma_m: 0.0,
+                    }),
+                    ..Config::default()
+                }
+                .camera()
+                .expect("a valid camera")
+            },
+        ));
+    }
+    for snr in [1e-6, 1e-2, 1e6, 1e9, 1e12, 1e15] {
+        cases.push(shows_at(
+            format!("signal-to-noise ratio {snr:e}"),
+            "noise overwhelming, or below the rounding of the data",
+            snr,
+            || camera([32, 32], 1e-3),
+        ));
+    }
+    cases
+}
+
+fn shows(name: String, hard: &'static str, camera: impl Fn() -> Camera + 'static) -> Case {
+    shows_at(name, hard, 300.0, camera)
+}
+
+/// An emitter near the middle, seen by an odd camera.
+fn shows_at(name: String, hard: &'static str, snr: f64, camera: impl Fn() -> Camera + 'static) -> Case {
+    Case::new(
+        GROUP,
+        name,
+        hard,
+        "no position without a warning off by more than 6 of its own σ",
+        move |options| {
+            let camera = camera();
+            let source = Source {
+                sensor_m: [0.137 * camera.x.half_width(), -0.211 * camera.y.half_width()],
+                energy_j: energy(&camera, snr),
+            };
+            let tally = observe(options, &camera, |rng| (expose(&camera, &[source], rng), vec![source]));
+            let (clean, stray) = tally.strays(&camera, LIMIT, |t| t.iter().map(|s| s.sensor_m).collect());
+            let remark = format!(
+                "seen in {:.0} %; {stray} of {clean} clean positions astray",
+                100.0 * tally.share_counted()
+            );
+            tally.observed(stray == 0, &remark)
+        },
+    )
+}
