@@ -25,7 +25,6 @@ pub enum Error {
 
 /// Owns everything that one frame after another goes through.
 pub struct Pipeline {
-    camera: Camera,
     estimator: Box<dyn Estimator>,
     pub claims: Store,
     pub monitor: Monitor,
@@ -57,7 +56,6 @@ impl Pipeline {
             estimator: estimate::build(&config.estimator, camera)?,
             claims: Store::new(&config.claims),
             monitor: Monitor::new(&config.monitor, &config.claims, camera, source),
-            camera: camera.clone(),
         })
     }
 
@@ -72,13 +70,10 @@ impl Pipeline {
         }
     }
 
-    /// One frame through calibration, estimation and cross-check. The frame is left corrected.
-    pub fn step(&mut self, frame: &mut Frame) -> Step {
+    /// One frame through calibration, estimation and cross-check.
+    pub fn step(&mut self, frame: &Frame) -> Step {
         let began = Instant::now();
         let digest = frame.digest();
-        if let Some(maps) = &self.camera.pixels {
-            maps.correct(frame, self.camera.saturation_j);
-        }
         let estimate = self.estimator.estimate(frame);
         let estimated = Instant::now();
         let observation = Observation {

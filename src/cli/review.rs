@@ -1,15 +1,16 @@
 use std::io::Write;
+use std::iter::from_fn;
 use std::path::PathBuf;
 use std::time::Duration;
 
 use anyhow::anyhow;
 
 use super::{Failure, Outcome};
-use crate::claims::{Store, read_log};
+use crate::claims::{self, read_log};
 use crate::config::Config;
 use crate::frames::{self, Next, SourceKind};
-use crate::monitor::{AlertEvent, Monitor, Observation, Source};
-use crate::{claims, estimate};
+use crate::monitor::AlertEvent;
+use crate::pipeline::Pipeline;
 
 #[derive(Debug, clap::Args)]
 pub struct Args {
@@ -22,8 +23,6 @@ pub struct Args {
 /// same bytes however fast it is read.
 pub fn run(args: Args) -> Outcome {
     let mut config = Config::load(&args.config).map_err(Failure::config)?;
-    config.monitor.validate().map_err(Failure::config)?;
-    config.claims.validate().map_err(Failure::config)?;
     let camera = config.optics.camera().map_err(Failure::config)?;
     if config.source.kind != SourceKind::Replay {
         return Err(Failure::config(anyhow!(
@@ -33,47 +32,23 @@ pub fn run(args: Args) -> Outcome {
     }
     config.source.speed = 0.0;
     config.source.r#loop = false;
-    let mut estimator = estimate::build(&config.estimator, &camera).map_err(Failure::config)?;
+    let mut pipeline = Pipeline::new(&config, &camera).map_err(Failure::config)?;
     let mut source = frames::open(&config.source, &camera).map_err(|e| match e.is_config() {
         true => Failure::config(e),
         false => Failure::input(e),
     })?;
     let mut upcoming = claims_of(&config.claims)?.into_iter().peekable();
-    let mut store = Store::new(&config.claims);
-    let mut monitor = Monitor::new(
-        &config.monitor,
-        &config.claims,
-        &camera,
-        Source {
-            kind: config.source.kind.name().into(),
-            file: source.file().map(|f| f.display().to_string()),
-            rate_hz: config.source.rate_hz,
-        },
-    );
     let mut out = std::io::BufWriter::new(std::io::stdout().lock());
     loop {
         let report = match source.next(Duration::from_secs(1)) {
             Next::Frame(frame, with_frame) => {
-                while let Some(claim) = upcoming.next_if(|c| c.time <= frame.time) {
-                    store.insert(claim, frame.time);
-                }
-                for claim in with_frame {
-                    store.insert(claim, frame.time);
-                }
-                let result = estimator.estimate(&frame);
-                let seen = Observation {
-                    frame: frame.index,
-                    time: frame.time,
-                    result: result.as_ref(),
-                    digest: frame.digest(),
-                };
-                monitor.step(seen, &mut store)
+                pipeline.claim(from_fn(|| upcoming.next_if(|c| c.time <= frame.time)), frame.time);
+                pipeline.claim(with_frame, frame.time);
+                pipeline.step(&frame).report
             }
             Next::Unusable { index, time, reason } => {
-                while let Some(claim) = upcoming.next_if(|c| c.time <= time) {
-                    store.insert(claim, time);
-                }
-                monitor.unusable(index, time, &reason, &mut store)
+                pipeline.claim(from_fn(|| upcoming.next_if(|c| c.time <= time)), time);
+                pipeline.unusable(index, time, &reason)
             }
             Next::Nothing => continue,
             Next::End => break,

@@ -82,13 +82,13 @@ impl Compute {
         self.outlet.close();
     }
 
-    fn frame(&mut self, mut frame: Frame, arrived: Instant) {
+    fn frame(&mut self, frame: Frame, arrived: Instant) {
         let Step {
             report,
             estimate,
             estimation,
             verdicts,
-        } = self.pipeline.step(&mut frame);
+        } = self.pipeline.step(&frame);
         let s = &mut self.state;
         s.counts.captured += 1;
         s.clock = frame.time;
