@@ -2,6 +2,7 @@
 //! independent judge) and never claims (an attacker writes those).
 
 mod basis;
+mod bound;
 mod config;
 mod emitter;
 mod fit;
@@ -16,6 +17,7 @@ mod screen;
 mod search;
 mod spot;
 
+pub use bound::position_bound;
 pub use config::Config;
 pub use emitter::{Emitter, Estimate, Flags};
 pub use ladder::{ConfigError, DEFAULT, LADDER, Rung, build, rung};

@@ -1,0 +1,155 @@
+//! What accuracy costs in time: every rung of the ladder on the same frames, against the Cramér–Rao bound.
+
+mod picture;
+mod report;
+mod scene;
+mod score;
+
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+
+pub use scene::{Cell, Noise};
+pub use score::Row;
+
+/// What to measure.
+#[derive(Clone, Debug)]
+pub struct Plan {
+    pub cells: Vec<Cell>,
+    /// Frames a cell.
+    pub frames: usize,
+    pub seed: u64,
+}
+
+/// Why a study could not be finished.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    #[error("{path}: {source}")]
+    Io { path: PathBuf, source: std::io::Error },
+    #[error("{path}: not a trade-off study: {source}")]
+    Malformed { path: PathBuf, source: serde_json::Error },
+    #[error("cell {cell}: {source}")]
+    Optics { cell: String, source: crate::optics::Error },
+    #[error(transparent)]
+    Estimator(#[from] crate::estimate::ConfigError),
+    #[error("{path}: {message}")]
+    Picture { path: PathBuf, message: PictureError },
+}
+
+/// What the plotting library said.
+#[derive(Debug)]
+pub struct PictureError(Box<dyn std::error::Error + Send + Sync>);
+
+impl std::fmt::Display for PictureError {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        self.0.fmt(f)
+    }
+}
+
+/// The study's file: rows are found again by cell, rung, frames and seed.
+#[derive(Debug, Default, Serialize, Deserialize)]
+pub struct Study {
+    pub rows: Vec<Row>,
+}
+
+impl Plan {
+    /// Both readings of the noise, σ_eff 0.5 to 10 mm, arrays of 10 to 100, and emitters from 1 to 40.
+    pub fn full() -> Self {
+        let mut cells = Vec::new();
+        for sigma_mm in [0.5, 1.0, 2.0, 4.0, 6.0, 8.0] {
+            cells.push(Cell::new(Noise::Energy, sigma_mm, 64));
+        }
+        for sigma_mm in [1.0, 2.0, 4.0, 8.0, 10.0] {
+            cells.push(Cell::new(Noise::Paper, sigma_mm, 64));
+        }
+        for pixels in [10, 20, 40, 60, 80, 100] {
+            cells.push(Cell::new(Noise::Paper, 8.0, pixels));
+            cells.push(Cell::new(Noise::Energy, 1.0, pixels));
+        }
+        for emitters in [1, 5, 9, 20, 40] {
+            cells.push(Cell::new(Noise::Energy, 1.0, 100).holding(emitters));
+        }
+        Self {
+            cells,
+            frames: 250,
+            seed: 1,
+        }
+    }
+
+    /// The same picture from few cells and frames, under a minute.
+    pub fn quick() -> Self {
+        let mut cells = vec![
+            Cell::new(Noise::Energy, 1.0, 64),
+            Cell::new(Noise::Energy, 2.0, 64),
+            Cell::new(Noise::Energy, 4.0, 20),
+        ];
+        cells.extend([10, 20, 40, 60, 100].map(|pixels| Cell::new(Noise::Paper, 8.0, pixels)));
+        cells.extend([1, 20].map(|emitters| Cell::new(Noise::Energy, 1.0, 100).holding(emitters)));
+        Self {
+            cells,
+            frames: 12,
+            seed: 1,
+        }
+    }
+
+    /// Measurements that the plan asks for.
+    pub fn len(&self) -> usize {
+        self.cells.len() * crate::estimate::LADDER.len()
+    }
+
+    pub fn is_empty(&self) -> bool {
+        self.cells.is_empty()
+    }
+}
+
+/// Runs what `out` does not hold yet and writes tradeoff.json after each row, tradeoff.md and the pictures at the end.
+/// `progress` is told of each row.
+pub fn run(plan: &Plan, out: &Path, progress: &mut dyn FnMut(&Row)) -> Result<Study, Error> {
+    let io = |path: &Path| {
+        let path = path.to_owned();
+        move |source| Error::Io { path, source }
+    };
+    std::fs::create_dir_all(out).map_err(io(out))?;
+    let file = out.join("tradeoff.json");
+    let mut study = match std::fs::read(&file) {
+        Ok(bytes) => serde_json::from_slice(&bytes).map_err(|source| Error::Malformed {
+            path: file.clone(),
+            source,
+        })?,
+        Err(e) if e.kind() == std::io::ErrorKind::NotFound => Study::default(),
+        Err(e) => return Err(io(&file)(e)),
+    };
+    let mut kept = Vec::new();
+    for cell in &plan.cells {
+        let mut scenes = None;
+        for rung in crate::estimate::LADDER {
+            let known = study
+                .rows
+                .iter()
+                .find(|r| r.cell == *cell && r.rung == rung.name && r.frames == plan.frames && r.seed == plan.seed);
+            let row = match known {
+                Some(row) => row.clone(),
+                None => {
+                    let scenes = match &mut scenes {
+                        Some(scenes) => scenes,
+                        none => none.insert(cell.scenes(plan.frames, plan.seed)?),
+                    };
+                    let row = score::measure(cell, rung, scenes, plan.seed)?;
+                    study.rows.push(row.clone());
+                    let bytes = serde_json::to_vec_pretty(&study).expect("rows are plain numbers and names");
+                    let partial = out.join("tradeoff.json.part");
+                    std::fs::write(&partial, bytes).map_err(io(&partial))?;
+                    std::fs::rename(&partial, &file).map_err(io(&file))?;
+                    row
+                }
+            };
+            progress(&row);
+            kept.push(row);
+        }
+    }
+    let study = Study { rows: kept };
+    let table = out.join("tradeoff.md");
+    std::fs::write(&table, report::markdown(&study)).map_err(io(&table))?;
+    picture::draw(&study, out)?;
+    Ok(study)
+}

@@ -1,0 +1,220 @@
+use std::path::Path;
+
+use plotters::prelude::*;
+
+use super::report::{PAPER, cells, front, is_paper_cell};
+use super::{Error, PictureError, Row, Study};
+use crate::estimate::LADDER;
+
+const SIZE: (u32, u32) = (900, 600);
+const FONT: (&str, i32) = ("sans-serif", 16);
+const CAPTION: (&str, i32) = ("sans-serif", 22);
+
+type Drawn = Result<(), Box<dyn std::error::Error + Send + Sync>>;
+
+/// Draws the three pictures into `out`.
+pub(super) fn draw(study: &Study, out: &Path) -> Result<(), Error> {
+    type Draw = fn(&Study, &Path) -> Drawn;
+    let pictures: [(&str, Draw); 3] = [
+        ("accuracy-time.svg", accuracy_against_time),
+        ("accuracy-array.svg", accuracy_against_array),
+        ("resolvable.svg", resolvable),
+    ];
+    for (name, draw) in pictures {
+        let path = out.join(name);
+        draw(study, &path).map_err(|e| Error::Picture {
+            path: path.clone(),
+            message: PictureError(e),
+        })?;
+    }
+    Ok(())
+}
+
+fn range(values: impl Iterator<Item = f64> + Clone) -> std::ops::Range<f64> {
+    let usable = values.filter(|v| v.is_finite() && *v > 0.0);
+    let lo = usable.clone().fold(f64::INFINITY, f64::min);
+    let hi = usable.fold(0.0, f64::max);
+    if lo > hi { 0.1..10.0 } else { 0.5 * lo..2.0 * hi }
+}
+
+fn colour(index: usize) -> RGBColor {
+    let (r, g, b) = Palette99::pick(index).rgb();
+    RGBColor(r, g, b)
+}
+
+/// The cell that the comparison is drawn for: the paper's hardest at about 60 pixels, or the first there is.
+fn subject(study: &Study) -> Vec<&Row> {
+    let cells = cells(study);
+    let near = |rows: &Vec<&Row>| is_paper_cell(rows[0]).then(|| rows[0].cell.pixels.abs_diff(60));
+    let best = cells.iter().filter(|r| near(r).is_some()).min_by_key(|r| near(r));
+    best.or(cells.first()).cloned().unwrap_or_default()
+}
+
+fn accuracy_against_time(study: &Study, path: &Path) -> Drawn {
+    let rows = subject(study);
+    let Some(first) = rows.first() else { return Ok(()) };
+    let area = SVGBackend::new(path, SIZE).into_drawing_area();
+    area.fill(&WHITE)?;
+    let bound = first.bound_median_m2.unwrap_or(f64::NAN);
+    let errors = rows.iter().filter_map(|r| r.median_m2).chain([bound]);
+    let mut chart = ChartBuilder::on(&area)
+        .caption(format!("{}: accuracy against time", first.cell.name()), CAPTION)
+        .margin(12)
+        .x_label_area_size(45)
+        .y_label_area_size(80)
+        .build_cartesian_2d(
+            range(rows.iter().map(|r| r.latency_median_us)).log_scale(),
+            range(errors).log_scale(),
+        )?;
+    chart
+        .configure_mesh()
+        .x_desc("median time a frame, µs")
+        .y_desc("median squared error, m²")
+        .x_label_formatter(&|v| format!("{v:.0}"))
+        .y_label_formatter(&|v| format!("{v:.0e}"))
+        .label_style(FONT)
+        .draw()?;
+    let times = range(rows.iter().map(|r| r.latency_median_us));
+    chart
+        .draw_series(LineSeries::new(
+            [(times.start, bound), (times.end, bound)],
+            BLACK.stroke_width(1),
+        ))?
+        .label("Cramér–Rao bound (median)")
+        .legend(|(x, y)| PathElement::new([(x, y), (x + 18, y)], BLACK));
+    let edge = front(&rows);
+    let line = edge.iter().filter_map(|r| Some((r.latency_median_us, r.median_m2?)));
+    chart
+        .draw_series(LineSeries::new(line, BLUE.stroke_width(2)))?
+        .label("Pareto front (time, OSPA)")
+        .legend(|(x, y)| PathElement::new([(x, y), (x + 18, y)], BLUE));
+    for row in &rows {
+        let Some(error) = row.median_m2 else { continue };
+        let at = (row.latency_median_us, error);
+        chart.draw_series([Circle::new(at, 5, BLUE.filled())])?;
+        chart.draw_series([Text::new(
+            format!("  {} (OSPA {:.2} m)", row.rung, row.ospa_m),
+            at,
+            FONT.into_font(),
+        )])?;
+    }
+    chart
+        .configure_series_labels()
+        .border_style(BLACK)
+        .background_style(WHITE)
+        .draw()?;
+    area.present()?;
+    Ok(())
+}
+
+fn accuracy_against_array(study: &Study, path: &Path) -> Drawn {
+    let rows: Vec<&Row> = study.rows.iter().filter(|r| is_paper_cell(r)).collect();
+    let area = SVGBackend::new(path, SIZE).into_drawing_area();
+    area.fill(&WHITE)?;
+    let errors = rows
+        .iter()
+        .flat_map(|r| [r.mean_m2, r.bound_median_m2])
+        .flatten()
+        .chain(PAPER.iter().flat_map(|p| [p.1, p.2]));
+    let mut chart = ChartBuilder::on(&area)
+        .caption("σ_eff 8 mm, paper reading: accuracy against array size", CAPTION)
+        .margin(12)
+        .x_label_area_size(45)
+        .y_label_area_size(80)
+        .build_cartesian_2d(0.0..105.0, range(errors).log_scale())?;
+    chart
+        .configure_mesh()
+        .x_desc("pixels a side")
+        .y_desc("mean squared error, m²")
+        .y_label_formatter(&|v| format!("{v:.0e}"))
+        .label_style(FONT)
+        .draw()?;
+    let mut lines: Vec<(String, Vec<(f64, f64)>)> = LADDER
+        .iter()
+        .map(|rung| {
+            let own = rows.iter().filter(|r| r.rung == rung.name);
+            (
+                rung.name.to_owned(),
+                own.filter_map(|r| Some((r.cell.pixels as f64, r.mean_m2?))).collect(),
+            )
+        })
+        .collect();
+    let hybrid = PAPER.iter().map(|p| (p.0 as f64, p.1)).collect();
+    let unet = PAPER.iter().map(|p| (p.0 as f64, p.2)).collect();
+    lines.push(("the paper's hybrid".into(), hybrid));
+    lines.push(("the paper's U-Net".into(), unet));
+    let bound = rows.iter().filter(|r| r.rung == LADDER[0].name);
+    let bound = bound
+        .filter_map(|r| Some((r.cell.pixels as f64, r.bound_median_m2?)))
+        .collect();
+    lines.push(("Cramér–Rao bound (median)".into(), bound));
+    for (index, (name, mut points)) in lines.into_iter().enumerate() {
+        points.sort_by(|a, b| a.0.total_cmp(&b.0));
+        let style = colour(index).stroke_width(2);
+        chart
+            .draw_series(LineSeries::new(points, style).point_size(3))?
+            .label(name)
+            .legend(move |(x, y)| PathElement::new([(x, y), (x + 18, y)], style));
+    }
+    chart
+        .configure_series_labels()
+        .border_style(BLACK)
+        .background_style(WHITE)
+        .draw()?;
+    area.present()?;
+    Ok(())
+}
+
+fn resolvable(study: &Study, path: &Path) -> Drawn {
+    let cells: Vec<&Row> = cells(study)
+        .into_iter()
+        .map(|r| r[0])
+        .filter(|r| r.cell.emitters.is_none())
+        .collect();
+    let area = SVGBackend::new(path, SIZE).into_drawing_area();
+    area.fill(&WHITE)?;
+    let mut chart = ChartBuilder::on(&area)
+        .caption("Share of emitters that any estimator can resolve", CAPTION)
+        .margin(12)
+        .x_label_area_size(45)
+        .y_label_area_size(60)
+        .build_cartesian_2d(0.0..11.0, 0.0..1.05)?;
+    chart
+        .configure_mesh()
+        .x_desc("σ_eff, mm")
+        .y_desc("share")
+        .label_style(FONT)
+        .draw()?;
+    for (index, (noise, name)) in [
+        (super::Noise::Energy, "energy reading"),
+        (super::Noise::Paper, "paper reading"),
+    ]
+    .into_iter()
+    .enumerate()
+    {
+        let style = colour(index).filled();
+        let points = cells.iter().filter(|r| r.cell.noise == noise);
+        chart
+            .draw_series(
+                points
+                    .clone()
+                    .map(|r| Circle::new((r.cell.sigma_mm, r.resolvable), 5, style)),
+            )?
+            .label(name)
+            .legend(move |(x, y)| Circle::new((x + 9, y), 5, style));
+        chart.draw_series(points.map(|r| {
+            Text::new(
+                format!("  {0}×{0}", r.cell.pixels),
+                (r.cell.sigma_mm, r.resolvable),
+                FONT.into_font(),
+            )
+        }))?;
+    }
+    chart
+        .configure_series_labels()
+        .border_style(BLACK)
+        .background_style(WHITE)
+        .draw()?;
+    area.present()?;
+    Ok(())
+}

@@ -1,0 +1,153 @@
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use rand_distr::{Distribution, Gamma, Normal};
+use serde::{Deserialize, Serialize};
+
+use super::Error;
+use crate::estimate::position_bound;
+use crate::frame::Frame;
+use crate::optics::{self, Camera, psf, radiometry};
+
+/// Which reading of the paper's N₀ = 10⁻¹² a cell takes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Noise {
+    /// σ_n = 10⁻⁶ J.
+    Energy,
+    /// The same signal-to-noise ratio as the paper's literal formula: σ_n = 10⁻⁶·2π σ_eff².
+    Paper,
+}
+
+/// One setting: its frames are drawn from the paper's scene.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Cell {
+    pub noise: Noise,
+    pub sigma_mm: f64,
+    /// Pixels a side.
+    pub pixels: usize,
+    /// Emitters a frame; 5 to 9 when left out.
+    pub emitters: Option<usize>,
+}
+
+/// A frame with its truth.
+pub(super) struct Scene {
+    pub frame: Frame,
+    pub positions: Vec<[f64; 2]>,
+    pub bound_m2: Vec<f64>,
+}
+
+const AREA_HALF_M: f64 = 125.0;
+const POWER_W: f64 = 1.0;
+const BEAM_RADIUS_M: f64 = 0.6;
+const POINTING_STD_M: f64 = 0.1;
+/// τ·η_s·T_int.
+const COLLECTED: f64 = 0.9 * 0.9;
+const ATTENUATION_PER_M: f64 = 1e-3;
+/// (α, β) of the Gamma–Gamma fading, and the coherence times within one exposure.
+const FADING: [f64; 2] = [4.0, 2.0];
+const COHERENCE_TIMES: usize = 100;
+
+impl Cell {
+    pub fn new(noise: Noise, sigma_mm: f64, pixels: usize) -> Self {
+        Self {
+            noise,
+            sigma_mm,
+            pixels,
+            emitters: None,
+        }
+    }
+
+    /// The same cell with a fixed number of emitters.
+    pub fn holding(self, emitters: usize) -> Self {
+        Self {
+            emitters: Some(emitters),
+            ..self
+        }
+    }
+
+    /// Short name: reading, σ_eff in mm, pixels a side, and emitters where fixed.
+    pub fn name(&self) -> String {
+        let reading = match self.noise {
+            Noise::Energy => 'E',
+            Noise::Paper => 'P',
+        };
+        let emitters = self.emitters.map_or(String::new(), |n| format!(", N = {n}"));
+        format!("{reading}{}/{}{emitters}", self.sigma_mm, self.pixels)
+    }
+
+    pub fn camera(&self) -> Result<Camera, Error> {
+        let sigma = 1e-3 * self.sigma_mm;
+        let config = optics::Config {
+            pixels: [self.pixels; 2],
+            spot_sigma_m: Some(sigma),
+            noise_std_j: match self.noise {
+                Noise::Energy => 1e-6,
+                Noise::Paper => 1e-6 * std::f64::consts::TAU * sigma * sigma,
+            },
+            ..Default::default()
+        };
+        config.camera().map_err(|source| Error::Optics {
+            cell: self.name(),
+            source,
+        })
+    }
+
+    /// Draws frames from the paper's scene.
+    pub(super) fn scenes(&self, frames: usize, seed: u64) -> Result<Vec<Scene>, Error> {
+        let camera = self.camera()?;
+        Ok((0..frames)
+            .map(|k| {
+                // A stream a frame: more frames leave the first ones as they were.
+                let mut rng = ChaCha8Rng::seed_from_u64(seed);
+                rng.set_stream(k as u64);
+                self.scene(&camera, k as u64, &mut rng)
+            })
+            .collect())
+    }
+
+    fn scene(&self, camera: &Camera, index: u64, rng: &mut ChaCha8Rng) -> Scene {
+        let drawn = rng.random_range(5..=9);
+        let positions: Vec<[f64; 2]> = (0..self.emitters.unwrap_or(drawn))
+            .map(|_| std::array::from_fn(|_| rng.random_range(-AREA_HALF_M..AREA_HALF_M)))
+            .collect();
+        let energies: Vec<f64> = positions.iter().map(|&p| energy(camera, p, rng)).collect();
+        let noise = Normal::new(0.0, camera.noise_std_j).expect("a camera's noise is positive and finite");
+        let mut pixels = ndarray::Array2::from_shape_simple_fn(camera.shape(), || noise.sample(rng));
+        let (mut row, mut column) = (vec![0.0; camera.x.n], vec![0.0; camera.y.n]);
+        for (&p, &e) in positions.iter().zip(&energies) {
+            let [x, y] = camera.to_sensor(p);
+            psf::profile(&camera.x, x, camera.spot_sigma_m, &mut row);
+            psf::profile(&camera.y, y, camera.spot_sigma_m, &mut column);
+            for ((b, a), pixel) in pixels.indexed_iter_mut() {
+                *pixel += e * column[b] * row[a];
+            }
+        }
+        Scene {
+            frame: Frame {
+                index,
+                time: jiff::Timestamp::UNIX_EPOCH,
+                pixels,
+                masked: None,
+            },
+            bound_m2: position_bound(camera, &positions, &energies),
+            positions,
+        }
+    }
+}
+
+/// Collected energy of one emitter, J: the mean over the coherence times of fading and pointing.
+fn energy(camera: &Camera, [x, y]: [f64; 2], rng: &mut ChaCha8Rng) -> f64 {
+    let h = camera.altitude_m;
+    let length = (h * h + x * x + y * y).sqrt();
+    let gammas = FADING.map(|shape| Gamma::new(shape, 1.0 / shape).expect("positive shapes"));
+    let jitter = Normal::new(0.0, POINTING_STD_M).expect("a positive deviation");
+    let scale: f64 = (0..COHERENCE_TIMES)
+        .map(|_| {
+            let fading: f64 = gammas.iter().map(|g| g.sample(rng)).product();
+            let offset = jitter.sample(rng).hypot(jitter.sample(rng));
+            fading * radiometry::flat_aperture_fraction(camera.lens_radius_m, BEAM_RADIUS_M, offset)
+        })
+        .sum::<f64>()
+        / COHERENCE_TIMES as f64;
+    POWER_W * COLLECTED * radiometry::path_transmission(ATTENUATION_PER_M, length) * scale * h / length
+}

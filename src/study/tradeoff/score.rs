@@ -1,0 +1,137 @@
+use std::time::Instant;
+
+use serde::{Deserialize, Serialize};
+
+use super::Error;
+use super::scene::{Cell, Scene};
+use crate::assign::ospa;
+use crate::estimate::{self, Rung};
+
+/// OSPA's cutoff, m.
+const CUTOFF_M: f64 = 25.0;
+/// An emitter is resolvable where its bound's root is below this share of the distance to the next and below 10 m.
+const RESOLVABLE_SHARE: f64 = 0.1;
+const RESOLVABLE_M: f64 = 10.0;
+
+/// One rung in one cell.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Row {
+    pub cell: Cell,
+    pub rung: String,
+    pub frames: usize,
+    pub seed: u64,
+    /// Squared error over matched pairs, both axes summed; none where nothing was matched.
+    pub mean_m2: Option<f64>,
+    pub median_m2: Option<f64>,
+    /// Mean of the smallest 95 %.
+    pub trimmed_m2: Option<f64>,
+    /// Median of the emitters' Cramér–Rao bounds.
+    pub bound_median_m2: Option<f64>,
+    /// Mean of squared error over bound among resolvable emitters, the largest 5 % left out and the mean of a χ² variate
+    /// of two degrees of freedom so trimmed divided out: 1 is at the bound.
+    pub bound_ratio: Option<f64>,
+    pub ospa_m: f64,
+    pub missed: usize,
+    pub invented: usize,
+    /// Share of frames with the number of emitters right; the same among frames with all emitters resolvable.
+    pub count_right: f64,
+    pub count_right_resolvable: Option<f64>,
+    /// Share of emitters that can be resolved at all.
+    pub resolvable: f64,
+    pub latency_median_us: f64,
+    pub latency_p99_us: f64,
+}
+
+/// Mean of an exponential variate's smallest 95 %: (1 − 0.05(1 + ln 20))/0.95.
+const TRIMMED_EXPONENTIAL: f64 = 0.842_329_8;
+
+pub(super) fn measure(cell: &Cell, rung: &Rung, scenes: &[Scene], seed: u64) -> Result<Row, Error> {
+    let config = estimate::Config {
+        name: Some(rung.name.to_owned()),
+        ..Default::default()
+    };
+    let mut estimator = estimate::build(&config, &cell.camera()?)?;
+    let (mut squared, mut ratios, mut bounds, mut latencies) = (vec![], vec![], vec![], vec![]);
+    let (mut total_ospa, mut missed, mut invented) = (0.0, 0, 0);
+    let (mut right, mut clear, mut clear_right, mut resolvable) = (0, 0, 0, 0);
+    if let Some(scene) = scenes.first() {
+        // Scratch memory grows with the first frame.
+        let _ = estimator.estimate(&scene.frame);
+    }
+    for scene in scenes {
+        let clock = Instant::now();
+        let found = estimator.estimate(&scene.frame);
+        latencies.push(clock.elapsed().as_secs_f64() * 1e6);
+        let positions: Vec<[f64; 2]> = found
+            .map(|e| e.emitters.iter().map(|m| [m.x_m, m.y_m]).collect())
+            .unwrap_or_default();
+        let score = ospa(&scene.positions, &positions, CUTOFF_M);
+        total_ospa += score.distance_m;
+        missed += score.matching.unmatched_rows.len();
+        invented += score.matching.unmatched_columns.len();
+        let is_resolvable: Vec<bool> = (0..scene.positions.len()).map(|i| is_resolvable(scene, i)).collect();
+        let is_clear = is_resolvable.iter().all(|&r| r);
+        let is_right = positions.len() == scene.positions.len();
+        right += usize::from(is_right);
+        clear += usize::from(is_clear);
+        clear_right += usize::from(is_clear && is_right);
+        resolvable += is_resolvable.iter().filter(|r| **r).count();
+        bounds.extend_from_slice(&scene.bound_m2);
+        for &(i, j) in &score.matching.pairs {
+            let (t, p) = (scene.positions[i], positions[j]);
+            let error = (t[0] - p[0]).powi(2) + (t[1] - p[1]).powi(2);
+            squared.push(error);
+            if is_resolvable[i] {
+                ratios.push(error / scene.bound_m2[i]);
+            }
+        }
+    }
+    let frames = scenes.len();
+    for values in [&mut squared, &mut ratios, &mut bounds, &mut latencies] {
+        values.sort_by(f64::total_cmp);
+    }
+    let emitters = bounds.len().max(1);
+    Ok(Row {
+        cell: *cell,
+        rung: rung.name.to_owned(),
+        frames,
+        seed,
+        mean_m2: mean(&squared),
+        median_m2: quantile(&squared, 0.5),
+        trimmed_m2: trimmed(&squared),
+        bound_median_m2: quantile(&bounds, 0.5),
+        bound_ratio: trimmed(&ratios).map(|r| r / TRIMMED_EXPONENTIAL),
+        ospa_m: total_ospa / frames.max(1) as f64,
+        missed,
+        invented,
+        count_right: right as f64 / frames.max(1) as f64,
+        count_right_resolvable: (clear > 0).then(|| clear_right as f64 / clear as f64),
+        resolvable: resolvable as f64 / emitters as f64,
+        latency_median_us: quantile(&latencies, 0.5).unwrap_or(0.0),
+        latency_p99_us: quantile(&latencies, 0.99).unwrap_or(0.0),
+    })
+}
+
+fn is_resolvable(scene: &Scene, i: usize) -> bool {
+    let p = scene.positions[i];
+    let others = scene.positions.iter().enumerate().filter(|(j, _)| *j != i);
+    let nearest = others
+        .map(|(_, q)| (p[0] - q[0]).hypot(p[1] - q[1]))
+        .fold(f64::INFINITY, f64::min);
+    let error = scene.bound_m2[i].sqrt();
+    error < RESOLVABLE_SHARE * nearest && error < RESOLVABLE_M
+}
+
+fn mean(sorted: &[f64]) -> Option<f64> {
+    (!sorted.is_empty()).then(|| sorted.iter().sum::<f64>() / sorted.len() as f64)
+}
+
+fn trimmed(sorted: &[f64]) -> Option<f64> {
+    mean(&sorted[..(sorted.len() as f64 * 0.95).ceil() as usize])
+}
+
+fn quantile(sorted: &[f64], share: f64) -> Option<f64> {
+    sorted
+        .get(((sorted.len().max(1) - 1) as f64 * share).round() as usize)
+        .copied()
+}
