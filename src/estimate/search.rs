@@ -85,13 +85,15 @@ impl Search {
             width: Width::Known,
         };
         let mut model = self.start(reading, &frame.pixels, plain, 60);
-        if !reading.is_explained(&model) {
-            let levels = [Width::Known, Width::Common, Width::PerAxis].map(|width| Nuisances {
-                background: true,
-                width,
-            });
-            for nuisances in levels {
-                if reading.is_explained(&model) || nuisances == model.nuisances {
+        // A background has singular values of its own: what the first start explained with it may hold ghosts.
+        if !reading.is_explained(&model) || model.nuisances != plain {
+            for width in [Width::Known, Width::Common, Width::PerAxis] {
+                let nuisances = Nuisances {
+                    background: true,
+                    width,
+                };
+                let is_settled = reading.is_explained(&model) && width != Width::Known;
+                if is_settled || nuisances == plain || self.is_exhausted() {
                     continue;
                 }
                 let next = self.start(reading, &frame.pixels, nuisances, 60);
@@ -100,6 +102,7 @@ impl Search {
                 }
             }
         }
+        self.fitter.work = self.fitter.work.min(0.7 * MOST_WORK);
         self.refine(reading, &mut model, ROUNDS);
         self.simplify(reading, &mut model);
         self.fitter.fit(reading, &mut model, FINAL_STEPS);
@@ -225,63 +228,58 @@ impl Search {
         model
     }
 
-    /// Seeds by the pencil for rising N until the frame is explained: as configured first, then with a background and
-    /// another width, both of which have singular values of their own.
+    /// Seeds by the pencil for rising N until the frame is explained.
     fn pencil(&mut self, reading: &Reading, pixels: &[f64], nuisances: Nuisances, polish: usize) -> Option<Model> {
         let pencil = Pencil::new(pixels, &self.fitter.bx, &self.fitter.by)?;
-        let sure = pencil.strength.iter().take_while(|&&s| s > 4.0).count();
-        let likely = pencil.strength.iter().take_while(|&&s| s > 0.5).count();
-        let last = (likely + 2).min(pencil.most()).min(MOST);
         let mut best = Model::empty(nuisances);
         self.fitter.fit(reading, &mut best, TRIAL_STEPS);
-        self.climb(
-            reading,
-            &pencil,
-            &mut best,
-            nuisances,
-            sure.max(1)..=last.min(sure + 3),
-            polish,
-        );
-        if polish > MINIMAL_POLISH && !reading.is_explained(&best) && nuisances == Nuisances::default() {
-            let wide = Nuisances {
-                background: true,
-                width: Width::Common,
-            };
-            let first = sure.saturating_sub(6).max(1);
-            self.climb(reading, &pencil, &mut best, wide, first..=last, polish);
-            if !reading.is_explained(&best) {
-                self.climb(reading, &pencil, &mut best, nuisances, sure + 4..=last, polish);
-            }
-        }
-        Some(best)
-    }
-
-    /// Fits the pencil's seeds for each count until `best`, which takes what scores better, explains the frame.
-    fn climb(
-        &mut self,
-        reading: &Reading,
-        pencil: &Pencil,
-        best: &mut Model,
-        nuisances: Nuisances,
-        counts: std::ops::RangeInclusive<usize>,
-        polish: usize,
-    ) {
+        let sure = pencil.strength.iter().take_while(|&&s| s > 4.0).count();
+        let likely = pencil.strength.iter().take_while(|&&s| s > 0.5).count();
         let mut worse = 0;
-        for count in counts {
-            if reading.is_explained(best) || worse == 3 || self.is_exhausted() {
+        let mut wide: Option<Model> = None;
+        let plain = nuisances == Nuisances::default() && polish > MINIMAL_POLISH;
+        // A background or another width has singular values of its own.
+        let fewest = if nuisances == Nuisances::default() {
+            sure
+        } else {
+            sure.saturating_sub(6)
+        };
+        for count in fewest.max(1)..=(likely + 2).min(pencil.most()).min(MOST) {
+            if reading.is_explained(&best) || worse == 3 || self.is_exhausted() {
                 break;
             }
             let Some(seeds) = pencil.seeds(count) else { break };
             let mut model = Model::empty(nuisances);
             model.spots.extend(seeds.into_iter().map(|u| Spot { u, a: 0.0 }));
             self.fitter.fit(reading, &mut model, polish);
-            if self.score(&model) < self.score(best) {
-                *best = model;
+            if self.score(&model) < self.score(&best) {
+                best = model;
                 worse = 0;
-            } else if best.nuisances == nuisances {
+            } else {
                 worse += 1;
             }
+            if let Some(wide) = wide.as_ref().filter(|w| reading.is_explained(w))
+                && !reading.is_explained(&best)
+                && best.spots.len() > wide.spots.len() + 1
+            {
+                break;
+            }
+            if plain && !reading.is_explained(&best) && best.spots.len() == count {
+                let mut next = best.clone();
+                next.nuisances = Nuisances {
+                    background: true,
+                    width: Width::Common,
+                };
+                self.fitter.fit(reading, &mut next, polish);
+                if wide.as_ref().is_none_or(|w| self.score(&next) < self.score(w)) {
+                    wide = Some(next);
+                }
+            }
         }
+        if let Some(wide) = wide.filter(|w| self.score(w) < self.score(&best)) {
+            best = wide;
+        }
+        Some(best)
     }
 
     /// Seeds by the pencil where spots overlap, by residual peaks elsewhere.
