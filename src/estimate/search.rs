@@ -85,13 +85,15 @@ impl Search {
             width: Width::Known,
         };
         let mut model = self.start(reading, &frame.pixels, plain, 60);
-        if !reading.is_explained(&model) {
-            let levels = [Width::Known, Width::Common, Width::PerAxis].map(|width| Nuisances {
-                background: true,
-                width,
-            });
-            for nuisances in levels {
-                if reading.is_explained(&model) || nuisances == model.nuisances {
+        // A background has singular values of its own: what the first start explained with it may hold ghosts.
+        if !reading.is_explained(&model) || model.nuisances != plain {
+            for width in [Width::Known, Width::Common, Width::PerAxis] {
+                let nuisances = Nuisances {
+                    background: true,
+                    width,
+                };
+                let is_settled = reading.is_explained(&model) && width != Width::Known;
+                if is_settled || nuisances == plain || self.is_exhausted() {
                     continue;
                 }
                 let next = self.start(reading, &frame.pixels, nuisances, 60);
@@ -100,6 +102,7 @@ impl Search {
                 }
             }
         }
+        self.fitter.work = self.fitter.work.min(0.7 * MOST_WORK);
         self.refine(reading, &mut model, ROUNDS);
         self.simplify(reading, &mut model);
         self.fitter.fit(reading, &mut model, FINAL_STEPS);
