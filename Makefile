@@ -36,3 +36,10 @@ deb: setup
 	target/dist/oapwatch completions zsh > target/completions/_oapwatch
 	target/dist/oapwatch completions fish > target/completions/oapwatch.fish
 	cargo deb --no-build --profile dist --output target/oapwatch.deb
+
+.PHONY: test-v4l2
+# Capture from a real V4L2 device (the kernel's virtual camera) in a virtual machine.
+test-v4l2: setup
+	$(call need,sh -c 'command -v qemu-system-x86_64 && command -v busybox && command -v depmod && command -v cpio && command -v v4l2-ctl && command -v xz',qemu-system-x86 busybox-static kmod cpio v4l-utils xz-utils)
+	cargo build --release --locked --bin oapwatch --example v4l2_guest
+	tests/v4l2/run.sh target/release/examples/v4l2_guest target/release/oapwatch

@@ -36,6 +36,8 @@ pub const JOURNAL_LOST: &str = "oapwatch_journal_events_lost_total";
 pub const JOURNAL_FAILURES: &str = "oapwatch_journal_write_failures_total";
 pub const JOURNAL_WRITE_SECONDS: &str = "oapwatch_journal_write_seconds";
 pub const SOURCE_CONNECTED: &str = "oapwatch_source_connected";
+pub const RECORDER_DROPPED: &str = "oapwatch_recorder_dropped_total";
+pub const RECORDER_ERRORS: &str = "oapwatch_recorder_errors_total";
 pub const SOURCE_OPENED: &str = "oapwatch_source_opened_total";
 pub const SOURCE_FRAMES_LOST: &str = "oapwatch_source_frames_lost_total";
 /// Label `fault`.
@@ -119,6 +121,11 @@ pub fn describe() {
         "Time of one transaction of the journal."
     );
     g!(SOURCE_CONNECTED, "1 while the camera is open, else 0.");
+    c!(
+        RECORDER_DROPPED,
+        "Frames and evidence not recorded because the disk could not keep up."
+    );
+    c!(RECORDER_ERRORS, "Recordings that failed: disk full, folder gone.");
     c!(SOURCE_OPENED, "Times the camera was opened.");
     c!(SOURCE_FRAMES_LOST, "Frames the driver lost before we saw them.");
     c!(SOURCE_FAULTS, "Faults of the camera, by kind.");

@@ -98,6 +98,7 @@ fn a_replay_gives_what_was_recorded_bit_for_bit_over_all_files() {
                 index: 36,
                 time: time(12),
                 reason: "short".into(),
+                claims: vec![claim(12)],
             };
             expected.push((format!("{next:?}"), name(path)));
             continue;

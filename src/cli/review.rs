@@ -40,14 +40,22 @@ pub fn run(args: Args) -> Outcome {
     let mut upcoming = claims_of(&config.claims)?.into_iter().peekable();
     let mut out = std::io::BufWriter::new(std::io::stdout().lock());
     loop {
-        let report = match source.next(Duration::from_secs(1)) {
+        let next = source.next(Duration::from_secs(1));
+        pipeline.monitor.recorded_in(source.file());
+        let report = match next {
             Next::Frame(frame, with_frame) => {
                 pipeline.claim(from_fn(|| upcoming.next_if(|c| c.time <= frame.time)), frame.time);
                 pipeline.claim(with_frame, frame.time);
                 pipeline.step(&frame).report
             }
-            Next::Unusable { index, time, reason } => {
+            Next::Unusable {
+                index,
+                time,
+                reason,
+                claims,
+            } => {
                 pipeline.claim(from_fn(|| upcoming.next_if(|c| c.time <= time)), time);
+                pipeline.claim(claims, time);
                 pipeline.unusable(index, time, &reason)
             }
             Next::Nothing => continue,

@@ -1,5 +1,6 @@
 //! The compute thread: alone owns the pipeline; takes the latest frame, then what came in beside it.
 
+use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
@@ -13,12 +14,13 @@ use super::supervisor::Supervisor;
 use crate::api::{
     Acknowledged, ClaimsStatus, Command, FrameCounts, JournalStatus, Snapshot, SourceState, SourceStatus, Status,
 };
-use crate::claims::{ClaimState, Follower, Outcome};
+use crate::claims::{Claim, ClaimState, Follower, Outcome};
 use crate::frame::Frame;
+use crate::frames::record::Recorder;
 use crate::frames::{Capture, Next};
 use crate::journal::Journal;
 use crate::metric;
-use crate::monitor::{AlertState, Report};
+use crate::monitor::{AlertEventKind, AlertState, Report};
 use crate::notify;
 use crate::optics::Camera;
 use crate::pipeline::{Pipeline, Step};
@@ -27,6 +29,8 @@ use crate::pipeline::{Pipeline, Step};
 const PATIENCE: Duration = Duration::from_millis(50);
 /// How often the claims log is looked at.
 const FOLLOW_EVERY: Duration = Duration::from_millis(100);
+/// Claims that wait for a recorder that takes nothing.
+const MOST_UNRECORDED: usize = 100_000;
 /// A source that gives nothing at all, not even word of a failure, for this long is taken for dead.
 const SILENCE: Duration = Duration::from_secs(2);
 
@@ -34,6 +38,11 @@ const SILENCE: Duration = Duration::from_secs(2);
 pub struct Compute {
     pub pipeline: Pipeline,
     pub capture: Capture,
+    pub recorder: Option<Recorder>,
+    /// Claims of the log that stand with the next frame: what a recording of them gives again.
+    pub fresh: Vec<Claim>,
+    /// Claims that the recorder has not got yet.
+    pub unrecorded: Vec<Claim>,
     pub commands: mpsc::Receiver<Command>,
     pub follower: Option<Follower>,
     pub outlet: Outlet,
@@ -62,13 +71,21 @@ impl Compute {
             match captured.next {
                 Next::Frame(frame, claims) => {
                     heard = arrived;
-                    self.pipeline.claim(claims, frame.time);
+                    self.take_claims(claims, frame.time);
                     self.obey();
+                    let recorded = self.recorder.as_mut().map(|r| r.frame(&frame, &self.unrecorded));
+                    self.recorded(recorded.flatten(), captured.file);
                     self.frame(frame, arrived);
                 }
-                Next::Unusable { index, time, reason } => {
+                Next::Unusable {
+                    index,
+                    time,
+                    reason,
+                    claims,
+                } => {
                     heard = arrived;
-                    self.unusable(index, time, reason);
+                    self.take_claims(claims, time);
+                    self.unusable(index, time, reason, captured.file);
                 }
                 Next::Nothing if !self.is_replay && heard.elapsed() > SILENCE => {
                     heard = arrived;
@@ -80,6 +97,26 @@ impl Compute {
         }
         self.supervisor.stopping();
         self.outlet.close();
+    }
+
+    /// Claims that came with a frame, and those of the log since the one before.
+    fn take_claims(&mut self, claims: Vec<Claim>, now: Timestamp) {
+        let claims = claims.into_iter().chain(self.fresh.drain(..));
+        if self.recorder.is_none() {
+            return self.pipeline.claim(claims, now);
+        }
+        let claims: Vec<Claim> = claims.collect();
+        self.unrecorded.extend_from_slice(&claims);
+        self.pipeline.claim(claims, now);
+    }
+
+    /// Lets alerts name the file that holds their frame: the recorder's, or the one being replayed.
+    fn recorded(&mut self, recorded: Option<Arc<Path>>, replayed: Option<Arc<Path>>) {
+        // What the disk could not take goes with the next frame, unless the disk is gone for good.
+        if recorded.is_some() || self.unrecorded.len() > MOST_UNRECORDED {
+            self.unrecorded.clear();
+        }
+        self.pipeline.monitor.recorded_in(recorded.or(replayed).as_deref());
     }
 
     fn frame(&mut self, frame: Frame, arrived: Instant) {
@@ -118,7 +155,12 @@ impl Compute {
         self.publish(report, Some(Arc::new(frame)));
     }
 
-    fn unusable(&mut self, index: u64, time: Timestamp, reason: String) {
+    fn unusable(&mut self, index: u64, time: Timestamp, reason: String, replayed: Option<Arc<Path>>) {
+        let recorded = self
+            .recorder
+            .as_mut()
+            .map(|r| r.unusable(index, time, &reason, &self.unrecorded));
+        self.recorded(recorded.flatten(), replayed);
         let report = self.pipeline.unusable(index, time, &reason);
         let s = &mut self.state;
         s.clock = time;
@@ -135,7 +177,9 @@ impl Compute {
     /// The source does not even report a failure.
     fn silence(&mut self) {
         let index = self.state.counts.captured;
-        self.unusable(index, Timestamp::now(), "the source gives no sign of life".to_owned());
+        let now = Timestamp::now();
+        self.take_claims(Vec::new(), now);
+        self.unusable(index, now, "the source gives no sign of life".to_owned(), None);
     }
 
     fn ended(&mut self) {
@@ -158,6 +202,9 @@ impl Compute {
     fn publish(&mut self, mut report: Report, frame: Option<Arc<Frame>>) {
         for event in &report.events {
             self.state.note(event);
+            if let (AlertEventKind::Raised, Some(recorder)) = (event.event, &mut self.recorder) {
+                recorder.evidence(&event.alert.id, report.time);
+            }
         }
         self.state.gauge(&report);
         let at = report.time;
@@ -246,6 +293,9 @@ impl Compute {
                     let now = self.now();
                     let mut refused = Vec::new();
                     for (index, claim) in claims.into_iter().enumerate() {
+                        if self.recorder.is_some() {
+                            self.unrecorded.push(claim.clone());
+                        }
                         self.state.last_claim = Some(claim.time);
                         let reason = match self.pipeline.claims.insert(claim, now) {
                             Outcome::Full => "the store of claims is full",
@@ -316,12 +366,11 @@ impl Compute {
             if let Some(last) = poll.claims.last() {
                 self.state.last_claim = Some(last.time);
             }
-            let now = if self.is_replay {
-                self.state.clock
+            if self.is_replay {
+                self.pipeline.claim(poll.claims, self.state.clock);
             } else {
-                Timestamp::now()
-            };
-            self.pipeline.claim(poll.claims, now);
+                self.fresh.extend(poll.claims);
+            }
             // A recording's first frame waits until the whole log has been read, so that no claim comes late.
             if !poll.more || !(self.is_replay && self.state.counts.captured == 0) {
                 return;

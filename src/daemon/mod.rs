@@ -19,6 +19,7 @@ use tokio::sync::{mpsc, watch};
 
 use crate::claims::Follower;
 use crate::config::Config;
+use crate::frames::record::Recorder;
 use crate::frames::{self, Capture, FrameSource, SourceKind};
 use crate::journal::Journal;
 use crate::optics::Camera;
@@ -43,6 +44,7 @@ pub struct Daemon {
     camera: Camera,
     pipeline: Pipeline,
     source: Box<dyn FrameSource>,
+    recorder: Option<Recorder>,
     server: api::Server,
     endpoints: Vec<notify::Endpoint>,
     journal: Journal,
@@ -56,6 +58,7 @@ impl Daemon {
         let server = api::Server::new(config.api.clone())?;
         let endpoints = notify::load(&config.webhook)?;
         let source = frames::open(&config.source, &camera)?;
+        let recorder = Recorder::start(&config.record)?;
         let subscriptions = endpoints.iter().map(notify::Endpoint::subscription).collect();
         let journal = Journal::open(&config.journal, subscriptions)?;
         Ok(Self {
@@ -64,6 +67,7 @@ impl Daemon {
             camera,
             pipeline,
             source,
+            recorder,
             server,
             endpoints,
             journal,
@@ -131,6 +135,9 @@ impl Daemon {
         let compute = Compute {
             pipeline: self.pipeline,
             capture: Capture::start(self.source)?,
+            recorder: self.recorder,
+            fresh: Vec::new(),
+            unrecorded: Vec::new(),
             commands: orders,
             follower: log.map(|l| Follower::new(l, &self.config.claims)),
             outlet,

@@ -51,6 +51,8 @@ pub enum Next {
         index: u64,
         time: Timestamp,
         reason: String,
+        /// As with a frame.
+        claims: Vec<Claim>,
     },
     /// Nothing yet; ask again.
     Nothing,

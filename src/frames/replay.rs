@@ -73,6 +73,7 @@ impl FrameSource for Playback {
                         index: index + 1,
                         time,
                         reason,
+                        claims: Vec::new(),
                     };
                 }
             },
@@ -168,6 +169,7 @@ impl FrameSource for Replay {
                     index,
                     time,
                     reason: error.to_string(),
+                    claims: Vec::new(),
                 }
             }
             None => Next::End,

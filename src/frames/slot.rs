@@ -146,7 +146,16 @@ mod tests {
     fn unusable(index: u64) -> Captured {
         let reason = "short".to_owned();
         let time = Timestamp::UNIX_EPOCH;
-        Captured::new(Next::Unusable { index, time, reason }, None)
+        let claims = Vec::new();
+        Captured::new(
+            Next::Unusable {
+                index,
+                time,
+                reason,
+                claims,
+            },
+            None,
+        )
     }
 
     fn take(slot: &Slot) -> (Next, u64) {

@@ -89,6 +89,14 @@ impl Book {
         }
     }
 
+    /// The recording that holds the frames from now on.
+    pub fn recorded_in(&mut self, file: Option<&std::path::Path>) {
+        let file = file.map(|f| f.display().to_string());
+        if self.source_file != file {
+            self.source_file = file;
+        }
+    }
+
     pub fn is_open(&self, cause: &Cause) -> bool {
         self.open.contains_key(cause)
     }

@@ -91,6 +91,11 @@ impl Monitor {
         }
     }
 
+    /// Names the recording that holds the frames from now on, for the alerts that they raise.
+    pub fn recorded_in(&mut self, file: Option<&std::path::Path>) {
+        self.book.recorded_in(file);
+    }
+
     /// Takes one frame. Claims due by its time stand first.
     pub fn step(&mut self, seen: Observation, claims: &mut Store) -> Report {
         let now = seen.time;

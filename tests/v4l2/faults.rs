@@ -28,9 +28,7 @@ pub const SCENARIOS: &[(&str, fn(&PrometheusHandle) -> Outcome)] = &[
     ("unplug and replug", replug),
     ("starvation", starvation),
     ("signals", signals),
-    ("time stamps that wrap", |m| {
-        wrap(m, "wrap_timestamp", "2", "timestamp_implausible")
-    }),
+    ("time stamps that wrap", timestamps_wrap),
     ("sequence numbers that wrap", sequence_wraps),
     ("device busy", busy),
     ("format refused", format_refused),
@@ -59,6 +57,7 @@ fn devices_are_listed() -> Outcome {
 fn running() -> Result<Capture, Box<dyn std::error::Error>> {
     allow(true)?;
     v4l2_ctl(CAPTURE, &["-c", "percentage_of_dropped_buffers=0"])?;
+    resize(640, 480)?;
     let config = source(|v4l2| {
         v4l2.pixel_format = Some(PixelFormat::Y16);
         v4l2.roi = Some([0, 0, 320, 320]);
@@ -67,6 +66,11 @@ fn running() -> Result<Capture, Box<dyn std::error::Error>> {
     let capture = start(&config, &camera([32, 32], 1e-9))?;
     frames_go_on(&capture)?;
     Ok(capture)
+}
+
+fn resize(width: u32, height: u32) -> Outcome {
+    let format = format!("width={width},height={height},pixelformat=Y16 ");
+    v4l2_ctl(CAPTURE, &["--set-fmt-video", &format])
 }
 
 /// Twenty frames, numbered upwards, at times that grow.
@@ -222,13 +226,16 @@ fn signals(metrics: &PrometheusHandle) -> Outcome {
     frames_go_on(&capture)
 }
 
-fn wrap(metrics: &PrometheusHandle, control: &str, setting: &str, name: &str) -> Outcome {
+/// vivid starts its clock anew with the next stream.
+fn timestamps_wrap(metrics: &PrometheusHandle) -> Outcome {
     let capture = running()?;
-    provoke(metrics, &capture, name, || {
-        v4l2_ctl(CAPTURE, &["-c", &format!("{control}={setting}")])
-    })?;
-    let went_on = frames_go_on(&capture);
-    v4l2_ctl(CAPTURE, &["-c", &format!("{control}=0")])?;
+    let went_on = provoke(metrics, &capture, "timestamp_implausible", || {
+        v4l2_ctl(CAPTURE, &["-c", "wrap_timestamp=2"])?;
+        press("inject_fatal_streaming_error")
+    })
+    .and_then(|()| frames_go_on(&capture));
+    v4l2_ctl(CAPTURE, &["-c", "wrap_timestamp=0"])?;
+    press("inject_fatal_streaming_error")?;
     went_on?;
     frames_go_on(&capture)
 }
@@ -284,7 +291,7 @@ fn format_change(metrics: &PrometheusHandle) -> Outcome {
         allow(false)?;
         press("inject_fatal_streaming_error")
     })?;
-    v4l2_ctl(CAPTURE, &["--set-dv-bt-timings", "index=10"])?;
+    resize(800, 600)?;
     provoke(metrics, &capture, "format_changed", || allow(true))?;
     frames_go_on(&capture)
 }

@@ -71,7 +71,7 @@ timeout 300 qemu-system-x86_64 -accel tcg -cpu qemu64 -smp 1 -m 512 -nodefaults 
     -serial stdio -monitor none -no-reboot -icount shift=auto,sleep=off \
     -device isa-debug-exit,iobase=0xf4,iosize=0x04 \
     -kernel "$work/vmlinux" -initrd "$work/initramfs.gz" \
-    -append "console=ttyS0 quiet panic=-1 nokaslr mitigations=off tsc=reliable no_timer_check random.trust_cpu=on cryptomgr.notests" \
+    -append "console=ttyS0 quiet loglevel=2 panic=-1 nokaslr mitigations=off tsc=reliable no_timer_check random.trust_cpu=on cryptomgr.notests" \
     < /dev/null
 code=$?
 set -e

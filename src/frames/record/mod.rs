@@ -22,6 +22,7 @@ use jiff::{SignedDuration, Timestamp};
 use super::Error;
 use crate::claim::Claim;
 use crate::frame::Frame;
+use crate::metric;
 use standing::Standing;
 use tape::{Entry, Seen, TapeReader, TapeWriter};
 
@@ -165,7 +166,7 @@ impl Recorder {
     fn order(&self, order: Order) -> bool {
         let sent = self.queue.as_ref().is_some_and(|queue| queue.try_send(order).is_ok());
         if !sent {
-            metrics::counter!("oapwatch_recorder_dropped_total").increment(1);
+            metrics::counter!(metric::RECORDER_DROPPED).increment(1);
         }
         sent
     }
@@ -208,7 +209,7 @@ impl Clerk {
                 Order::Evidence { name, time } => self.keep(&name, time),
             };
             if let Err(error) = done {
-                metrics::counter!("oapwatch_recorder_errors_total").increment(1);
+                metrics::counter!(metric::RECORDER_ERRORS).increment(1);
                 tracing::error!(%error, "not recorded");
             }
         }
@@ -250,7 +251,7 @@ impl Clerk {
 
     fn trim(&self, folder: &Path, limit_mb: f64, keep: &Path) {
         if let Err(error) = ring::trim(folder, bytes(limit_mb), keep) {
-            metrics::counter!("oapwatch_recorder_errors_total").increment(1);
+            metrics::counter!(metric::RECORDER_ERRORS).increment(1);
             tracing::error!(folder = %folder.display(), %error, "old recordings could not be removed");
         }
     }

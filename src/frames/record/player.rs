@@ -33,7 +33,7 @@ impl Player {
     pub fn next(&mut self) -> Result<Option<Seen>, Error> {
         loop {
             if let Some(mut seen) = self.tape.next()? {
-                if seen.pixels.is_some() && !self.standing.is_empty() {
+                if !self.standing.is_empty() {
                     seen.entry.claims.splice(0..0, self.standing.drain(..));
                 }
                 return Ok(Some(seen));

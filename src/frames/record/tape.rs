@@ -74,7 +74,12 @@ impl Seen {
         } = self.entry;
         let Some(pixels) = self.pixels else {
             let reason = unusable.unwrap_or_default();
-            return Next::Unusable { index, time, reason };
+            return Next::Unusable {
+                index,
+                time,
+                reason,
+                claims,
+            };
         };
         let masked = masked.map(|marked| {
             let mut mask = Array2::from_elem(pixels.dim(), false);

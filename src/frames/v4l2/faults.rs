@@ -2,6 +2,8 @@
 
 use std::time::{Duration, Instant};
 
+use crate::metric;
+
 /// A way for a device to fail, as `oapwatch_source_faults_total{fault}` names it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Fault {
@@ -109,7 +111,7 @@ pub struct Faults {
 impl Faults {
     pub fn new(device: String) -> Self {
         for fault in Fault::ALL {
-            metrics::counter!("oapwatch_source_faults_total", "fault" => fault.name()).increment(0);
+            metrics::counter!(metric::SOURCE_FAULTS, "fault" => fault.name()).increment(0);
         }
         let tally = Tally {
             unlogged: 0,
@@ -123,7 +125,7 @@ impl Faults {
     }
 
     pub fn count(&mut self, fault: Fault, details: impl std::fmt::Display) {
-        metrics::counter!("oapwatch_source_faults_total", "fault" => fault.name()).increment(1);
+        metrics::counter!(metric::SOURCE_FAULTS, "fault" => fault.name()).increment(1);
         if let Some(before) = self.tallies[fault as usize].count(Instant::now()) {
             tracing::warn!(
                 device = self.device,

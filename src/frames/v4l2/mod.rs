@@ -22,6 +22,7 @@ use v4l::v4l_sys::V4L2_BUF_FLAG_ERROR;
 
 use super::{Error, FrameSource, Next};
 use crate::frame::Frame;
+use crate::metric;
 use crate::optics::Camera;
 use clock::{Moment, Numbering, Stamped, exposed, is_monotonic};
 use faults::{Fault, Faults};
@@ -108,7 +109,7 @@ impl V4l2 {
     fn close(&mut self, fault: Fault, why: impl std::fmt::Display) {
         self.trouble = why.to_string();
         self.faults.count(fault, why);
-        metrics::gauge!("oapwatch_source_connected").set(0.0);
+        metrics::gauge!(metric::SOURCE_CONNECTED).set(0.0);
         self.state = State::Closed {
             retry_at: Instant::now() + self.retry,
         };
@@ -125,8 +126,8 @@ impl V4l2 {
                 }
                 self.numbering.restart();
                 self.last_usable = Instant::now();
-                metrics::counter!("oapwatch_source_opened_total").increment(1);
-                metrics::gauge!("oapwatch_source_connected").set(1.0);
+                metrics::counter!(metric::SOURCE_OPENED).increment(1);
+                metrics::gauge!(metric::SOURCE_CONNECTED).set(1.0);
                 let settling = self.config.settle_frames;
                 self.state = State::Open { session, settling };
             }
@@ -192,7 +193,7 @@ impl V4l2 {
                 None
             }
             Err(error) => {
-                self.close(Fault::of(&error), format_args!("dequeue: {error}"));
+                self.close(Fault::of(&error), format_args!("buffer: {error}"));
                 None
             }
         }
@@ -208,7 +209,7 @@ impl V4l2 {
     ) -> Next {
         let (index, lost) = self.numbering.number(meta.sequence);
         if lost > 0 {
-            metrics::counter!("oapwatch_source_frames_lost_total").increment(lost);
+            metrics::counter!(metric::SOURCE_FRAMES_LOST).increment(lost);
             self.faults.count(
                 Fault::SequenceGap,
                 format_args!("{lost} frames lost before frame {index}"),
@@ -228,7 +229,12 @@ impl V4l2 {
                 };
                 self.faults.count(fault, &reason);
                 self.last_told = Instant::now();
-                return Next::Unusable { index, time, reason };
+                return Next::Unusable {
+                    index,
+                    time,
+                    reason,
+                    claims: Vec::new(),
+                };
             }
         };
         let masked = to_joules(&mut pixels, saturated, self.joules_per_count, self.saturation_j);
@@ -292,6 +298,7 @@ impl FrameSource for V4l2 {
                     index: self.numbering.next(),
                     time,
                     reason,
+                    claims: Vec::new(),
                 };
             }
             if left.is_zero() {
