@@ -562,3 +562,79 @@ fn a_webhook_that_cannot_work_is_a_clear_config_error() {
         notify::load(&[local]).unwrap();
     }
 }
+
+#[tokio::test]
+async fn https_is_verified_against_the_authority_that_is_named() {
+    let dir = tempfile::tempdir().unwrap();
+    let tls = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/tls");
+    let _ = rustls::crypto::ring::default_provider().install_default();
+    let server = axum_server::tls_rustls::RustlsConfig::from_pem_file(tls.join("server.pem"), tls.join("server.key"))
+        .await
+        .unwrap();
+    let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    listener.set_nonblocking(true).unwrap();
+    let port = listener.local_addr().unwrap().port();
+    let seen: Arc<Mutex<Vec<Seen>>> = Arc::default();
+    let answer: Arc<Answer> = Arc::new(|_, _: &Seen| StatusCode::OK.into_response());
+    let app = Router::new().fallback(take).with_state((seen.clone(), answer));
+    let served = axum_server::from_tcp_rustls(listener, server)
+        .unwrap()
+        .serve(app.into_make_service());
+    let task = tokio::spawn(served);
+
+    let mut trusting = webhook(dir.path(), &format!("https://localhost:{port}/hook"));
+    trusting.name = Some("trusting".to_owned());
+    trusting.ca_file = Some(tls.join("ca.pem"));
+    let mut wary = webhook(dir.path(), &format!("https://localhost:{port}/hook"));
+    wary.name = Some("wary".to_owned());
+    let daemon = Daemon::start(&on_disk(dir.path()), &[trusting, wary], Clock::wall());
+    daemon.record(&[event(AlertEventKind::Raised, "a", AlertKind::UserUnseen)]);
+    until(|| {
+        daemon
+            .notifier
+            .status()
+            .iter()
+            .all(|s| s.sent > 0 || s.last_error.is_some())
+    })
+    .await;
+    let status = daemon.notifier.status();
+    assert_eq!((status[0].sent, &status[0].last_error), (1, &None));
+    assert_eq!(status[1].sent, 0);
+    assert!(
+        status[1].last_error.as_ref().unwrap().contains("certificate"),
+        "{:?}",
+        status[1].last_error
+    );
+    assert_eq!(seen.lock().unwrap().len(), 1);
+    daemon.stop().await;
+    task.abort();
+}
+
+#[tokio::test]
+async fn events_are_sent_while_the_disk_refuses_them_and_not_again_after() {
+    let dir = tempfile::tempdir().unwrap();
+    let receiver = Receiver::accepting().await;
+    let daemon = Daemon::start(
+        &on_disk(dir.path()),
+        &[webhook(dir.path(), &receiver.url)],
+        Clock::wall(),
+    );
+    let other = rusqlite::Connection::open(dir.path().join("a.db")).unwrap();
+    other.execute_batch("BEGIN IMMEDIATE").unwrap();
+    daemon.record(&life("a"));
+    until(|| receiver.accepted().len() == 3).await;
+    assert!(!daemon.journal.health().writable);
+    other.execute_batch("ROLLBACK").unwrap();
+    until(|| daemon.journal.health().writable && daemon.journal.health().unwritten == 0).await;
+    daemon.stop().await;
+
+    let daemon = Daemon::start(
+        &on_disk(dir.path()),
+        &[webhook(dir.path(), &receiver.url)],
+        Clock::wall(),
+    );
+    until(|| daemon.status().sent == 3).await;
+    assert_eq!(daemon.status().queued, 0);
+    assert_eq!(receiver.all().len(), 3);
+    daemon.stop().await;
+}

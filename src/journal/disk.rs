@@ -8,12 +8,13 @@ use jiff::{SignedDuration, Timestamp};
 use super::retention::Retention;
 use super::store::{Store, Write};
 use super::{Error, Subscription, health};
+use crate::metric;
 
 /// How often old alerts are looked for.
 const ROUND: SignedDuration = SignedDuration::from_hours(1);
 
-/// A wall clock that runs on by more than this between two writes was set: one round is then left out, so that a
-/// clock which is wrong for a moment does not make everything old.
+/// After a gap longer than this one round is left out: the wall clock may have been set, and one that is wrong for
+/// a while, as after a start without a network, must not make everything old.
 const JUMP: SignedDuration = SignedDuration::from_hours(25);
 
 /// Writes between two looks at a journal that is too large.
@@ -55,7 +56,7 @@ impl Disk {
         for batch in batches {
             let started = Instant::now();
             let answer = self.write(&batch).map(|()| health::size(&self.path));
-            metrics::histogram!("oapwatch_journal_write_seconds").record(started.elapsed().as_secs_f64());
+            metrics::histogram!(metric::JOURNAL_WRITE_SECONDS).record(started.elapsed().as_secs_f64());
             let size = answer.as_ref().copied().ok();
             if answers.send(answer).is_err() {
                 return;
@@ -94,14 +95,16 @@ impl Disk {
             return;
         };
         let asked = batch.iter().any(|write| matches!(write, Write::Maintain { .. }));
-        let last = *self.last_round.get_or_insert(now);
-        let age = now.duration_since(last);
-        let due = age >= ROUND && age < JUMP;
-        if age >= ROUND || age < SignedDuration::ZERO {
+        let earlier = self
+            .last_round
+            .or_else(|| self.store.as_ref()?.newest_recorded().ok().flatten());
+        let age = now.duration_since(earlier.unwrap_or(now));
+        let due = (asked || age >= ROUND) && age < JUMP;
+        if self.last_round.is_none() || age >= ROUND || age < SignedDuration::ZERO {
             self.last_round = Some(now);
         }
         let large = self.retention.exceeded_by(size) && self.since_round >= PAUSE;
-        let Some(store) = self.store.as_mut().filter(|_| asked || due || large) else {
+        let Some(store) = self.store.as_mut().filter(|_| due || large) else {
             return;
         };
         self.since_round = 0;

@@ -1,5 +1,7 @@
 use std::path::{Path, PathBuf};
 
+use crate::metric;
+
 /// How the journal fares: for `/readyz`, metrics and the dashboard.
 #[derive(Clone, Debug, Default, PartialEq, serde::Serialize, utoipa::ToSchema)]
 pub struct Health {
@@ -33,9 +35,9 @@ impl Health {
     }
 
     fn report(&self) {
-        metrics::gauge!("oapwatch_journal_writable").set(f64::from(u8::from(self.writable)));
-        metrics::gauge!("oapwatch_journal_unwritten_events").set(self.unwritten as f64);
-        metrics::gauge!("oapwatch_journal_bytes").set(self.size_bytes as f64);
+        metrics::gauge!(metric::JOURNAL_WRITABLE).set(f64::from(u8::from(self.writable)));
+        metrics::gauge!(metric::JOURNAL_UNWRITTEN).set(self.unwritten as f64);
+        metrics::gauge!(metric::JOURNAL_BYTES).set(self.size_bytes as f64);
     }
 }
 

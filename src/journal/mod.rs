@@ -310,7 +310,8 @@ impl Journal {
         self.until(done).await;
     }
 
-    /// Removes what is older than `keep_days` or beyond `max_mb`.
+    /// Removes what is older than `keep_days` or beyond `max_mb`. Where the last event or round is more than a day
+    /// before `now`, only the next call does: the clock may be wrong.
     pub fn maintain(&self, now: Timestamp) {
         self.shared.push(Write::Maintain { now });
     }

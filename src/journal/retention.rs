@@ -82,6 +82,13 @@ impl Store {
         Ok(removed)
     }
 
+    pub(super) fn newest_recorded(&self) -> Result<Option<Timestamp>, rusqlite::Error> {
+        let us: Option<i64> = self
+            .db
+            .query_row("SELECT max(recorded_us) FROM alert", [], |row| row.get(0))?;
+        Ok(us.and_then(|us| Timestamp::from_microsecond(us).ok()))
+    }
+
     /// Removes the oldest cleared alerts that no delivery waits for, with events and deliveries.
     fn remove_cleared(&mut self, before_us: i64, limit: usize) -> Result<usize, rusqlite::Error> {
         self.db.execute(

@@ -10,6 +10,7 @@ use tokio::sync::watch;
 use super::retention::Retention;
 use super::store::{Store, Write};
 use super::{Attempt, Error, Health, Outcome, Subscription, disk};
+use crate::metric;
 
 /// Alert events that may wait for a disk that refuses them.
 pub(super) const BACKLOG: usize = 20_000;
@@ -102,7 +103,7 @@ impl Shared {
             drop(queue);
             let mut health = lock(&self.health);
             health.lost += n as u64;
-            metrics::counter!("oapwatch_journal_events_lost_total").increment(n as u64);
+            metrics::counter!(metric::JOURNAL_LOST).increment(n as u64);
             return Err(Error::BacklogFull {
                 lost: health.lost,
                 limit: BACKLOG,
@@ -302,7 +303,7 @@ impl Writer {
         if !std::mem::replace(&mut self.failing, true) {
             tracing::error!(%error, "the journal cannot be written; alert events are held in memory");
         }
-        metrics::counter!("oapwatch_journal_write_failures_total").increment(1);
+        metrics::counter!(metric::JOURNAL_FAILURES).increment(1);
         lock(&self.shared.health).failed(error.to_string(), events_in(&self.deferred));
     }
 

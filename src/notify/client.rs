@@ -34,6 +34,8 @@ pub(super) enum Verdict {
     Delivered,
     /// 410: the receiver wants no more.
     Gone,
+    /// The journal no longer holds the event: it was given up while the endpoint was disabled.
+    Expired,
     Failed {
         failure: Failure,
         retry_after: Option<Duration>,

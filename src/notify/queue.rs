@@ -199,6 +199,12 @@ impl Queue {
         }
     }
 
+    /// Forgets a delivery whose event is no longer there.
+    pub(super) fn expired(&mut self, seq: u64, now: Duration) {
+        self.under_way -= 1;
+        self.drop_first(seq, now);
+    }
+
     pub(super) fn disable(&mut self) {
         self.disabled = true;
     }

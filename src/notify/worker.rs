@@ -14,6 +14,7 @@ use super::queue::{Next, Queue};
 use super::status::{EndpointState, EndpointStatus};
 use super::{Clock, Endpoint, schedule};
 use crate::journal::{self, Attempt, Journal, Outcome, Waiting};
+use crate::metric;
 
 /// How long requests that are under way may still take when the daemon stops.
 const GRACE: Duration = Duration::from_secs(3);
@@ -219,8 +220,7 @@ impl Worker {
         let lane = &mut self.lanes[k];
         let name = lane.endpoint.name();
         let count = |outcome: &'static str| {
-            counter!("oapwatch_webhook_attempts_total", "endpoint" => name.to_owned(), "outcome" => outcome)
-                .increment(1);
+            counter!(metric::WEBHOOK_ATTEMPTS, "endpoint" => name.to_owned(), "outcome" => outcome).increment(1);
         };
         let was_failing = lane.queue.is_failing();
         let (next, error) = match verdict {
@@ -246,6 +246,15 @@ impl Worker {
                 );
                 self.journal.disable(name, at, error.clone());
                 (lane.queue.gone(seq, now), error)
+            }
+            Verdict::Expired => {
+                lane.queue.expired(seq, now);
+                tracing::warn!(
+                    endpoint = name,
+                    seq,
+                    "a webhook delivery is gone from the journal, by age"
+                );
+                return;
             }
             Verdict::Failed { failure, retry_after } => {
                 count("failed");
@@ -338,9 +347,9 @@ impl Worker {
                 .oldest_queued
                 .map_or(0.0, |at| wall.duration_since(at).as_secs_f64().max(0.0));
             let name = lane.endpoint.name();
-            gauge!("oapwatch_webhook_queued", "endpoint" => name.to_owned()).set(status.queued as f64);
-            gauge!("oapwatch_webhook_oldest_queued_seconds", "endpoint" => name.to_owned()).set(age);
-            gauge!("oapwatch_webhook_dead_letters", "endpoint" => name.to_owned()).set(status.failed as f64);
+            gauge!(metric::WEBHOOK_QUEUED, "endpoint" => name.to_owned()).set(status.queued as f64);
+            gauge!(metric::WEBHOOK_OLDEST, "endpoint" => name.to_owned()).set(age);
+            gauge!(metric::WEBHOOK_DEAD_LETTERS, "endpoint" => name.to_owned()).set(status.failed as f64);
         }
         *self.shown.lock().unwrap_or_else(PoisonError::into_inner) =
             self.lanes.iter().map(|lane| lane.status.clone()).collect();
@@ -352,7 +361,8 @@ async fn attempt(journal: Journal, endpoint: Arc<Endpoint>, seq: u64, clock: Clo
     let found = tokio::task::spawn_blocking(move || journal.event(seq)).await;
     let failure = match found {
         Ok(Ok(Some(event))) => return client::send(&endpoint, &id, &event, clock.now()).await,
-        Ok(Ok(None)) | Err(_) => Failure::Broken,
+        Ok(Ok(None)) => return Verdict::Expired,
+        Err(_) => Failure::Broken,
         Ok(Err(error)) => Failure::Journal(error),
     };
     Verdict::Failed {
