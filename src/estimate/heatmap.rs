@@ -36,8 +36,10 @@ impl Heatmap {
     pub fn new(bx: &Basis, by: &Basis) -> Self {
         let axis = |b: &Basis| {
             // Centres up to half a σ outside; beyond that only a fit can tell.
-            let (lo, hi) = (b.edges[0] - SPACING, b.edges[b.n] + SPACING);
-            let count = ((hi - lo) / SPACING).ceil() as usize + 1;
+            // Inside a pixel much wider than the spot all places look alike: a grid of σ would be endless and say no more.
+            let spacing = SPACING.max(0.25 * b.pitch());
+            let (lo, hi) = (b.edges[0] - spacing, b.edges[b.n] + spacing);
+            let count = ((hi - lo) / spacing).ceil() as usize + 1;
             let grid: Vec<f64> = (0..count)
                 .map(|k| lo + (hi - lo) * k as f64 / (count - 1) as f64)
                 .collect();
