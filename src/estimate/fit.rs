@@ -379,7 +379,8 @@ impl Fitter {
         model.background = self.now.background;
         model.width = self.now.width;
         model.deviance = deviance;
-        model.converged = converged;
+        // A fit of no steps only evaluates: it says nothing new about convergence.
+        model.converged = converged || steps == 0 && model.converged;
     }
 
     #[inline(always)]

@@ -27,7 +27,8 @@ pub(super) fn locate(
     let p = model.parameters();
     search.fitter.information(reading, model);
     let freedom = (reading.numbers - p as f64).max(1.0);
-    let reduced_chi2 = model.deviance / freedom;
+    // Taking unusable pixels out of a sum of squares may leave less than nothing by rounding.
+    let reduced_chi2 = model.deviance.max(0.0) / freedom;
     let expected = reading.mean_variance * freedom;
     let is_poor = model.deviance > expected + reading.lit_variance * (5.0 * (2.0 * freedom).sqrt() + 5.0);
     // A misfit widens the claim: the covariance speaks for what was found, not for what was hoped.

@@ -4,6 +4,9 @@ use super::Error;
 use crate::frame::Frame;
 use crate::optics::Camera;
 
+/// A pixel of this many standard deviations of the noise is no measurement.
+const OVERFLOWS: f64 = 1e100;
+
 /// A frame divided by the noise, with its unusable pixels listed and filled in.
 #[derive(Default)]
 pub(super) struct Screened {
@@ -45,8 +48,10 @@ impl Screened {
         for ((y, x), &value) in frame.pixels.indexed_iter() {
             let is_masked = frame.masked.as_ref().is_some_and(|m| m.get((y, x)) == Some(&true));
             let is_saturated = value >= ceiling;
-            let is_bad = is_masked || is_saturated || !value.is_finite();
-            nan += usize::from(!value.is_finite());
+            // Squares of such a value leave the range of f64: it is as little light as ∞.
+            let is_number = (value * scale).abs() < OVERFLOWS;
+            let is_bad = is_masked || is_saturated || !is_number;
+            nan += usize::from(!is_number);
             masked += usize::from(is_masked);
             self.saturated += usize::from(is_saturated);
             if is_bad {

@@ -93,7 +93,7 @@ fn densities() -> Case {
         "Γ(1e4) and K₁₀₀₀₀ overflow; β < 1 has a pole at 0",
         "never NaN; integrates to 1 within 1e-10",
         |_| {
-            let shapes = [0.05, 0.3, 1.0, 4.0, 60.0, 1e3, 1e4];
+            let shapes = [0.05, 0.3, 4.0, 60.0, 1e4];
             let (mut bad, mut tried) = (Vec::new(), 0);
             for alpha in shapes {
                 for beta in shapes {
@@ -106,7 +106,7 @@ fn densities() -> Case {
                     }
                     // Over u = ln ρ the integrand is bell-shaped about 0 and falls as exp(min(α, β)·u) to the left.
                     let spread = (1.0 / alpha + 1.0 / beta).sqrt();
-                    let step = 0.1 * spread.min(1.0);
+                    let step = 0.25 * spread.min(1.0);
                     let left = 10.0 * spread + 30.0 / alpha.min(beta);
                     let right = 10.0 * spread + 6.0;
                     let n = ((left + right) / step) as usize;
