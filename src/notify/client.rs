@@ -95,10 +95,10 @@ pub(super) fn build(index: usize, config: &Config, timeout: Duration, loopback: 
         builder = builder.no_proxy();
     }
     if let Some(path) = &config.ca_file {
-        let authority = |source| Error::Authority {
+        let authority = |cause| Error::Authority {
             index,
             path: path.clone(),
-            source,
+            cause,
         };
         let pem = std::fs::read(path).map_err(|e| authority(e.into()))?;
         let certificates = Certificate::from_pem_bundle(&pem).map_err(|e| authority(e.into()))?;
@@ -107,7 +107,7 @@ pub(super) fn build(index: usize, config: &Config, timeout: Duration, loopback: 
         }
         builder = builder.tls_certs_merge(certificates);
     }
-    builder.build().map_err(|source| Error::Client { index, source })
+    builder.build().map_err(|cause| Error::Client { index, cause })
 }
 
 /// Makes one signed request and judges the answer.

@@ -21,32 +21,32 @@ pub struct Endpoint {
 /// Why a `[[webhook]]` cannot be used. `index` counts the tables from 1.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    #[error("[[webhook]] {index}: url: {source}")]
-    Url { index: usize, source: url::ParseError },
+    #[error("[[webhook]] {index}: url: {cause}")]
+    Url { index: usize, cause: url::ParseError },
     #[error("[[webhook]] {index}: url: expected https:// or http://, found {scheme}://")]
     Scheme { index: usize, scheme: String },
     #[error(
         "[[webhook]] {index}: url: http:// to {host} would show alerts to anyone on the way; use https://, or set allow_http = true"
     )]
     Plain { index: usize, host: String },
-    #[error("[[webhook]] {index}: secret_file: {path}: {source}")]
+    #[error("[[webhook]] {index}: secret_file: {path}: {cause}")]
     Unreadable {
         index: usize,
         path: PathBuf,
-        source: std::io::Error,
+        cause: std::io::Error,
     },
-    #[error("[[webhook]] {index}: secret_file: {path}: line {line}: {source}")]
+    #[error("[[webhook]] {index}: secret_file: {path}: line {line}: {cause}")]
     Secret {
         index: usize,
         path: PathBuf,
         line: usize,
-        source: SecretError,
+        cause: SecretError,
     },
-    #[error("[[webhook]] {index}: ca_file: {path}: {source}")]
+    #[error("[[webhook]] {index}: ca_file: {path}: {cause}")]
     Authority {
         index: usize,
         path: PathBuf,
-        source: client::AuthorityError,
+        cause: client::AuthorityError,
     },
     #[error("[[webhook]] {index}: timeout_s: expected 1 to 120, found {found}")]
     Timeout { index: usize, found: f64 },
@@ -56,8 +56,8 @@ pub enum Error {
     Twice { index: usize, earlier: usize, name: String },
     #[error("[[webhook]] {index}: kinds: an empty list would send nothing; leave it out to send all")]
     NoKinds { index: usize },
-    #[error("[[webhook]] {index}: {source}")]
-    Client { index: usize, source: reqwest::Error },
+    #[error("[[webhook]] {index}: {cause}")]
+    Client { index: usize, cause: reqwest::Error },
 }
 
 /// Validates all `[[webhook]]` tables and reads their secrets.
@@ -79,7 +79,7 @@ pub fn load(configs: &[Config]) -> Result<Vec<Endpoint>, Error> {
 
 impl Endpoint {
     fn load(index: usize, config: &Config) -> Result<Self, Error> {
-        let url = Url::parse(&config.url).map_err(|source| Error::Url { index, source })?;
+        let url = Url::parse(&config.url).map_err(|cause| Error::Url { index, cause })?;
         let loopback = is_loopback(&url);
         match url.scheme() {
             "https" => {}
@@ -153,17 +153,17 @@ impl Endpoint {
 fn read_secrets(index: usize, config: &Config) -> Result<Signer, Error> {
     use std::os::unix::fs::PermissionsExt;
     let path = &config.secret_file;
-    let unreadable = |source| Error::Unreadable {
+    let unreadable = |cause| Error::Unreadable {
         index,
         path: path.clone(),
-        source,
+        cause,
     };
     let text = std::fs::read_to_string(path).map_err(unreadable)?;
-    let signer = Signer::parse(&text).map_err(|(line, source)| Error::Secret {
+    let signer = Signer::parse(&text).map_err(|(line, cause)| Error::Secret {
         index,
         path: path.clone(),
         line,
-        source,
+        cause,
     })?;
     let mode = std::fs::metadata(path).map_err(unreadable)?.permissions().mode() & 0o777;
     if mode & 0o077 != 0 {
