@@ -8,6 +8,4 @@ pub struct Config {
     pub name: Option<String>,
     /// Time allowed a frame; the best rung finished within it is returned.
     pub budget_ms: Option<f64>,
-    /// Energy that a source of known power delivers per frame, J; learned from the frame when left out.
-    pub known_energy_j: Option<f64>,
 }

@@ -119,14 +119,19 @@ impl Reading {
     }
 
     /// Fills `out` (Ny, Nx) with what the basis holds of the frame, Uᵧ Z Uₓᵀ.
-    pub fn expand(&mut self, bx: &Basis, by: &Basis, out: &mut Vec<f64>) {
+    pub fn expand(&self, bx: &Basis, by: &Basis, out: &mut Vec<f64>) {
+        self.expand_matrix(&self.z, bx, by, out);
+    }
+
+    /// The same for any matrix (my, mx) of coefficients.
+    pub fn expand_matrix(&self, matrix: &[f64], bx: &Basis, by: &Basis, out: &mut Vec<f64>) {
         let (mx, my) = (self.mx, self.my);
         out.clear();
         out.resize(bx.n * by.n, 0.0);
         for y in 0..by.n {
             let mut row = vec![0.0; mx];
             for (c, &u) in by.row(y)[..my].iter().enumerate() {
-                for (r, z) in row.iter_mut().zip(&self.z[c * mx..(c + 1) * mx]) {
+                for (r, z) in row.iter_mut().zip(&matrix[c * mx..(c + 1) * mx]) {
                     *r += u * z;
                 }
             }
