@@ -21,6 +21,8 @@ const POSITION_FLOOR_M: f64 = 0.02;
 const CONFIRM: (u32, u32) = (3, 5);
 /// A confirmed track is kept this long without a hit, in time the sensor could see.
 const KEEP_S: f64 = 1.5;
+/// A beam missed for no longer than this still holds its claim against others, s.
+const JUST_MISSED_S: f64 = 0.35;
 /// With the sensor blind for longer, positions have nothing to do with what was.
 const FORGET_AFTER_S: f64 = 30.0;
 /// How far back a track knows where it was, for claims that come late.
@@ -162,6 +164,11 @@ impl Track {
             trail: VecDeque::from([(time, detection.position)]),
             detection: detection.clone(),
         }
+    }
+
+    /// Followed well and missed only just now: its place is not free yet.
+    pub fn is_just_missed(&self) -> bool {
+        self.confirmed && !self.hit && !self.merged && self.missed_s <= JUST_MISSED_S
     }
 
     /// Where the beam was at `time`, if the track reaches back that far.

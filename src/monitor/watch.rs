@@ -116,9 +116,9 @@ impl Monitor {
             let detections = Detection::of(estimate, &self.camera);
             self.tracks.step(now, &detections, dt);
             self.find_pose(&mut asserted, dt);
-            let answers = self.answer(&asserted, now);
+            let answers = self.answer(&asserted);
             self.weigh(&asserted, &answers, now);
-            self.decide(&asserted, answers, claims, now);
+            self.decide(&asserted, answers, now);
         }
         self.watch_inputs(&asserted, claims, now);
         self.report(&asserted, seen.frame, now)
@@ -228,12 +228,24 @@ impl Monitor {
     }
 
     /// Which track answers which claim: near pairs by optimal assignment, then the beam that answered before.
-    fn answer(&self, asserted: &[Asserted], _now: Timestamp) -> Vec<Option<u64>> {
+    fn answer(&self, asserted: &[Asserted]) -> Vec<Option<u64>> {
         let seen: Vec<&Track> = self.tracks.all.iter().filter(|t| t.hit).collect();
         let merged: Vec<&Track> = self.tracks.all.iter().filter(|t| t.merged).collect();
         let mut answers = vec![None; asserted.len()];
+        // A frame that misses a user's beam must not let another beam nearby pass for it.
+        let held: Vec<bool> = asserted
+            .iter()
+            .map(|a| {
+                let before = self.users.get(&a.claim.user).and_then(|u| u.track);
+                before
+                    .and_then(|id| self.tracks.get(id))
+                    .is_some_and(Track::is_just_missed)
+            })
+            .collect();
         for tracks in [&seen, &merged] {
-            let open: Vec<usize> = (0..asserted.len()).filter(|&i| answers[i].is_none()).collect();
+            let open: Vec<usize> = (0..asserted.len())
+                .filter(|&i| answers[i].is_none() && !held[i])
+                .collect();
             let matching = assign(open.len(), tracks.len(), ANSWER_GATE + INCUMBENCY, |i, j| {
                 let (a, t) = (&asserted[open[i]], tracks[j]);
                 let r = t.motion.position() - a.position;
@@ -333,7 +345,7 @@ impl Monitor {
         })
     }
 
-    fn decide(&mut self, asserted: &[Asserted], mut answers: Vec<Option<u64>>, claims: &Store, now: Timestamp) {
+    fn decide(&mut self, asserted: &[Asserted], mut answers: Vec<Option<u64>>, now: Timestamp) {
         let taken: BTreeSet<u64> = answers.iter().flatten().copied().collect();
         let tracks: Vec<(u64, bool)> = self.tracks.all.iter().map(|t| (t.id, t.hit)).collect();
         self.alone.retain(|id, _| tracks.iter().any(|(t, _)| t == id));
@@ -345,7 +357,7 @@ impl Monitor {
             }
         }
         self.decide_unclaimed(asserted, &mut answers, now);
-        self.decide_users(asserted, &answers, claims, now);
+        self.decide_users(asserted, &answers, now);
     }
 
     /// The log's habits, as medians over users: no single one can slow the monitor down.
@@ -406,7 +418,7 @@ impl Monitor {
                 }
             }
             if track.hit {
-                let finding = self.unclaimed(track, since, now);
+                let finding = self.unclaimed(asserted, track, since, now);
                 self.book.report(&cause, finding, now, self.frame);
             }
         }
@@ -456,8 +468,49 @@ impl Monitor {
         })
     }
 
-    fn unclaimed(&self, track: &Track, since: Timestamp, now: Timestamp) -> Finding {
+    /// What else tells of an eavesdropper, each with its likelihood ratio against an honest stray beam.
+    fn unclaimed(&self, asserted: &[Asserted], track: &Track, since: Timestamp, now: Timestamp) -> Finding {
         let lasted = seconds(since, now);
+        let here = track.motion.position();
+        let nearest = asserted
+            .iter()
+            .filter(|a| !a.ended)
+            .map(|a| (a, (a.position - here).norm()))
+            .min_by(|a, b| a.1.total_cmp(&b.1));
+        let [width, height] =
+            [self.camera.x.half_width(), self.camera.y.half_width()].map(|h| 2.0 * h * self.camera.ground_scale());
+        let beside = nearest.map(|(a, distance)| {
+            // One who wants a user's light stands within its spot; one who does not is anywhere in view.
+            let spot = 3.0 * self.spot_m();
+            let by_chance = (std::f64::consts::PI * spot * spot * asserted.len() as f64 / (width * height)).min(1.0);
+            json!({
+                "user": a.claim.user,
+                "distance_m": distance,
+                "likelihood_ratio": if distance <= spot { 1.0 / by_chance } else { 0.5 },
+                "second_beam_for_claim": distance <= self.config.tolerated_distance_m + a.slack_m,
+            })
+        });
+        let vanished: Vec<Value> = asserted
+            .iter()
+            .filter_map(|a| {
+                let gone = self.users.get(&a.claim.user)?.unanswered_since?;
+                let gap = seconds(gone, since).abs();
+                // Absences come perhaps once an hour and user: one within the gap by chance is that rare.
+                let by_chance = (2.0 * gap.max(0.1) / 3600.0).min(1.0);
+                Some(json!({ "user": a.claim.user, "apart_s": gap, "likelihood_ratio": 0.5 / by_chance }))
+            })
+            .collect();
+        let usual = median(
+            self.users
+                .values()
+                .filter_map(|u| Some(self.tracks.get(u.track?)?.detection.energy_j)),
+        );
+        let energy = usual.map(|usual| {
+            // ln energies of honest users scatter by about 0.3 (ten coherence times a frame); a stranger's by any factor of ten.
+            let z = (track.detection.energy_j.max(1e-30) / usual.max(1e-30)).ln() / 0.3;
+            let (honest, stranger) = ((-0.5 * z * z).exp() / 0.3, (-0.5 * (0.3 * z / 2.3).powi(2)).exp() / 2.3);
+            json!({ "users_median_j": usual, "likelihood_ratio": (stranger / honest.max(1e-12)).min(1e9) })
+        });
         let severity = if lasted >= ESCALATE_S {
             Severity::Critical
         } else {
@@ -470,6 +523,9 @@ impl Monitor {
             "log_likelihood_ratio": track.score,
             "threshold": self.level_unclaimed,
             "energy_j": track.detection.energy_j,
+            "energy_against_users": energy,
+            "nearest_user": beside,
+            "vanished_users": vanished,
             "flags": track.detection.flags,
         });
         self.at_track(Finding::new(severity, evidence), track)
@@ -483,7 +539,7 @@ impl Monitor {
         finding
     }
 
-    fn decide_users(&mut self, asserted: &[Asserted], answers: &[Option<u64>], _claims: &Store, now: Timestamp) {
+    fn decide_users(&mut self, asserted: &[Asserted], answers: &[Option<u64>], now: Timestamp) {
         let tolerated = self.config.tolerated_distance_m;
         let floor = self.floor();
         let each = (asserted.len() * super::residuals::WINDOWS.len()) as f64;
