@@ -698,7 +698,7 @@ impl Monitor {
 
     /// A network without users has nothing to say.
     fn expects_claims(&self, asserted: &[Asserted]) -> bool {
-        asserted.iter().any(|a| !a.ended) || !self.tracks.all.is_empty()
+        asserted.iter().any(|a| !a.ended) || self.tracks.all.iter().any(|t| t.confirmed)
     }
 
     fn report(&mut self, asserted: &[Asserted], frame: u64, now: Timestamp) -> Report {
