@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 pub struct Claim {
     #[schema(value_type = String, format = DateTime)]
     pub time: Timestamp,
-    #[schema(min_length = 1, max_length = 64)]
+    #[schema(min_length = 1, max_length = 256, pattern = r"^[^\x00-\x1f\x7f-\x9f]+$")]
     pub user: String,
     #[schema(minimum = -1e7, maximum = 1e7)]
     pub x_m: f64,

@@ -23,7 +23,8 @@ const MAX_SIDE: usize = 2048;
 #[into_params(parameter_in = Query)]
 #[serde(deny_unknown_fields)]
 pub struct PictureQuery {
-    /// Picture pixels per sensor pixel; so that the picture has at least 512 a side when left out
+    /// Picture pixels per sensor pixel, fewer where the picture would be larger than 2048 a side; enough for 512 a side
+    /// when left out
     #[param(minimum = 1, maximum = 64)]
     scale: Option<usize>,
     /// Whether detections are drawn; true when left out
@@ -91,7 +92,7 @@ pub async fn frame_png(
     let (ny, nx) = frame.pixels.dim();
     let side = nx.max(ny).max(1);
     let scale = match query.scale {
-        Some(scale) => within("scale", scale, 1, (MAX_SIDE / side).clamp(1, 64))?,
+        Some(scale) => within("scale", scale, 1, 64)?.min((MAX_SIDE / side).max(1)),
         None => DEFAULT_SIDE.div_ceil(side).clamp(1, 64),
     };
     let look = (scale, query.detections.unwrap_or(true));

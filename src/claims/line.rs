@@ -73,7 +73,7 @@ pub fn parse_line(line: &[u8], config: &Config) -> Result<Claim, LineError> {
 }
 
 const TIME: &str = "an RFC 3339 time or seconds since 1970";
-const USER: &str = "a name of 1 to 256 bytes";
+const USER: &str = "a name of 1 to 256 characters";
 const METRES: &str = "metres within 10000 km of the nadir";
 const LATITUDE: &str = "degrees between -90 and 90";
 const LONGITUDE: &str = "degrees between -180 and 180";
@@ -123,7 +123,7 @@ fn user(name: &str, value: &Value) -> Result<String, LineError> {
         Value::Number(n) => n.to_string(),
         _ => return Err(wrong(name, USER, value)),
     };
-    if user.is_empty() || user.len() > LONGEST_USER || user.chars().any(char::is_control) {
+    if user.is_empty() || user.chars().count() > LONGEST_USER || user.chars().any(char::is_control) {
         return Err(wrong(name, USER, value));
     }
     Ok(user)

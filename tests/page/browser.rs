@@ -135,16 +135,12 @@ impl Browser {
     }
 }
 
-/// Asks the browser for its page's address, in the plainest HTTP.
+/// Asks the browser for its page's address.
 async fn page_target(port: u16) -> Option<String> {
-    use tokio::io::{AsyncReadExt, AsyncWriteExt};
-    let mut stream = TcpStream::connect(("127.0.0.1", port)).await.ok()?;
-    let request = format!("GET /json/list HTTP/1.0\r\nHost: 127.0.0.1:{port}\r\n\r\n");
-    stream.write_all(request.as_bytes()).await.ok()?;
-    let mut answer = String::new();
-    stream.read_to_string(&mut answer).await.ok()?;
-    let (_, body) = answer.split_once("\r\n\r\n")?;
-    let targets: Value = serde_json::from_str(body).ok()?;
+    // reqwest is built without a default; a second installation finds the first in place.
+    let _ = rustls::crypto::ring::default_provider().install_default();
+    let answer = reqwest::get(format!("http://127.0.0.1:{port}/json/list")).await.ok()?;
+    let targets: Value = serde_json::from_slice(&answer.bytes().await.ok()?).ok()?;
     let page = targets.as_array()?.iter().find(|t| t["type"] == "page")?;
     page["webSocketDebuggerUrl"].as_str().map(str::to_owned)
 }
