@@ -159,7 +159,8 @@ pub fn render(calibration: &Calibration, remarks: &[String]) -> String {
         let bad: Vec<String> = maps
             .bad
             .indexed_iter()
-            .filter_map(|((y, x), &bad)| bad.then(|| format!("[{x}, {y}]")))
+            .filter(|&(_, &bad)| bad)
+            .map(|((y, x), _)| format!("[{x}, {y}]"))
             .collect();
         let _ = write!(
             out,

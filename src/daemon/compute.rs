@@ -372,7 +372,7 @@ impl Compute {
                 self.fresh.extend(poll.claims);
             }
             // A recording's first frame waits until the whole log has been read, so that no claim comes late.
-            if !poll.more || !(self.is_replay && self.state.counts.captured == 0) {
+            if !(poll.more && self.is_replay && self.state.counts.captured == 0) {
                 return;
             }
         }

@@ -61,7 +61,7 @@ pub struct V4l2 {
 
 enum State {
     Closed { retry_at: Instant },
-    Open { session: Session, settling: u32 },
+    Open { session: Box<Session>, settling: u32 },
 }
 
 impl V4l2 {
@@ -129,7 +129,7 @@ impl V4l2 {
                 metrics::counter!(metric::SOURCE_OPENED).increment(1);
                 metrics::gauge!(metric::SOURCE_CONNECTED).set(1.0);
                 let settling = self.config.settle_frames;
-                self.state = State::Open { session, settling };
+                self.state = State::Open { session: Box::new(session), settling };
             }
             Err(error) => self.close(error.fault(), error),
         }
