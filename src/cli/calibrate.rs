@@ -84,6 +84,15 @@ pub fn run(args: Args) -> Outcome {
             after.cost_m2
         )));
     }
+    if 2 * after.missed >= after.beacons {
+        return Err(Failure::Other(anyhow!(
+            "{} was not written: {} of the {} held-out positions have no emitter within 25 m; \
+             does the truth belong to these frames?",
+            args.out.display(),
+            after.missed,
+            after.beacons
+        )));
+    }
     let mut remarks = vec!["Written by `oapwatch calibrate`; name it in [optics] calibration.".to_owned()];
     remarks.extend(report(&calibrated));
     file::write(&args.out, &file::render(&calibrated.fitted.calibration, &remarks)).map_err(Failure::other)?;

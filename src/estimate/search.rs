@@ -215,6 +215,10 @@ impl Search {
         let usable = frame.pixels.iter().zip(&frame.is_bad).filter(|(_, bad)| !**bad);
         self.residual.extend(usable.map(|(p, _)| *p));
         let count = self.residual.len();
+        // Every pixel may have been rejected by now.
+        if count == 0 {
+            return false;
+        }
         let (_, tenth, _) = self.residual.select_nth_unstable_by(count / 10, f64::total_cmp);
         // The lowest decile of standard normal noise is −1.2816, with standard deviation 1.71/√count.
         (*tenth + 1.2816).abs() > 5.0 * 1.71 / (count as f64).sqrt()
