@@ -26,7 +26,9 @@ fn an_honest_crowd_raises_nothing_and_is_verified() {
 fn an_intruder_is_alerted_within_a_second_and_cleared_when_gone() {
     for seed in SEEDS {
         let mut actors = crowd();
-        actors.push(Actor::intruder(|t| (10.0..20.0).contains(&t).then_some([20.0 + t, 10.0])));
+        actors.push(Actor::intruder(|t| {
+            (10.0..20.0).contains(&t).then_some([20.0 + t, 10.0])
+        }));
         let told = tell(&Story::new(seed, actors));
         told.expect(&[(UnclaimedEmitter, None, 10.0, 11.0)]);
         let cleared = told.cleared();

@@ -9,6 +9,9 @@ use std::f64::consts::{FRAC_1_SQRT_2, PI};
 
 use super::Axis;
 
+/// Beyond this many σ the density underflows: exp(−39²/2) is below the smallest f64.
+const DARK: f64 = 39.0;
+
 /// What one pixel collects along one axis, and how that changes as the spot moves or widens.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct PixelResponse {
@@ -37,6 +40,13 @@ pub fn pixel_response(lo: f64, hi: f64, centre: f64, sigma: f64) -> PixelRespons
     let half = 0.5 * (hi - lo) / sigma;
     // Mirrored so that the pixel's middle is on the positive side; there φ(a) ≥ φ(b) and only c's derivative is odd.
     let (near, far, sign) = if a + b >= 0.0 { (a, b, 1.0) } else { (-b, -a, -1.0) };
+    if near > DARK {
+        return PixelResponse {
+            fraction: 0.0,
+            d_centre: 0.0,
+            d_sigma: 0.0,
+        };
+    }
     let middle = 0.5 * (near + far);
     let density = normal_density(near);
     // φ(far)/φ(near) = exp(−2mh).
@@ -73,6 +83,9 @@ pub fn profile_response(axis: &Axis, centre: f64, sigma: f64, out: &mut [PixelRe
 /// ΔΦ between a and b; `half` is (b − a)/2, formed from the edges themselves because a and b have lost it when the
 /// pixel is narrow and far away.
 fn fraction(a: f64, b: f64, half: f64) -> f64 {
+    if a > DARK || b < -DARK {
+        return 0.0;
+    }
     let middle = 0.5 * (a + b);
     // Where erfc(a) and erfc(b) share more than a digit or so, integrate instead.
     if half <= 0.25 && middle.abs() * half <= 1.0 {

@@ -129,7 +129,10 @@ impl V4l2 {
                 metrics::counter!(metric::SOURCE_OPENED).increment(1);
                 metrics::gauge!(metric::SOURCE_CONNECTED).set(1.0);
                 let settling = self.config.settle_frames;
-                self.state = State::Open { session: Box::new(session), settling };
+                self.state = State::Open {
+                    session: Box::new(session),
+                    settling,
+                };
             }
             Err(error) => self.close(error.fault(), error),
         }
