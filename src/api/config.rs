@@ -17,7 +17,7 @@ pub struct Config {
     pub tls_cert_file: Option<PathBuf>,
     /// PEM private key.
     pub tls_key_file: Option<PathBuf>,
-    /// Origins of other web pages that may use the API (CORS), such as "https://ops.example.org".
+    /// Origins of other web pages that may use the API (CORS), such as `https://ops.example.org`.
     pub allowed_origins: Vec<String>,
     /// Names, beside localhost and plain addresses, that this host is called by when no token is asked for.
     pub allowed_hosts: Vec<String>,

@@ -1,6 +1,6 @@
 //! Training samples as a byte stream, so that a trainer needs neither a forward model nor a disk of its own.
 //!
-//! One JSON line describes the stream ([`Layout`]); then each sample is `slots` × (column, row, energy) followed by
+//! One JSON line describes the stream (`Layout`); then each sample is `slots` × (column, row, energy) followed by
 //! ny × nx pixels, all little-endian f4. Columns and rows count pixels, a pixel's centre at its integer; unused slots are
 //! NaN. Energies are joules, pixels are in units of the noise's standard deviation.
 
