@@ -133,6 +133,7 @@ impl Config {
     fn rebase(&mut self, base: &Path) {
         let optional = [
             &mut self.optics.calibration,
+            &mut self.estimator.network,
             &mut self.source.scene,
             &mut self.source.frames,
             &mut self.record.folder,

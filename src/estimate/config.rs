@@ -1,3 +1,5 @@
+use std::path::PathBuf;
+
 use serde::{Deserialize, Serialize};
 
 /// `[estimator]`.
@@ -6,6 +8,8 @@ use serde::{Deserialize, Serialize};
 pub struct Config {
     /// A rung of the ladder; the embedded default when left out.
     pub name: Option<String>,
+    /// ONNX file of the `network` and `hybrid` rungs, its card beside it; the embedded one when left out.
+    pub network: Option<PathBuf>,
     /// Time allowed a frame; the best rung finished within it is returned.
     pub budget_ms: Option<f64>,
 }

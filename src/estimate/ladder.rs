@@ -5,6 +5,8 @@ use std::time::{Duration, Instant};
 use super::basis::Basis;
 use super::corrected::Corrected;
 use super::fit::{Fitter, Model, Nuisances};
+use super::learned::{Learned, LearnedEstimator};
+use super::network::NetworkError;
 use super::noise::Inspection;
 use super::reading::Reading;
 use super::screen::Screened;
@@ -84,10 +86,18 @@ pub enum ConfigError {
         expected: &'static str,
         found: f64,
     },
+    #[error(transparent)]
+    Network(#[from] NetworkError),
 }
 
 fn names() -> String {
-    LADDER.iter().map(|r| r.name).collect::<Vec<_>>().join(", ")
+    let learned = Learned::ALL.iter().map(|l| l.name());
+    LADDER
+        .iter()
+        .map(|r| r.name)
+        .chain(learned)
+        .collect::<Vec<_>>()
+        .join(", ")
 }
 
 /// The rung of that name.
@@ -107,7 +117,7 @@ pub fn rung(name: &str) -> Result<&'static Rung, ConfigError> {
 
 /// Builds the configured estimator for a camera.
 pub fn build(config: &Config, camera: &Camera) -> Result<Box<dyn Estimator>, ConfigError> {
-    let rung = rung(config.name.as_deref().unwrap_or(DEFAULT))?;
+    let name = config.name.as_deref().unwrap_or(DEFAULT);
     if let Some(budget) = config.budget_ms
         && !(budget.is_finite() && budget > 0.0)
     {
@@ -118,7 +128,10 @@ pub fn build(config: &Config, camera: &Camera) -> Result<Box<dyn Estimator>, Con
         });
     }
     let budget = config.budget_ms.map(|ms| Duration::from_secs_f64(ms * 1e-3));
-    let estimator = Box::new(Analytic::new(rung, camera, budget));
+    let estimator: Box<dyn Estimator> = match Learned::ALL.into_iter().find(|l| l.name() == name) {
+        Some(learned) => Box::new(LearnedEstimator::new(learned, config.network.as_deref(), camera)?),
+        None => Box::new(Analytic::new(rung(name)?, camera, budget)),
+    };
     Ok(match &camera.pixels {
         Some(maps) => Box::new(Corrected::new(estimator, maps.clone(), camera.saturation_j)),
         None => estimator,

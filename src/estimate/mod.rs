@@ -10,7 +10,9 @@ mod fit;
 mod ground;
 mod heatmap;
 mod ladder;
+mod learned;
 mod linear;
+mod network;
 mod noise;
 mod pencil;
 mod reading;
@@ -21,6 +23,8 @@ mod spot;
 pub use bound::position_bound;
 pub use config::Config;
 pub use emitter::{Emitter, Estimate, Flags};
+pub use learned::Learned;
+pub use network::NetworkError;
 pub use ladder::{ConfigError, DEFAULT, LADDER, Rung, build, rung};
 
 use crate::frame::Frame;
@@ -52,4 +56,6 @@ pub enum Error {
         saturated: usize,
         masked: usize,
     },
+    #[error(transparent)]
+    Network(#[from] NetworkError),
 }
