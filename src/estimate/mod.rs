@@ -23,9 +23,9 @@ mod spot;
 pub use bound::position_bound;
 pub use config::Config;
 pub use emitter::{Emitter, Estimate, Flags};
+pub use ladder::{ConfigError, DEFAULT, LADDER, Rung, build, rung};
 pub use learned::Learned;
 pub use network::NetworkError;
-pub use ladder::{ConfigError, DEFAULT, LADDER, Rung, build, rung};
 
 use crate::frame::Frame;
 
