@@ -1,0 +1,73 @@
+use std::collections::BTreeSet;
+
+use super::Monitor;
+use crate::assign::assign;
+use crate::monitor::motion::mahalanobis2;
+use crate::monitor::tracks::Track;
+use crate::monitor::users::Asserted;
+
+/// Squared Mahalanobis distance within which a beam can answer a claim.
+const ANSWER_GATE: f64 = 25.0;
+/// What an assignment must gain before a claim is answered by another beam than before.
+const INCUMBENCY: f64 = 4.0;
+
+impl Monitor {
+    /// Which track answers which claim: near pairs by optimal assignment, then the beam that answered before.
+    pub(super) fn answer(&self, asserted: &[Asserted]) -> Vec<Option<u64>> {
+        let seen: Vec<&Track> = self.tracks.all.iter().filter(|t| t.hit).collect();
+        let merged: Vec<&Track> = self.tracks.all.iter().filter(|t| t.merged).collect();
+        let mut answers = vec![None; asserted.len()];
+        // A frame that misses a user's beam must not let another beam nearby pass for it.
+        let held: Vec<bool> = asserted
+            .iter()
+            .map(|a| {
+                let before = self.users.get(&a.claim.user).and_then(|u| u.track);
+                before
+                    .and_then(|id| self.tracks.get(id))
+                    .is_some_and(Track::is_just_missed)
+            })
+            .collect();
+        for tracks in [&seen, &merged] {
+            let open: Vec<usize> = (0..asserted.len())
+                .filter(|&i| answers[i].is_none() && !held[i])
+                .collect();
+            let matching = assign(open.len(), tracks.len(), ANSWER_GATE + INCUMBENCY, |i, j| {
+                let (a, t) = (&asserted[open[i]], tracks[j]);
+                let r = t.motion.position() - a.position;
+                let d2 = mahalanobis2(r, t.motion.position_cov() + a.spread(self.config.tolerated_distance_m));
+                let incumbent = self.users.get(&a.claim.user).and_then(|u| u.track) == Some(t.id);
+                if d2 > ANSWER_GATE {
+                    f64::INFINITY
+                } else if incumbent {
+                    d2
+                } else {
+                    d2 + INCUMBENCY
+                }
+            });
+            for (i, j) in matching.pairs {
+                answers[open[i]] = Some(tracks[j].id);
+            }
+        }
+        let mut taken: BTreeSet<u64> = answers.iter().flatten().copied().collect();
+        for (a, answer) in asserted.iter().zip(&mut answers) {
+            if answer.is_some() {
+                continue;
+            }
+            let before = self.users.get(&a.claim.user).and_then(|u| u.track);
+            if let Some(id) = before
+                && seen.iter().any(|t| t.id == id)
+                && taken.insert(id)
+            {
+                *answer = Some(id);
+            }
+        }
+        answers
+    }
+    /// Whether the claimed place lies so near a beam of someone else that a second spot there could not be told apart.
+    pub(super) fn is_hidden(&self, a: &Asserted) -> bool {
+        self.tracks.all.iter().filter(|t| t.hit).any(|t| {
+            let reach = t.detection.resolution_m + 2.0 * a.variance.sqrt();
+            (t.motion.position() - a.position).norm() < reach
+        })
+    }
+}

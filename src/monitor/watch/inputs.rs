@@ -1,0 +1,82 @@
+use jiff::Timestamp;
+use serde_json::json;
+
+use super::Monitor;
+use crate::claims::Store;
+use crate::monitor::book::{Cause, Finding};
+use crate::monitor::residuals::surprise;
+use crate::monitor::users::Asserted;
+use crate::monitor::{AlertKind, Severity};
+
+impl Monitor {
+    /// The health of what we are given: frames and claims.
+    pub(super) fn watch_inputs(&mut self, asserted: &[Asserted], claims: &Store, now: Timestamp) {
+        let lost = Cause::Whole(AlertKind::SensorLost);
+        let blind_s = self.sight.blind_s(now);
+        if blind_s >= self.config.sensor_lost_s {
+            let finding = Finding::new(Severity::Critical, self.sight.evidence(now));
+            self.book.report(&lost, finding, now, self.frame);
+        } else if blind_s == 0.0 {
+            self.book.absent(&lost, now);
+        }
+        self.watch_pose(now);
+        let stale = Cause::Whole(AlertKind::ClaimsStale);
+        let period = self.period_s.unwrap_or(0.0);
+        let limit = self.config.claims_stale_s.max(5.0 * period);
+        match claims.quiet_s(now) {
+            Some((came, made)) if came.max(made) > limit && self.expects_claims(asserted) => {
+                let severity = if came.max(made) > 6.0 * limit {
+                    Severity::Critical
+                } else {
+                    Severity::Warning
+                };
+                let evidence = json!({
+                    "newest_came_s_ago": came,
+                    "newest_made_s_ago": made,
+                    "limit_s": limit,
+                    "typical_period_s": period,
+                });
+                self.book
+                    .report(&stale, Finding::new(severity, evidence), now, self.frame);
+            }
+            _ => self.book.absent(&stale, now),
+        }
+    }
+
+    fn watch_pose(&mut self, now: Timestamp) {
+        let cause = Cause::Whole(AlertKind::PoseInconsistent);
+        let limit = self
+            .config
+            .pose_limit_m
+            .unwrap_or(0.5 * self.config.tolerated_distance_m);
+        let shift = self.pose.shift();
+        let (agreeing, of) = self.pose.support();
+        let surprise = surprise(shift, &self.floor(), limit);
+        let level = self.thresholds.level(1.0);
+        let is_open = self.book.is_open(&cause);
+        if surprise > level || (is_open && shift.norm() > 0.9 * limit) {
+            let severity = if shift.norm() > 4.0 * limit {
+                Severity::Critical
+            } else {
+                Severity::Warning
+            };
+            let evidence = json!({
+                "shift_m": [shift.x, shift.y],
+                "limit_m": limit,
+                "users_agreeing": agreeing,
+                "users": of,
+                "surprise": surprise,
+                "threshold": level,
+            });
+            self.book
+                .report(&cause, Finding::new(severity, evidence), now, self.frame);
+        } else {
+            self.book.absent(&cause, now);
+        }
+    }
+
+    /// A network without users has nothing to say.
+    fn expects_claims(&self, asserted: &[Asserted]) -> bool {
+        asserted.iter().any(|a| !a.ended) || self.tracks.all.iter().any(|t| t.confirmed)
+    }
+}

@@ -1,0 +1,223 @@
+//! The monitor: one frame after another through the steps that lead to verdicts, one file a step.
+
+mod answers;
+mod habits;
+mod inputs;
+mod summary;
+mod unclaimed;
+mod users;
+
+use std::collections::BTreeMap;
+
+use jiff::Timestamp;
+use nalgebra::{Matrix2, Vector2};
+
+use super::book::{Book, Cause, Finding};
+use super::pose::Pose;
+use super::sight::Sight;
+use super::thresholds::Thresholds;
+use super::tracks::{Detection, Track, Tracks};
+use super::users::{Asserted, CLAIM_LIFE_S, User};
+use super::{Alert, AlertEvent, AlertKind, Config, Observation, Report, Source};
+use crate::claims::{Store, seconds};
+use crate::optics::Camera;
+
+/// Systematic error of the positions that does not average out, m.
+const SYSTEMATIC_M: f64 = 0.05;
+/// An alert that lasts this long is critical, s.
+const ESCALATE_S: f64 = 10.0;
+
+/// The monitor: frames' estimates and claims in, positions and alert events out.
+pub struct Monitor {
+    config: Config,
+    camera: Camera,
+    thresholds: Thresholds,
+    default_sigma_m: f64,
+    tracks: Tracks,
+    users: BTreeMap<String, User>,
+    sight: Sight,
+    book: Book,
+    pose: Pose,
+    first: Option<Timestamp>,
+    first_claim: Option<Timestamp>,
+    /// Typical seconds between a user's claims, and from a claim's own time to its arrival.
+    period_s: Option<f64>,
+    delay_s: f64,
+    time: Option<Timestamp>,
+    frame: u64,
+    /// Since when each track has had no claim, by track.
+    alone: BTreeMap<u64, Timestamp>,
+    level_unclaimed: f64,
+}
+
+impl Monitor {
+    pub fn new(config: &Config, claims: &crate::claims::Config, camera: &Camera, source: Source) -> Self {
+        let thresholds = Thresholds::new(config, source.rate_hz);
+        let level_unclaimed = thresholds.level(1.0);
+        Self {
+            camera: camera.clone(),
+            default_sigma_m: claims.default_sigma_m,
+            tracks: Tracks::new(1.5 * level_unclaimed),
+            users: BTreeMap::new(),
+            sight: Sight::default(),
+            book: Book::new(source.kind, source.file, config.cool_down_s),
+            pose: Pose::default(),
+            first: None,
+            first_claim: None,
+            period_s: None,
+            delay_s: 0.0,
+            time: None,
+            frame: 0,
+            alone: BTreeMap::new(),
+            level_unclaimed,
+            thresholds,
+            config: config.clone(),
+        }
+    }
+
+    /// Names the recording that holds the frames from now on, for the alerts that they raise.
+    pub fn recorded_in(&mut self, file: Option<&std::path::Path>) {
+        self.book.recorded_in(file);
+    }
+
+    /// Takes one frame. Claims due by its time stand first.
+    pub fn step(&mut self, seen: Observation, claims: &mut Store) -> Report {
+        let now = seen.time;
+        claims.advance(now);
+        self.frame = seen.frame;
+        self.first.get_or_insert(now);
+        let dt = self.time.map_or(0.0, |t| seconds(t, now)).max(0.0);
+        self.time = Some(self.time.map_or(now, |t| t.max(now)));
+        let mut asserted = self.assert(claims, now);
+        let lit = asserted
+            .iter()
+            .filter(|a| !a.ended)
+            .filter_map(|a| self.users.get(&a.claim.user)?.last_answered)
+            .filter(|t| seconds(*t, now) < 2.0 + self.sight.blind_s(now))
+            .count();
+        self.learn_habits(&asserted, claims, now);
+        if let Some(estimate) = self.sight.judge(&seen, lit) {
+            let detections = Detection::of(estimate, &self.camera);
+            self.tracks.step(now, &detections, dt);
+            self.find_pose(&mut asserted, dt);
+            let mut answers = self.answer(&asserted);
+            self.weigh(&asserted, &answers, now);
+            self.note_alone(&answers, now);
+            self.decide_unclaimed(&asserted, &mut answers, now);
+            self.decide_users(&asserted, &answers, now);
+        }
+        self.watch_inputs(&asserted, claims, now);
+        self.report(&asserted, seen.frame, now)
+    }
+
+    /// A frame that the source itself could not deliver whole.
+    pub fn unusable(&mut self, frame: u64, time: Timestamp, reason: &str, claims: &mut Store) -> Report {
+        claims.advance(time);
+        self.frame = frame;
+        self.first.get_or_insert(time);
+        self.time = Some(self.time.map_or(time, |t| t.max(time)));
+        self.sight.unusable(time, reason);
+        let asserted = self.assert(claims, time);
+        self.watch_inputs(&asserted, claims, time);
+        self.report(&asserted, frame, time)
+    }
+
+    /// Time passes without a frame.
+    pub fn tick(&mut self, now: Timestamp, claims: &mut Store) -> Vec<AlertEvent> {
+        if self.time.is_some_and(|t| now <= t) {
+            return Vec::new();
+        }
+        claims.advance(now);
+        self.first.get_or_insert(now);
+        self.sight.nothing(now);
+        let asserted = self.assert(claims, now);
+        self.watch_inputs(&asserted, claims, now);
+        self.book.take_events()
+    }
+
+    /// An operator has taken note. `None` when no open alert has this id, or it is acknowledged already.
+    pub fn acknowledge(&mut self, id: &str, _at: Timestamp) -> Option<AlertEvent> {
+        self.book.acknowledge(id)
+    }
+
+    /// Takes over the alerts that were open when the last run ended: they go on, or clear when their cause is gone.
+    pub fn restore(&mut self, open: Vec<Alert>) {
+        for alert in open {
+            let cause = match (alert.kind, &alert.user) {
+                (kind, Some(user)) => Cause::User(kind, user.clone()),
+                (AlertKind::UnclaimedEmitter, None) => Cause::Track(alert.kind, self.tracks.reserve()),
+                (kind, None) => Cause::Whole(kind),
+            };
+            self.book.restore(cause, alert);
+        }
+    }
+
+    /// The claims that bear on a frame at `now`.
+    fn assert(&self, claims: &Store, now: Timestamp) -> Vec<Asserted> {
+        let tolerated = self.config.tolerated_distance_m;
+        claims
+            .standing()
+            .map(|s| Asserted::new(&s, now, self.default_sigma_m, tolerated))
+            .filter(|a| self.bears(a))
+            .map(|mut a| {
+                a.expected = !a.ended && self.must_be_seen(&a);
+                a
+            })
+            .collect()
+    }
+
+    fn bears(&self, a: &Asserted) -> bool {
+        let tracked = self.users.get(&a.claim.user).and_then(|u| u.track);
+        let held = tracked.is_some_and(|id| self.tracks.get(id).is_some());
+        if a.ended {
+            return a.age_s <= self.config.ended_grace_s;
+        }
+        let reach = self.config.tolerated_distance_m + a.slack_m + 5.0 * a.variance.sqrt();
+        held || (a.age_s <= CLAIM_LIFE_S && self.is_near_view(a.position, reach + self.spot_m() * 3.0))
+    }
+
+    /// Whether even a user as far off as is tolerated would show at least part of a spot.
+    fn must_be_seen(&self, a: &Asserted) -> bool {
+        let off = self.config.tolerated_distance_m + a.slack_m + 3.0 * a.variance.sqrt();
+        self.is_near_view(a.position, (self.spot_m() - off).min(0.0))
+    }
+
+    /// Covariance of what all of a user's residuals share: our own pose and what is systematic in the positions.
+    fn floor(&self) -> Matrix2<f64> {
+        Matrix2::identity() * (SYSTEMATIC_M.powi(2) + self.pose.variance())
+    }
+
+    /// Learns our own pose error from the frame and moves the claims by it.
+    fn find_pose(&mut self, asserted: &mut [Asserted], dt: f64) {
+        let beams: Vec<Vector2<f64>> = self
+            .tracks
+            .all
+            .iter()
+            .filter(|t| t.hit)
+            .map(|t| t.motion.position())
+            .collect();
+        let witnesses: Vec<_> = asserted.iter().filter(|a| a.expected).map(Asserted::witness).collect();
+        self.pose.update(&beams, &witnesses, dt, self.period_s.unwrap_or(1.0));
+        for a in asserted {
+            a.position += self.pose.shift();
+        }
+    }
+
+    fn spot_m(&self) -> f64 {
+        self.camera.spot_sigma_m * self.camera.ground_scale()
+    }
+
+    fn is_near_view(&self, p: Vector2<f64>, margin_m: f64) -> bool {
+        let [x, y] = self.camera.to_sensor([p.x, p.y]);
+        let margin = margin_m / self.camera.ground_scale();
+        x.abs() <= self.camera.x.half_width() + margin && y.abs() <= self.camera.y.half_width() + margin
+    }
+
+    fn at_track(&self, mut finding: Finding, track: &Track) -> Finding {
+        let (p, c) = (track.motion.position(), track.motion.position_cov());
+        finding.x_m = Some(p.x);
+        finding.y_m = Some(p.y);
+        finding.cov_m2 = Some([[c[(0, 0)], c[(0, 1)]], [c[(1, 0)], c[(1, 1)]]]);
+        finding
+    }
+}

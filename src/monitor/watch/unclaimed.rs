@@ -1,0 +1,184 @@
+use jiff::Timestamp;
+use nalgebra::Vector2;
+use serde_json::{Value, json};
+
+use super::habits::median;
+use super::{ESCALATE_S, Monitor};
+use crate::claims::seconds;
+use crate::monitor::book::{Cause, Finding};
+use crate::monitor::tracks::Track;
+use crate::monitor::users::Asserted;
+use crate::monitor::{AlertKind, Severity};
+
+/// A beam and an absence that began within this of each other have one cause, s.
+const COINCIDENCE_S: f64 = 1.5;
+/// ln likelihood ratio from which a user counts as vanished: three frames in a row.
+const VANISHED: f64 = 6.9;
+/// Share of the time to decide that a beam waits for its claim; the rest is for frames that miss it.
+const PATIENCE: f64 = 0.85;
+
+impl Monitor {
+    /// Notes since when each beam has had no claim.
+    pub(super) fn note_alone(&mut self, answers: &[Option<u64>], now: Timestamp) {
+        let tracks = &self.tracks;
+        self.alone.retain(|id, _| tracks.get(*id).is_some());
+        for track in &self.tracks.all {
+            if answers.contains(&Some(track.id)) {
+                self.alone.remove(&track.id);
+            } else if track.hit {
+                self.alone.entry(track.id).or_insert(now);
+            }
+        }
+    }
+
+    pub(super) fn decide_unclaimed(&mut self, asserted: &[Asserted], answers: &mut [Option<u64>], now: Timestamp) {
+        let settled = self.claims_settled(now);
+        let patience = PATIENCE * self.config.decision_s + self.delay_s;
+        let candidates: Vec<Track> = self
+            .tracks
+            .all
+            .iter()
+            .filter(|t| self.alone.contains_key(&t.id))
+            .cloned()
+            .collect();
+        for track in &candidates {
+            let cause = Cause::Track(AlertKind::UnclaimedEmitter, track.id);
+            let since = self.alone[&track.id];
+            let open = self.book.is_open(&cause);
+            let ripe = settled
+                && track.hit
+                && track.confirmed
+                && track.score >= self.level_unclaimed
+                && seconds(since, now) >= patience;
+            if !open && !ripe {
+                continue;
+            }
+            if !open {
+                if let Some(i) = self.displaced_user(asserted, answers, since) {
+                    answers[i] = Some(track.id);
+                    let user = self.users.entry(asserted[i].claim.user.clone()).or_default();
+                    user.track = Some(track.id);
+                    user.unanswered_since = None;
+                    user.absence = 0.0;
+                    user.displaced = true;
+                    self.alone.remove(&track.id);
+                    continue;
+                }
+                if let Some(old) = self.lost_alert_near(track) {
+                    self.book.rename(&old, cause.clone());
+                }
+            }
+            if track.hit {
+                let finding = self.unclaimed(asserted, track, since, now);
+                self.book.report(&cause, finding, now, self.frame);
+            }
+        }
+        let open: Vec<(Cause, u64)> = self
+            .book
+            .open()
+            .filter_map(|(c, _)| match c {
+                Cause::Track(_, id) => Some((c.clone(), *id)),
+                _ => None,
+            })
+            .collect();
+        for (cause, id) in open {
+            let still = self.tracks.get(id).is_some_and(|t| t.hit || t.merged) && self.alone.contains_key(&id);
+            if !still {
+                self.book.absent(&cause, now);
+            }
+        }
+    }
+
+    /// A user whose beam vanished as this one appeared.
+    fn displaced_user(&self, asserted: &[Asserted], answers: &[Option<u64>], since: Timestamp) -> Option<usize> {
+        (0..asserted.len())
+            .filter(|&i| answers[i].is_none() && asserted[i].expected)
+            .filter_map(|i| {
+                let name = &asserted[i].claim.user;
+                if self.book.is_open(&Cause::User(AlertKind::UserUnseen, name.clone())) {
+                    return None;
+                }
+                let user = self.users.get(name)?;
+                let gap = seconds(user.unanswered_since?, since).abs();
+                (user.absence >= VANISHED && gap <= COINCIDENCE_S).then_some((i, gap))
+            })
+            .min_by(|a, b| a.1.total_cmp(&b.1))
+            .map(|(i, _)| i)
+    }
+
+    /// An open alert near here whose own track was lost, or took the place of the beam that answered a claim: the same cause.
+    fn lost_alert_near(&self, track: &Track) -> Option<Cause> {
+        let p = track.motion.position();
+        self.book.open().find_map(|(cause, alert)| {
+            let Cause::Track(AlertKind::UnclaimedEmitter, id) = cause else {
+                return None;
+            };
+            let lost = !self.alone.contains_key(id) || self.tracks.get(*id).is_none_or(|t| !t.hit);
+            let (x, y) = (alert.x_m?, alert.y_m?);
+            (lost && (p - Vector2::new(x, y)).norm() < 10.0).then(|| cause.clone())
+        })
+    }
+
+    /// What else tells of an eavesdropper, each with its likelihood ratio against an honest stray beam.
+    fn unclaimed(&self, asserted: &[Asserted], track: &Track, since: Timestamp, now: Timestamp) -> Finding {
+        let lasted = seconds(since, now);
+        let here = track.motion.position();
+        let nearest = asserted
+            .iter()
+            .filter(|a| !a.ended)
+            .map(|a| (a, (a.position - here).norm()))
+            .min_by(|a, b| a.1.total_cmp(&b.1));
+        let [width, height] =
+            [self.camera.x.half_width(), self.camera.y.half_width()].map(|h| 2.0 * h * self.camera.ground_scale());
+        let beside = nearest.map(|(a, distance)| {
+            // One who wants a user's light stands within its spot; one who does not is anywhere in view.
+            let spot = 3.0 * self.spot_m();
+            let by_chance = (std::f64::consts::PI * spot * spot * asserted.len() as f64 / (width * height)).min(1.0);
+            json!({
+                "user": a.claim.user,
+                "distance_m": distance,
+                "likelihood_ratio": if distance <= spot { 1.0 / by_chance } else { 0.5 },
+                "second_beam_for_claim": distance <= self.config.tolerated_distance_m + a.slack_m,
+            })
+        });
+        let vanished: Vec<Value> = asserted
+            .iter()
+            .filter_map(|a| {
+                let gone = self.users.get(&a.claim.user)?.unanswered_since?;
+                let gap = seconds(gone, since).abs();
+                // Absences come perhaps once an hour and user: one within the gap by chance is that rare.
+                let by_chance = (2.0 * gap.max(0.1) / 3600.0).min(1.0);
+                Some(json!({ "user": a.claim.user, "apart_s": gap, "likelihood_ratio": 0.5 / by_chance }))
+            })
+            .collect();
+        let usual = median(
+            self.users
+                .values()
+                .filter_map(|u| Some(self.tracks.get(u.track?)?.detection.energy_j)),
+        );
+        let energy = usual.map(|usual| {
+            // ln energies of honest users scatter by about 0.3 (ten coherence times a frame); a stranger's by any factor of ten.
+            let z = (track.detection.energy_j.max(1e-30) / usual.max(1e-30)).ln() / 0.3;
+            let (honest, stranger) = ((-0.5 * z * z).exp() / 0.3, (-0.5 * (0.3 * z / 2.3).powi(2)).exp() / 2.3);
+            json!({ "users_median_j": usual, "likelihood_ratio": (stranger / honest.max(1e-12)).min(1e9) })
+        });
+        let severity = if lasted >= ESCALATE_S {
+            Severity::Critical
+        } else {
+            Severity::Warning
+        };
+        let evidence = json!({
+            "track": track.id,
+            "seen_since": track.since,
+            "unclaimed_s": lasted,
+            "log_likelihood_ratio": track.score,
+            "threshold": self.level_unclaimed,
+            "energy_j": track.detection.energy_j,
+            "energy_against_users": energy,
+            "nearest_user": beside,
+            "vanished_users": vanished,
+            "flags": track.detection.flags,
+        });
+        self.at_track(Finding::new(severity, evidence), track)
+    }
+}

@@ -1,0 +1,174 @@
+use std::collections::BTreeSet;
+
+use jiff::Timestamp;
+use nalgebra::{Matrix2, Vector2};
+use serde_json::{Value, json};
+
+use super::{ESCALATE_S, Monitor};
+use crate::claims::seconds;
+use crate::monitor::book::{Cause, Finding};
+use crate::monitor::residuals::surprise;
+use crate::monitor::users::Asserted;
+use crate::monitor::{AlertKind, Severity};
+
+/// Frames in a row that must show a beam outside before a single claim's evidence stands.
+const OUTSIDE_FRAMES: u32 = 3;
+
+impl Monitor {
+    /// Adds the frame's and the new claims' evidence to what is known of each user.
+    pub(super) fn weigh(&mut self, asserted: &[Asserted], answers: &[Option<u64>], now: Timestamp) {
+        let tolerated = self.config.tolerated_distance_m;
+        let gate = self.thresholds.level(asserted.len() as f64);
+        let floor = self.floor();
+        for (a, answer) in asserted.iter().zip(answers) {
+            let hidden = answer.is_none() && self.is_hidden(a);
+            let user = self.users.entry(a.claim.user.clone()).or_default();
+            let track = answer.and_then(|id| self.tracks.get(id));
+            let Some(track) = track else {
+                user.outside = 0;
+                if !a.expected || hidden {
+                    user.unanswered_since = None;
+                    user.absence = 0.0;
+                } else {
+                    user.unanswered_since.get_or_insert(now);
+                    // A beam in view is missed by chance in one frame of ten at the worst.
+                    user.absence += (1.0f64 / 0.1).ln();
+                }
+                continue;
+            };
+            user.track = Some(track.id);
+            user.unanswered_since = None;
+            user.absence = 0.0;
+            user.last_answered = Some(now);
+            if a.ended {
+                continue;
+            }
+            let claimed = Vector2::new(a.claim.x_m, a.claim.y_m) + self.pose.shift();
+            if user.residuals.newest().is_none_or(|t| t < a.claim.time) {
+                match track.at(a.claim.time) {
+                    Some(then) if track.confirmed && !track.merged => {
+                        let beam = track.motion.position_cov();
+                        user.residuals.push(a.claim.time, then - claimed, beam, a.variance);
+                    }
+                    _ if track.confirmed => user.residuals.skip(a.claim.time),
+                    _ => {}
+                }
+            }
+            let cov = track.motion.position_cov() + Matrix2::identity() * a.variance + floor;
+            let offset = track.motion.position() - a.position;
+            let is_outside = track.hit && track.confirmed && surprise(offset, &cov, tolerated + a.slack_m) > gate;
+            user.outside = if is_outside { user.outside + 1 } else { 0 };
+        }
+        let present: BTreeSet<&str> = asserted.iter().map(|a| a.claim.user.as_str()).collect();
+        let book = &self.book;
+        self.users.retain(|name, _| {
+            present.contains(name.as_str())
+                || [
+                    AlertKind::PositionMismatch,
+                    AlertKind::UserUnseen,
+                    AlertKind::ClaimsStale,
+                ]
+                .iter()
+                .any(|k| book.is_open(&Cause::User(*k, name.clone())))
+        });
+    }
+    pub(super) fn decide_users(&mut self, asserted: &[Asserted], answers: &[Option<u64>], now: Timestamp) {
+        let tolerated = self.config.tolerated_distance_m;
+        let floor = self.floor();
+        let each = (asserted.len() * crate::monitor::residuals::WINDOWS.len()) as f64;
+        let level = self.thresholds.level_every(self.period_s.unwrap_or(0.0), each);
+        let level_unseen = self.thresholds.level(asserted.len() as f64);
+        for (a, answer) in asserted.iter().zip(answers) {
+            let name = a.claim.user.clone();
+            let Some(user) = self.users.get_mut(&name) else {
+                continue;
+            };
+            let mismatch = Cause::User(AlertKind::PositionMismatch, name.clone());
+            let unseen = Cause::User(AlertKind::UserUnseen, name.clone());
+            let track = answer.and_then(|id| self.tracks.get(id));
+            if user.mismatched && user.outside == 0 && user.residuals.agree(2, tolerated) {
+                // What told of the mismatch is over and must not tell of another one.
+                user.residuals.forget();
+                user.mismatched = false;
+                user.displaced = false;
+            }
+            let excess = user.residuals.excess(tolerated, &floor);
+            user.mismatched |= user.outside >= OUTSIDE_FRAMES || excess.surprise > level;
+            match track {
+                Some(track) if !a.ended && user.mismatched => {
+                    let distance = (track.motion.position() - a.position).norm();
+                    let severity = if user.displaced || distance > 2.0 * tolerated {
+                        Severity::Critical
+                    } else {
+                        Severity::Warning
+                    };
+                    let evidence = json!({
+                        "track": track.id,
+                        "distance_m": distance,
+                        "tolerated_distance_m": tolerated,
+                        "surprise": excess.surprise,
+                        "threshold": level,
+                        "claims_in_window": excess.window,
+                        "mean_distance_m": excess.distance_m,
+                        "frames_outside": user.outside,
+                        "answered_from_elsewhere": user.displaced,
+                    });
+                    let mut finding = Finding::new(severity, evidence);
+                    finding.claimed = claimed(a);
+                    let track = track.clone();
+                    let finding = self.at_track(finding, &track);
+                    self.book.report(&mismatch, finding, now, self.frame);
+                }
+                _ => self.book.absent(&mismatch, now),
+            }
+            let Some(user) = self.users.get(&name) else { continue };
+            let gone_s = user.unanswered_since.map_or(0.0, |t| seconds(t, now));
+            let claimed_since = user
+                .unanswered_since
+                .is_some_and(|t| a.claim.time > t || user.last_answered.is_none());
+            let is_unseen = a.expected
+                && user.absence >= level_unseen
+                && gone_s >= self.config.decision_s
+                && claimed_since
+                && self.claims_settled(now);
+            let goes_on = self.book.is_open(&unseen) && a.expected && user.absence > 0.0;
+            if is_unseen || goes_on {
+                let severity = if gone_s >= ESCALATE_S {
+                    Severity::Critical
+                } else {
+                    Severity::Warning
+                };
+                let evidence = json!({
+                    "unseen_s": gone_s,
+                    "last_seen": user.last_answered,
+                    "log_likelihood_ratio": user.absence,
+                    "threshold": level_unseen,
+                });
+                let mut finding = Finding::new(severity, evidence);
+                finding.claimed = claimed(a);
+                self.book.report(&unseen, finding, now, self.frame);
+            } else {
+                self.book.absent(&unseen, now);
+            }
+        }
+        let present: BTreeSet<&str> = asserted.iter().map(|a| a.claim.user.as_str()).collect();
+        let orphans: Vec<Cause> = self
+            .book
+            .open()
+            .filter(|(c, _)| matches!(c, Cause::User(_, user) if !present.contains(user.as_str())))
+            .map(|(c, _)| c.clone())
+            .collect();
+        for cause in orphans {
+            self.book.absent(&cause, now);
+        }
+    }
+}
+
+fn claimed(a: &Asserted) -> Option<Value> {
+    Some(json!({
+        "x_m": a.claim.x_m,
+        "y_m": a.claim.y_m,
+        "sigma_m": a.claim.sigma_m,
+        "time": a.claim.time,
+    }))
+}
