@@ -11,6 +11,8 @@ use crate::claims::seconds;
 pub(super) enum Cause {
     User(AlertKind, String),
     Track(AlertKind, u64),
+    /// A second beam within this user's spot.
+    Spot(String),
     Whole(AlertKind),
 }
 
@@ -53,6 +55,7 @@ impl Cause {
     pub fn kind(&self) -> AlertKind {
         match self {
             Self::User(kind, _) | Self::Track(kind, _) | Self::Whole(kind) => *kind,
+            Self::Spot(_) => AlertKind::UnclaimedEmitter,
         }
     }
 
@@ -99,6 +102,10 @@ impl Book {
 
     pub fn is_open(&self, cause: &Cause) -> bool {
         self.open.contains_key(cause)
+    }
+
+    pub fn raised_at(&self, cause: &Cause) -> Option<Timestamp> {
+        self.open.get(cause).map(|open| open.alert.raised_at)
     }
 
     pub fn open(&self) -> impl Iterator<Item = (&Cause, &Alert)> {

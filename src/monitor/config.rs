@@ -6,6 +6,8 @@ use serde::{Deserialize, Serialize};
 pub struct Config {
     /// A user this far from the claim is still where they say.
     pub tolerated_distance_m: f64,
+    /// A user's light may grow by this factor for good before the rest counts as somebody else's in the same spot.
+    pub tolerated_brightening: f64,
     /// False alerts a month of continuous watching may bring, all kinds together.
     pub false_alerts_per_month: f64,
     /// Seconds from the first sight of a beam nobody claims to its alert; claims may come this much later than beams.
@@ -36,6 +38,7 @@ impl Default for Config {
     fn default() -> Self {
         Self {
             tolerated_distance_m: 5.0,
+            tolerated_brightening: 1.35,
             false_alerts_per_month: 1.0,
             decision_s: 1.0,
             sensor_lost_s: 1.0,
@@ -69,6 +72,14 @@ impl Config {
                     found,
                 });
             }
+        }
+        let brightening = self.tolerated_brightening;
+        if !(brightening.is_finite() && brightening >= 1.0) {
+            return Err(ConfigError {
+                field: "tolerated_brightening",
+                expected: "a finite factor of 1 or more",
+                found: brightening,
+            });
         }
         Ok(())
     }

@@ -2,8 +2,8 @@ use super::Config;
 
 /// Mean length of a month, s.
 const MONTH_S: f64 = 30.44 * 86_400.0;
-/// The budget of false alerts is shared by: unclaimed, mismatch, unseen, pose.
-const FAMILIES: f64 = 4.0;
+/// The budget of false alerts is shared by: unclaimed, blended, mismatch, unseen, pose.
+const FAMILIES: f64 = 5.0;
 
 /// Log-likelihood levels that keep the operator's false alerts per month.
 #[derive(Clone, Copy, Debug)]

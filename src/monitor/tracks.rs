@@ -110,6 +110,11 @@ impl Detection {
         }
         detections
     }
+
+    /// Of either beam's position, when two share the spot.
+    fn shared_cov(&self) -> Matrix2<f64> {
+        self.cov + Matrix2::identity() * self.resolution_m.powi(2)
+    }
 }
 
 /// An equal pair can be told apart at d ≥ 5 σ/√SNR, SNR = A·pitch/(2√π·σ·σ_n) (measured on the fit); never taken beyond
@@ -181,8 +186,10 @@ impl Track {
         }
     }
 
-    fn take(&mut self, time: Timestamp, detection: &Detection, ceiling: f64) {
-        self.motion.update(detection.position, detection.cov);
+    /// A spot that another beam has `melted` into lies between the two: neither may take its place or its pace for its own.
+    fn take(&mut self, time: Timestamp, detection: &Detection, melted: bool, ceiling: f64) {
+        let cov = if melted { detection.shared_cov() } else { detection.cov };
+        self.motion.update(detection.position, cov);
         self.last_hit = time;
         self.hit = true;
         self.merged = false;
@@ -272,10 +279,19 @@ impl Tracks {
         }
         // Spots that a known beam is followed by: only into such a one can another beam melt.
         let followed: Vec<bool> = owner.iter().map(|o| o.is_some_and(|i| self.all[i].confirmed)).collect();
+        let mut melted = vec![false; detections.len()];
+        for (track, _) in self.all.iter_mut().zip(&hit).filter(|(_, found)| found.is_none()) {
+            match track.neighbour(detections, &followed) {
+                Some(j) => {
+                    track.merge(&detections[j], dt_s);
+                    melted[j] = true;
+                }
+                None => track.miss(dt_s, track.detection.ghost),
+            }
+        }
         for (track, found) in self.all.iter_mut().zip(&hit) {
-            match *found {
-                Some(j) => track.take(time, &detections[j], self.score_ceiling),
-                None => track.miss_or_merge(detections, &followed, dt_s),
+            if let Some(j) = *found {
+                track.take(time, &detections[j], melted[j], self.score_ceiling);
             }
         }
         self.all.retain(|t| !t.is_over());
@@ -299,27 +315,23 @@ impl Tracks {
 }
 
 impl Track {
-    /// Without a detection of its own the beam may have melted into a neighbour's spot: it is then known to be there, as
-    /// well as the two can be told apart.
-    fn miss_or_merge(&mut self, detections: &[Detection], followed: &[bool], dt_s: f64) {
+    /// Without a detection of its own the beam may have melted into a neighbour's spot.
+    fn neighbour(&self, detections: &[Detection], followed: &[bool]) -> Option<usize> {
         let was_there = self.confirmed && (self.hit || self.merged);
         let here = self.motion.position();
         let spread = largest_eigenvalue(&self.motion.position_cov()).sqrt().min(1.0);
-        let neighbour = (0..detections.len()).filter(|&j| was_there && followed[j]).find(|&j| {
+        (0..detections.len()).filter(|&j| was_there && followed[j]).find(|&j| {
             let d = &detections[j];
             (d.position - here).norm() < d.resolution_m + GATE_FLOOR_M + 3.0 * spread
-        });
-        match neighbour {
-            Some(j) => {
-                let d = &detections[j];
-                self.motion
-                    .update(d.position, d.cov + Matrix2::identity() * d.resolution_m.powi(2));
-                self.merged = true;
-                self.hit = false;
-                // Bounds a track that shadows another one: it lives a few times longer than one lost in the open.
-                self.missed_s += 0.2 * dt_s;
-            }
-            None => self.miss(dt_s, self.detection.ghost),
-        }
+        })
+    }
+
+    /// It is known to be there, as well as the two can be told apart.
+    fn merge(&mut self, spot: &Detection, dt_s: f64) {
+        self.motion.update(spot.position, spot.shared_cov());
+        self.merged = true;
+        self.hit = false;
+        // Bounds a track that shadows another one: it lives a few times longer than one lost in the open.
+        self.missed_s += 0.2 * dt_s;
     }
 }

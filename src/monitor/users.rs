@@ -1,6 +1,7 @@
 use jiff::Timestamp;
 use nalgebra::{Matrix2, Vector2};
 
+use super::blend::Blend;
 use super::pose::Witness;
 use super::residuals::Residuals;
 use crate::claims::{Claim, ClaimState, Standing, seconds};
@@ -82,4 +83,8 @@ pub(super) struct User {
     pub mismatched: bool,
     /// A beam elsewhere took the user's place when they vanished.
     pub displaced: bool,
+    /// Whether the beam is two.
+    pub blend: Blend,
+    /// There are first signs that it is: the present is not taken for the past.
+    pub suspected: bool,
 }

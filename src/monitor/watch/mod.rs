@@ -3,6 +3,7 @@
 mod answers;
 mod habits;
 mod inputs;
+mod spots;
 mod summary;
 mod unclaimed;
 mod users;
@@ -24,6 +25,8 @@ use crate::optics::Camera;
 
 /// Systematic error of the positions that does not average out, m.
 const SYSTEMATIC_M: f64 = 0.05;
+/// A beam and an absence that began within this of each other have one cause, s.
+const COINCIDENCE_S: f64 = 1.5;
 /// An alert that lasts this long is critical, s.
 const ESCALATE_S: f64 = 10.0;
 
@@ -105,6 +108,7 @@ impl Monitor {
             self.note_alone(&answers, now);
             self.decide_unclaimed(&asserted, &mut answers, now);
             self.decide_users(&asserted, &answers, now);
+            self.decide_spots(&asserted, &answers, now);
         }
         self.watch_inputs(&asserted, claims, now);
         self.report(&asserted, seen.frame, now)

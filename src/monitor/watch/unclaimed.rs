@@ -3,15 +3,13 @@ use nalgebra::Vector2;
 use serde_json::{Value, json};
 
 use super::habits::median;
-use super::{ESCALATE_S, Monitor};
+use super::{COINCIDENCE_S, ESCALATE_S, Monitor};
 use crate::claims::seconds;
 use crate::monitor::book::{Cause, Finding};
 use crate::monitor::tracks::Track;
 use crate::monitor::users::Asserted;
 use crate::monitor::{AlertKind, Severity};
 
-/// A beam and an absence that began within this of each other have one cause, s.
-const COINCIDENCE_S: f64 = 1.5;
 /// ln likelihood ratio from which a user counts as vanished: three frames in a row.
 const VANISHED: f64 = 6.9;
 /// Share of the time to decide that a beam waits for its claim; the rest is for frames that miss it.
@@ -110,10 +108,13 @@ impl Monitor {
     fn lost_alert_near(&self, track: &Track) -> Option<Cause> {
         let p = track.motion.position();
         self.book.open().find_map(|(cause, alert)| {
-            let Cause::Track(AlertKind::UnclaimedEmitter, id) = cause else {
-                return None;
+            let lost = match cause {
+                Cause::Track(AlertKind::UnclaimedEmitter, id) => {
+                    !self.alone.contains_key(id) || self.tracks.get(*id).is_none_or(|t| !t.hit)
+                }
+                Cause::Spot(_) => true,
+                _ => return None,
             };
-            let lost = !self.alone.contains_key(id) || self.tracks.get(*id).is_none_or(|t| !t.hit);
             let (x, y) = (alert.x_m?, alert.y_m?);
             (lost && (p - Vector2::new(x, y)).norm() < 10.0).then(|| cause.clone())
         })

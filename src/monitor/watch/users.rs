@@ -4,11 +4,11 @@ use jiff::Timestamp;
 use nalgebra::{Matrix2, Vector2};
 use serde_json::{Value, json};
 
-use super::{ESCALATE_S, Monitor};
+use super::{COINCIDENCE_S, ESCALATE_S, Monitor};
 use crate::claims::seconds;
 use crate::monitor::book::{Cause, Finding};
-use crate::monitor::residuals::surprise;
-use crate::monitor::users::Asserted;
+use crate::monitor::residuals::{WINDOWS, surprise};
+use crate::monitor::users::{Asserted, User};
 use crate::monitor::{AlertKind, Severity};
 
 /// Frames in a row that must show a beam outside before a single claim's evidence stands.
@@ -73,83 +73,12 @@ impl Monitor {
         });
     }
     pub(super) fn decide_users(&mut self, asserted: &[Asserted], answers: &[Option<u64>], now: Timestamp) {
-        let tolerated = self.config.tolerated_distance_m;
-        let floor = self.floor();
-        let each = (asserted.len() * crate::monitor::residuals::WINDOWS.len()) as f64;
+        let each = (asserted.len() * WINDOWS.len()) as f64;
         let level = self.thresholds.level_every(self.period_s.unwrap_or(0.0), each);
         let level_unseen = self.thresholds.level(asserted.len() as f64);
         for (a, answer) in asserted.iter().zip(answers) {
-            let name = a.claim.user.clone();
-            let Some(user) = self.users.get_mut(&name) else {
-                continue;
-            };
-            let mismatch = Cause::User(AlertKind::PositionMismatch, name.clone());
-            let unseen = Cause::User(AlertKind::UserUnseen, name.clone());
-            let track = answer.and_then(|id| self.tracks.get(id));
-            if user.mismatched && user.outside == 0 && user.residuals.agree(2, tolerated) {
-                // What told of the mismatch is over and must not tell of another one.
-                user.residuals.forget();
-                user.mismatched = false;
-                user.displaced = false;
-            }
-            let excess = user.residuals.excess(tolerated, &floor);
-            user.mismatched |= user.outside >= OUTSIDE_FRAMES || excess.surprise > level;
-            match track {
-                Some(track) if !a.ended && user.mismatched => {
-                    let distance = (track.motion.position() - a.position).norm();
-                    let severity = if user.displaced || distance > 2.0 * tolerated {
-                        Severity::Critical
-                    } else {
-                        Severity::Warning
-                    };
-                    let evidence = json!({
-                        "track": track.id,
-                        "distance_m": distance,
-                        "tolerated_distance_m": tolerated,
-                        "surprise": excess.surprise,
-                        "threshold": level,
-                        "claims_in_window": excess.window,
-                        "mean_distance_m": excess.distance_m,
-                        "frames_outside": user.outside,
-                        "answered_from_elsewhere": user.displaced,
-                    });
-                    let mut finding = Finding::new(severity, evidence);
-                    finding.claimed = claimed(a);
-                    let track = track.clone();
-                    let finding = self.at_track(finding, &track);
-                    self.book.report(&mismatch, finding, now, self.frame);
-                }
-                _ => self.book.absent(&mismatch, now),
-            }
-            let Some(user) = self.users.get(&name) else { continue };
-            let gone_s = user.unanswered_since.map_or(0.0, |t| seconds(t, now));
-            let claimed_since = user
-                .unanswered_since
-                .is_some_and(|t| a.claim.time > t || user.last_answered.is_none());
-            let is_unseen = a.expected
-                && user.absence >= level_unseen
-                && gone_s >= self.config.decision_s
-                && claimed_since
-                && self.claims_settled(now);
-            let goes_on = self.book.is_open(&unseen) && a.expected && user.absence > 0.0;
-            if is_unseen || goes_on {
-                let severity = if gone_s >= ESCALATE_S {
-                    Severity::Critical
-                } else {
-                    Severity::Warning
-                };
-                let evidence = json!({
-                    "unseen_s": gone_s,
-                    "last_seen": user.last_answered,
-                    "log_likelihood_ratio": user.absence,
-                    "threshold": level_unseen,
-                });
-                let mut finding = Finding::new(severity, evidence);
-                finding.claimed = claimed(a);
-                self.book.report(&unseen, finding, now, self.frame);
-            } else {
-                self.book.absent(&unseen, now);
-            }
+            self.decide_mismatch(a, *answer, level, now);
+            self.decide_unseen(a, level_unseen, now);
         }
         let present: BTreeSet<&str> = asserted.iter().map(|a| a.claim.user.as_str()).collect();
         let orphans: Vec<Cause> = self
@@ -161,6 +90,97 @@ impl Monitor {
         for cause in orphans {
             self.book.absent(&cause, now);
         }
+    }
+
+    fn decide_mismatch(&mut self, a: &Asserted, answer: Option<u64>, level: f64, now: Timestamp) {
+        let tolerated = self.config.tolerated_distance_m;
+        let floor = self.floor();
+        let cause = Cause::User(AlertKind::PositionMismatch, a.claim.user.clone());
+        let track = answer.and_then(|id| self.tracks.get(id));
+        let Some(user) = self.users.get_mut(&a.claim.user) else {
+            return;
+        };
+        if user.mismatched && user.outside == 0 && user.residuals.agree(2, tolerated) {
+            // What told of the mismatch is over and must not tell of another one.
+            user.residuals.forget();
+            user.mismatched = false;
+            user.displaced = false;
+        }
+        let excess = user.residuals.excess(tolerated, &floor);
+        user.mismatched |= user.outside >= OUTSIDE_FRAMES || excess.surprise > level;
+        let Some(track) = track.filter(|_| !a.ended && user.mismatched) else {
+            self.book.absent(&cause, now);
+            return;
+        };
+        let distance = (track.motion.position() - a.position).norm();
+        let severity = if user.displaced || distance > 2.0 * tolerated {
+            Severity::Critical
+        } else {
+            Severity::Warning
+        };
+        let evidence = json!({
+            "track": track.id,
+            "distance_m": distance,
+            "tolerated_distance_m": tolerated,
+            "surprise": excess.surprise,
+            "threshold": level,
+            "claims_in_window": excess.window,
+            "mean_distance_m": excess.distance_m,
+            "frames_outside": user.outside,
+            "answered_from_elsewhere": user.displaced,
+        });
+        let mut finding = self.at_track(Finding::new(severity, evidence), track);
+        finding.claimed = claimed(a);
+        self.book.report(&cause, finding, now, self.frame);
+    }
+
+    fn decide_unseen(&mut self, a: &Asserted, level: f64, now: Timestamp) {
+        let cause = Cause::User(AlertKind::UserUnseen, a.claim.user.clone());
+        let Some(user) = self.users.get(&a.claim.user) else {
+            return;
+        };
+        let gone_s = user.unanswered_since.map_or(0.0, |t| seconds(t, now));
+        let claimed_since = user
+            .unanswered_since
+            .is_some_and(|t| a.claim.time > t || user.last_answered.is_none());
+        let is_unseen = a.expected
+            && user.absence >= level
+            && gone_s >= self.config.decision_s
+            && claimed_since
+            && self.claims_settled(now)
+            && !self.awaits_newcomer(user, gone_s);
+        let goes_on = self.book.is_open(&cause) && a.expected && user.absence > 0.0;
+        if !is_unseen && !goes_on {
+            self.book.absent(&cause, now);
+            return;
+        }
+        let severity = if gone_s >= ESCALATE_S {
+            Severity::Critical
+        } else {
+            Severity::Warning
+        };
+        let evidence = json!({
+            "unseen_s": gone_s,
+            "last_seen": user.last_answered,
+            "log_likelihood_ratio": user.absence,
+            "threshold": level,
+        });
+        let mut finding = Finding::new(severity, evidence);
+        finding.claimed = claimed(a);
+        self.book.report(&cause, finding, now, self.frame);
+    }
+
+    /// Whether a beam that came as the user went is still being judged: it may be the user answering from elsewhere, which is
+    /// one alert and not two. New beams without end put the verdict off by no more than a coincidence lasts.
+    fn awaits_newcomer(&self, user: &User, gone_s: f64) -> bool {
+        let Some(gone) = user.unanswered_since else {
+            return false;
+        };
+        gone_s < self.config.decision_s + COINCIDENCE_S
+            && self.alone.iter().any(|(id, since)| {
+                let coincides = seconds(gone, *since).abs() <= COINCIDENCE_S;
+                coincides && !self.book.is_open(&Cause::Track(AlertKind::UnclaimedEmitter, *id))
+            })
     }
 }
 

@@ -1,0 +1,162 @@
+use std::collections::BTreeSet;
+
+use jiff::Timestamp;
+use nalgebra::Vector2;
+use serde_json::json;
+
+use super::habits::median;
+use super::{ESCALATE_S, Monitor};
+use crate::claims::seconds;
+use crate::monitor::blend::{Blend, Company, Scatter};
+use crate::monitor::book::{Cause, Finding};
+use crate::monitor::tracks::Track;
+use crate::monitor::users::Asserted;
+use crate::monitor::{AlertKind, Severity};
+
+/// Users besides the one at hand whose median tells what befalls everybody.
+const FEWEST_OTHERS: usize = 2;
+/// Share of the level from which a beam's present is no longer taken into its past.
+const SUSPECT: f64 = 0.2;
+
+impl Monitor {
+    /// Looks for a second beam within each user's spot.
+    pub(super) fn decide_spots(&mut self, asserted: &[Asserted], answers: &[Option<u64>], now: Timestamp) {
+        let level = self.thresholds.level(asserted.len() as f64);
+        let watched: Vec<(usize, Track)> = (0..asserted.len())
+            .filter_map(|i| Some((i, self.tracks.get(answers[i]?)?.clone())))
+            .filter(|(i, t)| t.hit && t.confirmed && !self.is_shared(*i, t, asserted, answers))
+            .collect();
+        self.note_spots(asserted, &watched);
+        let brightening = self.config.tolerated_brightening;
+        let mut suspects = BTreeSet::new();
+        for (i, track) in &watched {
+            let name = &asserted[*i].claim.user;
+            let cause = Cause::Spot(name.clone());
+            let company = self.company(name, asserted, &watched);
+            let Some(user) = self.users.get_mut(name) else { continue };
+            let seen = user.blend.suspicion(brightening, &company);
+            user.suspected = seen.surprise() > SUSPECT * level;
+            let open = self.book.is_open(&cause);
+            if seen.surprise() <= if open { SUSPECT * level } else { level } {
+                continue;
+            }
+            suspects.insert(name.clone());
+            if !open && let Some(old) = self.alert_melted_into(track) {
+                self.book.rename(&old, cause.clone());
+            }
+            let since = self.book.raised_at(&cause).unwrap_or(now);
+            let severity = match seconds(since, now) >= ESCALATE_S {
+                true => Severity::Critical,
+                false => Severity::Warning,
+            };
+            let evidence = json!({
+                "track": track.id,
+                "shares_the_spot_of": name,
+                "resolution_m": track.detection.resolution_m,
+                "energy_j": track.detection.energy_j,
+                "energy_over_the_past": { "ratio": seen.brighter, "surprise": seen.energy_surprise },
+                "unrest_over_the_expected": { "ratio": seen.restless, "surprise": seen.unrest_surprise },
+                "surprise": seen.surprise(),
+                "threshold": level,
+                "flags": track.detection.flags,
+            });
+            let finding = self.at_track(Finding::new(severity, evidence), track);
+            self.book.report(&cause, finding, now, self.frame);
+        }
+        // A spot that cannot be judged now keeps its alert; one whose beam is gone does not.
+        let over: Vec<Cause> = self
+            .book
+            .open()
+            .filter_map(|(cause, _)| match cause {
+                Cause::Spot(name) => Some((cause.clone(), name)),
+                _ => None,
+            })
+            .filter(|(_, name)| !suspects.contains(*name))
+            .map(|(cause, _)| cause)
+            .collect();
+        for cause in over {
+            self.book.absent(&cause, now);
+        }
+    }
+
+    /// Whether another user's beam may be in this spot, by tracks or by claims.
+    fn is_shared(&self, i: usize, track: &Track, asserted: &[Asserted], answers: &[Option<u64>]) -> bool {
+        let (here, reach) = (track.motion.position(), track.detection.resolution_m);
+        let melted = self.tracks.all.iter().any(|t| {
+            let claimed = asserted.iter().zip(answers).any(|(_, answer)| *answer == Some(t.id));
+            t.id != track.id && t.merged && claimed && (t.motion.position() - here).norm() < reach
+        });
+        melted
+            || (0..asserted.len())
+                .filter(|&j| j != i && answers[j].is_none())
+                .any(|j| {
+                    let a = &asserted[j];
+                    let off = reach + self.config.tolerated_distance_m + a.slack_m + 2.0 * a.variance.sqrt();
+                    (a.position - here).norm() < off
+                })
+    }
+
+    fn note_spots(&mut self, asserted: &[Asserted], watched: &[(usize, Track)]) {
+        let names: BTreeSet<&str> = watched.iter().map(|(i, _)| asserted[*i].claim.user.as_str()).collect();
+        for (name, user) in &mut self.users {
+            if !names.contains(name.as_str()) {
+                user.blend.pause();
+            }
+        }
+        let jumps: Vec<_> = watched
+            .iter()
+            .map(|(i, track)| {
+                let user = self.users.get_mut(&asserted[*i].claim.user)?;
+                user.blend.jump(track.last_hit, &track.detection)
+            })
+            .collect();
+        let known: Vec<Vector2<f64>> = jumps.iter().flatten().map(|(d, _)| *d).collect();
+        let common = if known.len() > FEWEST_OTHERS {
+            let axis = |k: usize| median(known.iter().map(|d| d[k])).unwrap_or(0.0);
+            Vector2::new(axis(0), axis(1))
+        } else {
+            Vector2::zeros()
+        };
+        for ((i, track), jump) in watched.iter().zip(jumps) {
+            if let Some(user) = self.users.get_mut(&asserted[*i].claim.user) {
+                let jump = jump.map(|(d, cov)| (d - common, cov));
+                user.blend.note(&track.detection, jump, !user.suspected);
+            }
+        }
+    }
+
+    fn company(&self, name: &str, asserted: &[Asserted], watched: &[(usize, Track)]) -> Company {
+        let blends: Vec<(bool, &Blend)> = watched
+            .iter()
+            .map(|(i, _)| &asserted[*i].claim.user)
+            .filter_map(|user| Some((user != name, &self.users.get(user)?.blend)))
+            .collect();
+        let others = || blends.iter().filter(|(other, _)| *other).map(|(_, b)| b);
+        let enough = |values: Vec<f64>| match values.len() >= FEWEST_OTHERS {
+            true => median(values.into_iter()),
+            false => None,
+        };
+        let scatters = blends.iter().map(|(_, b)| b.scatter());
+        Company {
+            rise: enough(others().filter_map(|b| b.recent_rise()).collect()),
+            unrest: enough(others().filter_map(|b| b.recent_unrest()).collect()),
+            scatter: scatters.fold(Scatter::default(), |sum, s| Scatter {
+                squares: sum.squares + s.squares,
+                freedom: sum.freedom + s.freedom,
+            }),
+        }
+    }
+
+    /// The alert of an emitter that can no longer be told apart from this beam: the same cause.
+    fn alert_melted_into(&self, track: &Track) -> Option<Cause> {
+        let here = track.motion.position();
+        self.book.open().find_map(|(cause, alert)| {
+            let Cause::Track(AlertKind::UnclaimedEmitter, id) = cause else {
+                return None;
+            };
+            let away = (Vector2::new(alert.x_m?, alert.y_m?) - here).norm();
+            let lost = self.tracks.get(*id).is_none_or(|t| !t.hit);
+            (lost && away < 2.0 * track.detection.resolution_m).then(|| cause.clone())
+        })
+    }
+}

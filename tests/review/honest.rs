@@ -1,0 +1,86 @@
+//! Nobody lies: nothing may be raised.
+
+use std::collections::BTreeMap;
+
+use super::stage::{Reviewed, Story, review};
+
+/// Which track answered for a user over the story, each once.
+fn identities(told: &Reviewed) -> BTreeMap<String, Vec<u64>> {
+    let mut tracks: BTreeMap<String, Vec<u64>> = BTreeMap::new();
+    for emitter in told.reports.iter().flat_map(|r| &r.emitters) {
+        if let Some(user) = &emitter.user {
+            let mine = tracks.entry(user.clone()).or_default();
+            if mine.last() != Some(&emitter.track) {
+                mine.push(emitter.track);
+            }
+        }
+    }
+    tracks
+}
+
+#[test]
+fn honest_users_raise_nothing_and_keep_their_tracks() {
+    for seed in 0..3 {
+        let mut story = Story::with(seed, "");
+        story.seconds = 60.0;
+        let told = review(&story);
+        told.expect(&[]);
+        assert!(
+            identities(&told).values().all(|t| t.len() == 1),
+            "{:?}",
+            identities(&told)
+        );
+    }
+}
+
+/// Their beams melt into one spot for some seconds. Who is who afterwards is known by how they walked.
+#[test]
+fn users_that_cross_raise_nothing_and_keep_their_tracks() {
+    for (seed, miss) in [(0, 0.0), (1, 1.0), (2, 2.0), (3, 4.0)] {
+        let mut story = Story::with(
+            seed,
+            &format!(
+                "[[user]]\nname = \"a\"\nmotion.drift = {{ from_m = [-30, 0], velocity_m_s = [1.5, 0] }}\n\
+                 [[user]]\nname = \"b\"\nmotion.drift = {{ from_m = [30, {miss}], velocity_m_s = [-1.5, 0] }}"
+            ),
+        );
+        story.seconds = 40.0;
+        let told = review(&story);
+        told.expect(&[]);
+        let who = identities(&told);
+        assert!(
+            who["a"].len() == 1 && who["b"].len() == 1,
+            "missed by {miss} m: {who:?}"
+        );
+    }
+}
+
+#[test]
+fn claims_late_and_lost_raise_nothing() {
+    for seed in 0..3 {
+        let mut story = Story::with(seed, "");
+        story.change(|scene| {
+            scene.claims.delay_s = 0.3;
+            scene.claims.delay_spread_s = 1.2;
+            scene.claims.lost = 0.3;
+        });
+        story.seconds = 40.0;
+        review(&story).expect(&[]);
+    }
+}
+
+/// Gusts, haze and a log full of holes: what befalls everybody is nobody's fault.
+#[test]
+fn the_scenes_without_an_attacker_raise_nothing() {
+    for (name, seconds) in [
+        ("night", 40.0),
+        ("bad-network", 60.0),
+        ("narrow-beam", 40.0),
+        ("windy", 60.0),
+    ] {
+        let mut story = Story::file(1, &format!("config/scenes/{name}.toml"));
+        story.seconds = seconds;
+        let told = review(&story);
+        assert!(told.raised().is_empty(), "{name}: {:?}", told.raised());
+    }
+}

@@ -1,0 +1,8 @@
+//! The whole chain from pixels to alerts, on scenes of the simulator: what must be raised, when, and nothing else.
+
+mod attacks;
+mod faults;
+mod honest;
+mod power;
+mod stage;
+mod tracks;

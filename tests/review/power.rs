@@ -1,0 +1,66 @@
+//! How often an attack is found in time, and how often peace is broken. Long runs are ignored by default:
+//! `cargo test --release --test review -- --ignored --nocapture`.
+
+use oapwatch::monitor::AlertKind::UnclaimedEmitter;
+
+use super::stage::{Story, review};
+
+/// Alerts of `kind` within `within` seconds of the shadow's coming, of `n` stories, with its delays.
+fn delays(n: u64, beside_m: f64, power_w: f64, history_s: f64) -> (usize, usize, Vec<f64>) {
+    let (mut other, mut silent, mut delays) = (0, 0, Vec::new());
+    for seed in 0..n {
+        let angle = 2.4 * seed as f64;
+        let (x, y) = (beside_m * angle.cos(), beside_m * angle.sin());
+        let mut story = Story::with(
+            seed,
+            &format!(
+                "[[intruder]]\nname = \"shadow\"\npower_w = {power_w}\npresent = {{ from_s = {history_s} }}\n\
+                 motion.beside = {{ user = \"u-2\", offset_m = [{x}, {y}] }}"
+            ),
+        );
+        story.seconds = history_s + 20.0;
+        let raised = review(&story).raised();
+        match raised.first() {
+            Some((UnclaimedEmitter, None, at)) if *at >= history_s => delays.push(at - history_s),
+            Some(_) => other += 1,
+            None => silent += 1,
+        }
+    }
+    delays.sort_by(f64::total_cmp);
+    (silent, other, delays)
+}
+
+#[test]
+#[ignore = "minutes; see the file's head"]
+fn a_shadow_by_distance_and_power() {
+    println!("beside m, power of the user's: found, median and longest delay s; something else first");
+    for power_w in [1.0, 0.5, 0.25] {
+        for beside_m in [0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 6.0] {
+            let n = 10;
+            let (silent, other, delays) = delays(n, beside_m, power_w, 60.0);
+            let found = n as usize - silent - other;
+            let median = delays.get(delays.len() / 2).copied().unwrap_or(f64::NAN);
+            let longest = delays.last().copied().unwrap_or(f64::NAN);
+            println!("{beside_m:4} {power_w:5}: {found:2} of {n}, {median:.1}, {longest:.1}; {other}");
+        }
+    }
+}
+
+/// Honest users on the simulator's own pixels, half an hour of them in stories of two minutes.
+#[test]
+#[ignore = "minutes; see the file's head"]
+fn honest_pixels_raise_nothing() {
+    let mut frames = 0;
+    for seed in 1000..1015 {
+        let mut story = Story::with(
+            seed,
+            "[[user]]\nname = \"r-1\"\nmotion.roam = { home_m = [0, 0], spread_m = 15, time_s = 12 }\n\
+             [[user]]\nname = \"r-2\"\nmotion.roam = { home_m = [10, 5], spread_m = 15, time_s = 12 }",
+        );
+        story.seconds = 120.0;
+        let told = review(&story);
+        frames += told.reports.len();
+        assert!(told.raised().is_empty(), "seed {seed}: {:?}", told.raised());
+    }
+    println!("{frames} honest frames, no alert");
+}
