@@ -4,6 +4,8 @@
 //! accuracy, a space of m ≪ n dimensions when σ is wider than a pixel. Fitting there is lossless for white noise
 //! and costs m² instead of n²; what lies outside is pure noise and measures it without a model.
 
+use std::ops::Range;
+
 use faer::Mat;
 
 use super::spot;
@@ -26,7 +28,7 @@ pub(super) struct Basis {
     pub stride: usize,
     /// Pixels to coefficients, (n, stride) row-major; unused columns are zero.
     u: Vec<f64>,
-    is_pixels: bool,
+    pub is_pixels: bool,
     /// `tail[m]`: largest norm that a spot of width σ leaves outside the first m columns.
     tail: Vec<f64>,
     /// f, f′, f″ at the knots, (knots, 3, stride).
@@ -39,6 +41,17 @@ impl Basis {
         let n = axis.n;
         let edges: Vec<f64> = (0..=n).map(|k| axis.edge(k) / sigma).collect();
         let extent = edges[n] - edges[0] + 2.0 * MARGIN;
+        let mut basis = Self::pixels(axis, sigma);
+        if extent <= WIDEST {
+            basis.decompose(extent);
+        }
+        basis
+    }
+
+    /// The axis in its pixels: every spot touches few of them, and each may have a weight of its own.
+    pub fn pixels(axis: &Axis, sigma: f64) -> Self {
+        let n = axis.n;
+        let edges: Vec<f64> = (0..=n).map(|k| axis.edge(k) / sigma).collect();
         let mut basis = Self {
             n,
             stride: n.next_multiple_of(4),
@@ -49,11 +62,7 @@ impl Basis {
             first_knot: edges[0] - MARGIN,
             edges,
         };
-        if extent > WIDEST {
-            basis.fill_identity();
-        } else {
-            basis.decompose(extent);
-        }
+        basis.fill_identity();
         basis
     }
 
@@ -103,7 +112,7 @@ impl Basis {
         let (mut f, mut f1, mut f2) = (vec![0.0; n], vec![0.0; n], vec![0.0; n]);
         for (b, w) in WIDTHS.into_iter().enumerate() {
             for j in 0..samples {
-                for k in spot::profile(&self.edges, at(j), w, &mut f, &mut f1, &mut f2) {
+                for k in spot::profile(&self.edges, at(j), w, spot::REACH, &mut f, &mut f1, &mut f2) {
                     kernels[(k, b * samples + j)] = f[k];
                 }
             }
@@ -151,16 +160,17 @@ impl Basis {
         let mut scratch = vec![0.0; 3 * n];
         for (k, row) in table.chunks_exact_mut(3 * stride).enumerate() {
             let u = self.first_knot + k as f64 / KNOTS_PER_SIGMA;
-            self.direct(u, 1.0, stride, &mut scratch, row);
+            self.direct(u, 1.0, spot::REACH, stride, &mut scratch, row);
         }
         self.table = table;
     }
 
-    /// f, f′, f″ of a spot of relative width `w` at `u` in the first `m` columns; `out` is (3, m), `scratch` 3 n.
+    /// f, f′, f″ of a spot of relative width `w` at `u`, as far out as `reach` widths, in the first `m` columns; `out` is
+    /// (3, m), `scratch` 3 n. Returns the columns that hold anything.
     #[inline(always)]
-    pub fn atom(&self, u: f64, w: f64, m: usize, scratch: &mut [f64], out: &mut [f64]) {
+    pub fn atom(&self, u: f64, w: f64, reach: f64, m: usize, scratch: &mut [f64], out: &mut [f64]) -> Range<usize> {
         if w != 1.0 || self.table.is_empty() {
-            return self.direct(u, w, m, scratch, out);
+            return self.direct(u, w, reach, m, scratch, out);
         }
         // Quintic Hermite interpolation: the error is h⁶/46080·f⁽⁶⁾, 2e-11 of the spot.
         let position = (u - self.first_knot) * KNOTS_PER_SIGMA;
@@ -216,22 +226,23 @@ impl Basis {
             }
             (f[c], f1[c], f2[c]) = (sum[0], sum[1], sum[2]);
         }
+        0..m
     }
 
     #[inline(always)]
-    fn direct(&self, u: f64, w: f64, m: usize, scratch: &mut [f64], out: &mut [f64]) {
+    fn direct(&self, u: f64, w: f64, reach: f64, m: usize, scratch: &mut [f64], out: &mut [f64]) -> Range<usize> {
         let n = self.n;
         let (f, rest) = scratch.split_at_mut(n);
         let (f1, f2) = rest.split_at_mut(n);
-        let range = spot::profile(&self.edges, u, w, f, f1, &mut f2[..n]);
+        let range = spot::profile(&self.edges, u, w, reach, f, f1, &mut f2[..n]);
         out[..3 * m].fill(0.0);
         let (o, rest) = out.split_at_mut(m);
         let (o1, o2) = rest.split_at_mut(m);
         if self.is_pixels {
             o[range.clone()].copy_from_slice(&f[range.clone()]);
             o1[range.clone()].copy_from_slice(&f1[range.clone()]);
-            o2[range.clone()].copy_from_slice(&f2[range]);
-            return;
+            o2[range.clone()].copy_from_slice(&f2[range.clone()]);
+            return range;
         }
         for k in range {
             let row = &self.row(k)[..m];
@@ -241,6 +252,7 @@ impl Basis {
                 o2[c] += f2[k] * row[c];
             }
         }
+        0..m
     }
 
     /// Coefficients of a profile over the pixels.
@@ -265,8 +277,8 @@ mod tests {
         let (mut scratch, mut a, mut b) = (vec![0.0; 180], vec![0.0; 3 * m], vec![0.0; 3 * m]);
         for k in 0..200 {
             let u = basis.lowest() + (basis.highest() - basis.lowest()) * (k as f64 + 0.37) / 200.0;
-            basis.atom(u, 1.0, m, &mut scratch, &mut a);
-            basis.direct(u, 1.0, m, &mut scratch, &mut b);
+            basis.atom(u, 1.0, spot::REACH, m, &mut scratch, &mut a);
+            basis.direct(u, 1.0, spot::REACH, m, &mut scratch, &mut b);
             for c in 0..m {
                 // Interpolation errors h⁶, h⁵, h⁴ with h = 1/16 and their small constants.
                 assert!((a[c] - b[c]).abs() < 1e-10);

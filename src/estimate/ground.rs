@@ -1,6 +1,6 @@
 //! From a fitted model to positions on the ground, each with its covariance and flags.
 
-use super::fit::Model;
+use super::model::Model;
 use super::reading::Reading;
 use super::screen::Screened;
 use super::search::Search;
@@ -39,9 +39,6 @@ pub(super) fn locate(
     let extent = (high[0] - low[0]).max(high[1] - low[1]);
     let mut cov = Vec::new();
     let is_regular = search.fitter.covariance(p, n, 12.0 / (extent * extent), &mut cov);
-    if is_regular && !reading.growth.is_flat() {
-        search.fitter.spread(reading, model, frame, &mut cov);
-    }
     let block = |i: usize, j: usize| {
         if is_regular {
             [0, 1].map(|r| [0, 1].map(|c| cov[(3 * i + r) * p + 3 * j + c]))

@@ -47,7 +47,7 @@ impl Heatmap {
             let mut norms = Vec::with_capacity(count);
             let (mut scratch, mut atom) = (vec![0.0; 3 * b.n], vec![0.0; 3 * b.stride]);
             for (k, row) in templates.chunks_exact_mut(b.stride).enumerate() {
-                b.atom(grid[k], 1.0, b.stride, &mut scratch, &mut atom);
+                b.atom(grid[k], 1.0, super::spot::REACH, b.stride, &mut scratch, &mut atom);
                 let norm = dot(&atom[..b.stride], &atom[..b.stride]).sqrt().max(1e-12);
                 for (t, a) in row.iter_mut().zip(&atom) {
                     *t = a / norm;

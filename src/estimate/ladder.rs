@@ -4,13 +4,16 @@ use std::time::{Duration, Instant};
 
 use super::basis::Basis;
 use super::corrected::Corrected;
-use super::fit::{Fitter, Model, Nuisances};
+use super::fit::Fitter;
 use super::learned::{Learned, LearnedEstimator};
+use super::model::{Model, Nuisances, Spot};
 use super::network::NetworkError;
 use super::noise::Inspection;
+use super::pencil::Pencil;
 use super::reading::Reading;
 use super::screen::Screened;
 use super::search::Search;
+use super::weigh::Weighing;
 use super::{Config, Error, Estimate, Estimator, Flags, ground};
 use crate::frame::Frame;
 use crate::optics::Camera;
@@ -68,6 +71,10 @@ pub const LADDER: &[Rung] = &[
 
 /// The rung used when none is named.
 pub const DEFAULT: &str = "ml";
+
+/// Reach of a spot in σ and share of it outside the basis by which a camera is judged.
+const REACH: f64 = 5.3;
+const TYPICAL: f64 = 1e-5;
 
 /// Times that a frame is looked over for pixels that are lit alone.
 const LOOKS: usize = 3;
@@ -147,14 +154,21 @@ struct Analytic {
     inspection: Inspection,
     budget: Option<Duration>,
     search: Search,
+    /// Where spots are small against the array, pixels are fewer to touch than a basis has numbers.
+    has_small_spots: bool,
+    weighing: Weighing,
 }
 
 impl Analytic {
     fn new(rung: &'static Rung, camera: &Camera, budget: Option<Duration>) -> Self {
         let bx = Basis::new(&camera.x, camera.spot_sigma_m);
         let by = Basis::new(&camera.y, camera.spot_sigma_m);
+        let window = (2.0 * REACH / bx.pitch()).min(bx.n as f64) * (2.0 * REACH / by.pitch()).min(by.n as f64);
+        let has_small_spots = window < 2.0 * (bx.rank(TYPICAL) * by.rank(TYPICAL)) as f64;
         Self {
             rung,
+            has_small_spots: has_small_spots && !Pencil::suits(&bx, &by),
+            weighing: Weighing::new(camera),
             camera: camera.clone(),
             frame: Screened::default(),
             reading: Reading::default(),
@@ -171,16 +185,22 @@ impl Estimator for Analytic {
     }
 
     fn estimate(&mut self, frame: &Frame) -> Result<Estimate, Error> {
-        let started = Instant::now();
+        let deadline = self.budget.map(|b| Instant::now() + b);
         self.frame.load(frame, &self.camera)?;
-        let Self { search, reading, .. } = self;
-        reading.load(&self.frame, &search.fitter.bx, &search.fitter.by);
+        let is_ml = self.rung.method == Method::MaximumLikelihood;
         let mut scale = 1.0;
-        search.restart(self.budget.map(|b| started + b));
-        if self.rung.method == Method::MaximumLikelihood {
-            scale = self
-                .inspection
-                .run(&mut self.frame, reading, &search.fitter.bx, &search.fitter.by);
+        if is_ml || !self.has_small_spots {
+            let (bx, by) = (&self.search.fitter.bx, &self.search.fitter.by);
+            self.reading.load(&self.frame, bx, by);
+            if is_ml {
+                scale = self.inspection.run(&mut self.frame, &mut self.reading, bx, by);
+            }
+        }
+        let growth = self.reading.growth;
+        let Self { search, reading, .. } = self;
+        search.restart(deadline);
+        self.weighing.search.restart(deadline);
+        if is_ml {
             for _ in 0..LOOKS {
                 let Some(mut model) = search.first_look(reading, &self.frame) else {
                     break;
@@ -192,21 +212,44 @@ impl Estimator for Analytic {
                 }
             }
         }
+        let (search, reading) = if self.has_small_spots {
+            let Weighing { search, reading } = &mut self.weighing;
+            reading.load(&self.frame, &search.fitter.bx, &search.fitter.by);
+            (reading.growth, reading.mean_variance, reading.lit_variance) =
+                (growth, self.reading.mean_variance, self.reading.lit_variance);
+            (search, reading)
+        } else {
+            (&mut self.search, &mut self.reading)
+        };
         let nuisances = Nuisances::default();
         let mut model = match self.rung.method {
             Method::Peak { is_subpixel } => search.peaks(reading, is_subpixel),
             Method::Greedy => {
-                let mut model = search.greedy(reading, nuisances);
+                let mut model = search.greedy(reading, &self.frame, nuisances);
                 search.shrink(reading, &mut model);
                 model
             }
-            Method::Pencil { steps } => search.seeded(reading, &self.frame.pixels, steps),
+            Method::Pencil { steps } => search.seeded(reading, &self.frame, steps),
             Method::MaximumLikelihood => search.maximum_likelihood(reading, &self.frame),
+        };
+        let is_exhausted = search.is_exhausted();
+        let known = search.suspected.or((!growth.is_flat()).then_some(growth));
+        let is_weighted = is_ml
+            && (known.is_some() || !reading.is_explained(&model))
+            && self.weighing.run(&self.frame, known, &mut model);
+        let (search, reading) = match (self.has_small_spots, is_weighted) {
+            (_, true) => (&mut self.weighing.search, &mut self.weighing.reading),
+            (false, false) => (&mut self.search, &mut self.reading),
+            (true, false) => {
+                let Weighing { search, reading } = &mut self.weighing;
+                reading.load(&self.frame, &search.fitter.bx, &search.fitter.by);
+                (search, reading)
+            }
         };
         let noise_j = scale * self.camera.noise_std_j;
         let mut estimate = ground::locate(search, reading, &mut model, &self.frame, &self.camera, noise_j);
         estimate.rung = self.rung.name;
-        if search.is_exhausted() {
+        if is_exhausted {
             for emitter in &mut estimate.emitters {
                 emitter.flags |= Flags::OUT_OF_TIME;
             }
@@ -221,7 +264,7 @@ impl Search {
         let peaks = self
             .heatmap
             .peaks(&reading.z, reading.mx, reading.my, self.price.sqrt(), 1.0);
-        model.spots.extend(peaks.iter().map(|p| super::fit::Spot {
+        model.spots.extend(peaks.iter().map(|p| Spot {
             u: if is_subpixel { p.u } else { p.grid },
             a: p.a,
         }));

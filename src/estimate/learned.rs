@@ -2,7 +2,8 @@
 //! joint fit.
 
 use super::basis::Basis;
-use super::fit::{Fitter, Model, Nuisances, Spot};
+use super::fit::Fitter;
+use super::model::{Model, Nuisances, Spot};
 use super::network::{Network, NetworkError};
 use super::reading::Reading;
 use super::screen::Screened;

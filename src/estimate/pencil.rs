@@ -165,7 +165,7 @@ mod tests {
             for (k, row) in rows.iter_mut().enumerate() {
                 let mut rest = [vec![0.0; 60], vec![0.0; 60]];
                 let [a, b] = &mut rest;
-                super::super::spot::profile(&bx.edges, t[k], 1.0, row, a, b);
+                super::super::spot::profile(&bx.edges, t[k], 1.0, super::super::spot::REACH, row, a, b);
             }
             for y in 0..60 {
                 for x in 0..60 {

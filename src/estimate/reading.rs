@@ -1,10 +1,11 @@
 //! A frame in the two bases, ready to be fitted.
 
 use super::basis::Basis;
-use super::fit::Model;
 use super::linear::dot;
+use super::model::Model;
 use super::noise::Growth;
 use super::screen::Screened;
+use super::spot;
 
 /// What a frame may leave outside the basis, in units of the noise.
 const LOSS: f64 = 0.02;
@@ -19,6 +20,12 @@ pub(super) struct Reading {
     /// (my, mx) row-major.
     pub z: Vec<f64>,
     pub bad: Vec<BadPixel>,
+    /// Inverse variances (my, mx) where pixels differ in them, and Σ ln of the variances. Only in the pixel bases.
+    pub weights: Vec<f64>,
+    pub log_det: f64,
+    weighted: Vec<f64>,
+    /// A spot farther out than this many of its widths is lost in the noise.
+    pub reach: f64,
     /// Numbers that the fit explains: coefficients less what unusable pixels take away.
     pub numbers: f64,
     /// Mean square of what lies outside the basis, and how many numbers that is.
@@ -46,6 +53,7 @@ impl Reading {
         // The brightest pixel bounds every amplitude: A ≤ peak / (largest pixel fraction)².
         let fraction = |b: &Basis| (b.pitch() / (2.0 * std::f64::consts::PI).sqrt()).min(1.0);
         let amplitude = brightest / (fraction(bx) * fraction(by));
+        self.reach = (2.0 * (amplitude / LOSS).max(1.0).ln()).sqrt().clamp(3.0, spot::REACH);
         let norm = |b: &Basis| (b.pitch() / (2.0 * std::f64::consts::PI.sqrt())).sqrt().min(1.0);
         self.rank = [
             bx.rank(LOSS / (amplitude * norm(by))),
@@ -56,6 +64,38 @@ impl Reading {
         // Columns up to the multiple of 4 are there anyway: use them.
         self.rank = [self.mx.min(bx.columns()), self.my.min(by.columns())];
         let (mx, my) = (self.mx, self.my);
+        self.weights.clear();
+        self.log_det = 0.0;
+        if bx.is_pixels && by.is_pixels {
+            self.z.clear();
+            self.z.resize(my * mx, 0.0);
+            for (out, row) in self.z.chunks_exact_mut(mx).zip(frame.pixels.chunks_exact(nx)) {
+                out[..nx].copy_from_slice(row);
+            }
+        } else {
+            self.compress(frame, bx, by);
+        }
+        self.bad.clear();
+        self.bad.extend(frame.bad.iter().map(|b| BadPixel {
+            x: b.x,
+            y: b.y,
+            value: frame.pixels[b.y * nx + b.x],
+        }));
+        let leverage: f64 = self
+            .bad
+            .iter()
+            .map(|b| square(&bx.row(b.x)[..mx]) * square(&by.row(b.y)[..my]))
+            .sum();
+        let inside = (self.rank[0] * self.rank[1]) as f64;
+        self.numbers = inside - leverage;
+        let left = (nx * ny) as f64 - inside - (self.bad.len() as f64 - leverage);
+        let energy = square(&frame.pixels) - square(&self.z) - self.filled_outside(frame, bx, by);
+        self.outside = (energy.max(0.0) / left.max(1.0), left.max(0.0));
+        (self.growth, self.mean_variance, self.lit_variance) = (Growth::default(), 1.0, 1.0);
+    }
+
+    fn compress(&mut self, frame: &Screened, bx: &Basis, by: &Basis) {
+        let (nx, ny, mx, my) = (bx.n, by.n, self.mx, self.my);
         self.rows.clear();
         self.rows.resize(ny * mx, 0.0);
         for y in 0..ny {
@@ -78,23 +118,32 @@ impl Reading {
                 }
             }
         }
+    }
+
+    /// Gives every pixel the weight 1/`variance`, (Ny, Nx), and unusable ones none.
+    pub fn weigh(&mut self, frame: &Screened, nx: usize, variance: impl Fn(usize) -> f64) {
+        self.weights.clear();
+        self.weights.resize(self.z.len(), 0.0);
+        self.log_det = 0.0;
+        for (k, _) in frame.is_bad.iter().enumerate().filter(|(_, bad)| !**bad) {
+            let v = variance(k);
+            self.log_det += v.ln();
+            self.weights[k / nx * self.mx + k % nx] = 1.0 / v;
+        }
         self.bad.clear();
-        self.bad.extend(frame.bad.iter().map(|b| BadPixel {
-            x: b.x,
-            y: b.y,
-            value: frame.pixels[b.y * nx + b.x],
-        }));
-        let leverage: f64 = self
-            .bad
-            .iter()
-            .map(|b| square(&bx.row(b.x)[..mx]) * square(&by.row(b.y)[..my]))
-            .sum();
-        let inside = (self.rank[0] * self.rank[1]) as f64;
-        self.numbers = inside - leverage;
-        let left = (nx * ny) as f64 - inside - (self.bad.len() as f64 - leverage);
-        let energy = square(&frame.pixels) - square(&self.z) - self.filled_outside(frame, bx, by);
-        self.outside = (energy.max(0.0) / left.max(1.0), left.max(0.0));
-        (self.growth, self.mean_variance, self.lit_variance) = (Growth::default(), 1.0, 1.0);
+        self.weighted.clear();
+        self.weighted
+            .extend(self.z.iter().zip(&self.weights).map(|(z, w)| z * w));
+    }
+
+    /// The frame times its weights.
+    #[inline(always)]
+    pub fn weighted(&self) -> &[f64] {
+        if self.weights.is_empty() {
+            &self.z
+        } else {
+            &self.weighted
+        }
     }
 
     /// Energy that the values filled into unusable pixels have outside the basis.

@@ -2,8 +2,10 @@
 
 use std::time::Instant;
 
-use super::fit::{Fitter, Model, Nuisances, Spot, Width};
+use super::fit::Fitter;
 use super::heatmap::Heatmap;
+use super::model::{Model, Nuisances, Spot, Width};
+use super::noise::Growth;
 use super::pencil::Pencil;
 use super::reading::Reading;
 use super::screen::Screened;
@@ -27,8 +29,6 @@ const SPLIT: f64 = 0.4;
 const GHOST: f64 = 100.0;
 /// Misfit counts as around an emitter within this many σ.
 const AROUND: f64 = 2.0;
-/// Multiplications a frame may cost: the same for every run, unlike a clock. About 10 ms on one core of 2021.
-const MOST_WORK: f64 = 1e8;
 /// Least drop of the deviance that a nuisance parameter must bring.
 const NUISANCE_PRICE: f64 = 5.0;
 
@@ -40,7 +40,8 @@ pub(super) struct Search {
     pub price: f64,
     /// What the noise of the frame's light multiplies prices by.
     pub factor: f64,
-    deadline: Option<Instant>,
+    /// How the noise seems to grow, where that explains a frame better than more emitters do.
+    pub suspected: Option<Growth>,
     residual: Vec<f64>,
 }
 
@@ -56,21 +57,21 @@ impl Search {
             heatmap,
             price,
             factor: 1.0,
-            deadline: None,
+            suspected: None,
             residual: Vec::new(),
         }
     }
 
     /// Forgets the work done for the last frame.
     pub fn restart(&mut self, deadline: Option<Instant>) {
-        self.fitter.work = 0.0;
-        self.deadline = deadline;
+        self.fitter.restart(deadline);
         self.factor = 1.0;
+        self.suspected = None;
     }
 
     /// Whether the frame has had its share of work, or of time where a budget is set.
     pub fn is_exhausted(&self) -> bool {
-        self.fitter.work > MOST_WORK || self.deadline.is_some_and(|d| Instant::now() >= d)
+        self.fitter.is_exhausted()
     }
 
     /// What is held against each other: −2 ln likelihood plus the price of the emitters and nuisances.
@@ -88,7 +89,10 @@ impl Search {
             background,
             width: Width::Known,
         };
-        let mut model = self.start(reading, &frame.pixels, plain, 60);
+        let mut model = self.start(reading, frame, plain, 60);
+        if self.suspected.is_some() {
+            return model;
+        }
         // A background has singular values of its own: what the first start explained with it may hold ghosts.
         if !reading.is_explained(&model) || model.nuisances != plain {
             for width in [Width::Known, Width::Common, Width::PerAxis] {
@@ -100,13 +104,13 @@ impl Search {
                 if is_settled || nuisances == plain || self.is_exhausted() {
                     continue;
                 }
-                let next = self.start(reading, &frame.pixels, nuisances, 60);
+                let next = self.start(reading, frame, nuisances, 60);
                 if self.score(&next) < self.score(&model) {
                     model = next;
                 }
             }
         }
-        self.fitter.work = self.fitter.work.min(0.7 * MOST_WORK);
+        self.fitter.reserve(0.3);
         self.refine(reading, &mut model, ROUNDS);
         self.simplify(reading, &mut model);
         if !reading.is_explained(&model) {
@@ -253,7 +257,7 @@ impl Search {
     }
 
     /// Adds peaks of the residual until none is significant, refitting all emitters each time.
-    pub fn greedy(&mut self, reading: &Reading, nuisances: Nuisances) -> Model {
+    pub fn greedy(&mut self, reading: &Reading, frame: &Screened, nuisances: Nuisances) -> Model {
         let mut model = Model::empty(nuisances);
         self.fitter.fit(reading, &mut model, TRIAL_STEPS);
         while model.spots.len() < MOST {
@@ -272,7 +276,10 @@ impl Search {
             if let Some(wider) = wider.filter(|w| self.score(w) < self.score(&next)) {
                 next = wider;
             }
-            if self.score(&next) > self.score(&model) {
+            if !reading.is_explained(&next) {
+                self.suspected = self.suspect(reading, frame, &mut model, &next);
+            }
+            if self.suspected.is_some() || self.score(&next) > self.score(&model) {
                 break;
             }
             model = next;
@@ -343,13 +350,44 @@ impl Search {
     }
 
     /// Seeds by the pencil where spots overlap, by residual peaks elsewhere.
-    pub fn start(&mut self, reading: &Reading, pixels: &[f64], nuisances: Nuisances, polish: usize) -> Model {
+    pub fn start(&mut self, reading: &Reading, frame: &Screened, nuisances: Nuisances, polish: usize) -> Model {
         let model = if Pencil::suits(&self.fitter.bx, &self.fitter.by) {
-            self.pencil(reading, pixels, nuisances, polish)
+            self.pencil(reading, &frame.pixels, nuisances, polish)
         } else {
             None
         };
-        model.unwrap_or_else(|| self.greedy(reading, nuisances))
+        model.unwrap_or_else(|| self.greedy(reading, frame, nuisances))
+    }
+
+    /// Fits `model` under new weights: nuisances where the frame cannot be explained without, then moves.
+    pub fn settle(&mut self, reading: &Reading, model: &mut Model, rounds: usize) {
+        self.fitter.fit(reading, model, TRIAL_STEPS);
+        if !reading.is_explained(model)
+            && let Some(wider) = self.widened(reading, model)
+        {
+            *model = wider;
+        }
+        self.refine(reading, model, rounds);
+        self.simplify(reading, model);
+    }
+
+    /// How the noise grows where that explains the frame better than `rival` does; only in the pixel bases.
+    fn suspect(&mut self, reading: &Reading, frame: &Screened, model: &mut Model, rival: &Model) -> Option<Growth> {
+        let is_even = self.fitter.bx.is_pixels && self.fitter.by.is_pixels && reading.weights.is_empty();
+        if !is_even || rival.deviance < 0.5 * model.deviance {
+            return None;
+        }
+        let residual = self.fitter.residual_of(reading, model).to_vec();
+        let signal = self.fitter.expectation(reading, model);
+        let growth = Growth::fit(frame, reading, &residual, &signal, model.spots.len());
+        let nx = self.fitter.bx.n;
+        let cost: f64 = (0..frame.is_bad.len())
+            .filter(|&k| !frame.is_bad[k])
+            .map(|k| k / nx * reading.mx + k % nx)
+            .map(|k| growth.at(signal[k]).ln() + residual[k].powi(2) / growth.at(signal[k]))
+            .sum();
+        let score = self.score(model) - model.deviance + cost + Growth::PRICE;
+        (score < self.score(rival)).then_some(growth)
     }
 
     /// The number of emitters of least score: moves from `model` until none helps, then a fit to convergence.
@@ -384,7 +422,7 @@ impl Search {
     fn residual_peaks(&mut self, reading: &Reading, model: &mut Model) -> &[super::heatmap::Peak] {
         self.residual.clear();
         self.residual.extend_from_slice(self.fitter.residual_of(reading, model));
-        self.fitter.clean(reading, model.nuisances, &mut self.residual);
+        self.fitter.clean(reading, &mut self.residual);
         let (mx, my) = (reading.mx, reading.my);
         // A peak's share that other spots have absorbed comes back in the joint fit: look a little lower.
         let threshold = 0.7 * (self.factor * self.price).sqrt();
@@ -527,7 +565,7 @@ impl Search {
     }
 
     /// Seeds by the pencil (or residual peaks) with a given number of fit steps, and nothing more.
-    pub fn seeded(&mut self, reading: &Reading, pixels: &[f64], steps: usize) -> Model {
-        self.start(reading, pixels, Nuisances::default(), steps)
+    pub fn seeded(&mut self, reading: &Reading, frame: &Screened, steps: usize) -> Model {
+        self.start(reading, frame, Nuisances::default(), steps)
     }
 }

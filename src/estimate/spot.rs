@@ -7,7 +7,7 @@ use std::f64::consts::FRAC_1_SQRT_2;
 use std::sync::LazyLock;
 
 /// Beyond this many σ both Φ and φ are constant to 1e-16.
-const REACH: f64 = 8.5;
+pub(super) const REACH: f64 = 8.5;
 const KNOTS_PER_SIGMA: f64 = 64.0;
 
 static TABLE: LazyLock<Vec<[f64; 2]>> = LazyLock::new(|| {
@@ -47,13 +47,14 @@ fn normal(table: &[[f64; 2]], t: f64) -> (f64, f64) {
 }
 
 /// Writes f, f′, f″ (derivatives in the centre) of a spot of relative width `w` at `u` for the pixels between
-/// `edges`; all in units of σ. `f.len() + 1 == edges.len()`. Returns the range of pixels that hold anything;
-/// outside it nothing is written.
+/// `edges`, as far out as `reach` widths; all in units of σ. `f.len() + 1 == edges.len()`. Returns the range of pixels
+/// that hold anything; outside it nothing is written.
 #[inline(always)]
 pub(super) fn profile(
     edges: &[f64],
     u: f64,
     w: f64,
+    reach: f64,
     f: &mut [f64],
     f1: &mut [f64],
     f2: &mut [f64],
@@ -62,8 +63,8 @@ pub(super) fn profile(
     let n = f.len();
     let pitch = edges[1] - edges[0];
     let pixel = |edge: f64| ((edge - edges[0]) / pitch).clamp(0.0, n as f64);
-    let first = pixel(u - REACH * w).floor() as usize;
-    let last = pixel(u + REACH * w).ceil() as usize;
+    let first = pixel(u - reach * w).floor() as usize;
+    let last = pixel(u + reach * w).ceil() as usize;
     if first >= last {
         return first..first;
     }
@@ -98,10 +99,10 @@ mod tests {
             hi.fill(0.0);
             f1.fill(0.0);
             f2.fill(0.0);
-            profile(&edges, u, w, &mut f, &mut f1, &mut f2);
+            profile(&edges, u, w, REACH, &mut f, &mut f1, &mut f2);
             let h = 1e-4;
-            profile(&edges, u - h, w, &mut lo, &mut t1, &mut t2);
-            profile(&edges, u + h, w, &mut hi, &mut t1, &mut t2);
+            profile(&edges, u - h, w, REACH, &mut lo, &mut t1, &mut t2);
+            profile(&edges, u + h, w, REACH, &mut hi, &mut t1, &mut t2);
             for k in 0..n {
                 let exact = pixel_fraction(edges[k], edges[k + 1], u, w);
                 assert!((f[k] - exact).abs() < 3e-15, "{u} {k}: {} against {exact}", f[k]);

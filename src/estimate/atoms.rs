@@ -1,0 +1,266 @@
+//! The atoms of a hypothesis: every source's separable profile with its derivatives, kept where they hold anything.
+
+use std::ops::Range;
+
+use super::basis::Basis;
+use super::linear::{axpy, dot};
+use super::model::{Nuisances, Spot};
+use super::reading::Reading;
+
+/// Sources in the bases. Spots come first, then background atoms.
+#[derive(Default)]
+pub(super) struct Atoms {
+    pub spots: Vec<Spot>,
+    pub background: [f64; 3],
+    /// Relative to the configured σ.
+    pub width: [f64; 2],
+    mx: usize,
+    my: usize,
+    /// (sources, 3, mx): f, f′, f″.
+    x: Vec<f64>,
+    y: Vec<f64>,
+    /// Columns and rows outside which a source is zero.
+    spans: Vec<[[usize; 2]; 2]>,
+}
+
+/// Constant and sloped profiles along one axis, of about a spot's norm, so that the normal equations are well scaled.
+pub(super) fn background(b: &Basis) -> [Vec<f64>; 2] {
+    let (half, norm) = (0.5 * b.n as f64, (b.n as f64).sqrt());
+    let mut pair = [vec![0.0; b.stride], vec![0.0; b.stride]];
+    b.compress((0..b.n).map(|_| 1.0 / norm), &mut pair[0]);
+    b.compress((0..b.n).map(|k| (k as f64 + 0.5 - half) / half / norm), &mut pair[1]);
+    pair
+}
+
+impl Atoms {
+    pub fn sources(&self) -> usize {
+        self.spans.len()
+    }
+
+    /// Numbers that all sources touch together.
+    pub fn footprint(&self) -> f64 {
+        let area = |s: &[[usize; 2]; 2]| ((s[0][1] - s[0][0]) * (s[1][1] - s[1][0])) as f64;
+        self.spans.iter().map(area).sum()
+    }
+
+    /// Amplitude of a source.
+    #[inline(always)]
+    pub fn amplitude(&self, i: usize) -> f64 {
+        let n = self.spots.len();
+        if i < n { self.spots[i].a } else { self.background[i - n] }
+    }
+
+    /// Profile `d` (0 to 2: f, f′, f″) of source `i` along x within its span.
+    #[inline(always)]
+    pub fn x(&self, i: usize, d: usize) -> &[f64] {
+        let [lo, hi] = self.spans[i][0];
+        let start = (3 * i + d) * self.mx;
+        &self.x[start + lo..start + hi]
+    }
+
+    #[inline(always)]
+    pub fn y(&self, i: usize, d: usize) -> &[f64] {
+        let [lo, hi] = self.spans[i][1];
+        let start = (3 * i + d) * self.my;
+        &self.y[start + lo..start + hi]
+    }
+
+    /// Values of source `i` at a pixel along each axis: f, f′, f″ each.
+    #[inline(always)]
+    pub fn at(&self, i: usize, ux: &[f64], uy: &[f64]) -> [[f64; 3]; 2] {
+        let [[x0, x1], [y0, y1]] = self.spans[i];
+        [
+            [0, 1, 2].map(|d| dot(&ux[x0..x1], self.x(i, d))),
+            [0, 1, 2].map(|d| dot(&uy[y0..y1], self.y(i, d))),
+        ]
+    }
+
+    /// Fills the atoms for the present spots, width and kinds of background.
+    #[inline(always)]
+    pub fn place(
+        &mut self,
+        axes: [&Basis; 2],
+        backgrounds: [&[Vec<f64>; 2]; 2],
+        reading: &Reading,
+        nuisances: Nuisances,
+        scratch: &mut [f64],
+    ) {
+        let (mx, my) = (reading.mx, reading.my);
+        (self.mx, self.my) = (mx, my);
+        let n = self.spots.len();
+        let sources = n + nuisances.background_atoms();
+        self.x.resize(sources * 3 * mx, 0.0);
+        self.y.resize(sources * 3 * my, 0.0);
+        self.spans.clear();
+        for (i, s) in self.spots.iter().enumerate() {
+            let x = &mut self.x[i * 3 * mx..(i + 1) * 3 * mx];
+            let columns = axes[0].atom(s.u[0], self.width[0], reading.reach, mx, scratch, x);
+            let y = &mut self.y[i * 3 * my..(i + 1) * 3 * my];
+            let rows = axes[1].atom(s.u[1], self.width[1], reading.reach, my, scratch, y);
+            // Whole vectors of four: padding holds zeros.
+            let span = |r: Range<usize>, m: usize| [r.start & !3, r.end.next_multiple_of(4).min(m)];
+            self.spans.push([span(columns, mx), [rows.start, rows.end]]);
+        }
+        for b in 0..nuisances.background_atoms() {
+            let x = &mut self.x[(n + b) * 3 * mx..(n + b + 1) * 3 * mx];
+            x.fill(0.0);
+            x[..mx].copy_from_slice(&backgrounds[0][usize::from(b == 1)][..mx]);
+            let y = &mut self.y[(n + b) * 3 * my..(n + b + 1) * 3 * my];
+            y.fill(0.0);
+            y[..my].copy_from_slice(&backgrounds[1][usize::from(b == 2)][..my]);
+            self.spans.push([[0, mx], [0, my]]);
+        }
+    }
+
+    /// Adds `scale`·f_y⁽ᵇ⁾⊗f_x⁽ᵃ⁾ of source `i` to a matrix (my, mx).
+    #[inline(always)]
+    pub fn add(&self, i: usize, a: usize, b: usize, scale: f64, matrix: &mut [f64]) {
+        let [[x0, x1], [y0, _]] = self.spans[i];
+        let fx = self.x(i, a);
+        for (c, &w) in self.y(i, b).iter().enumerate() {
+            let start = (y0 + c) * self.mx;
+            axpy(scale * w, fx, &mut matrix[start + x0..start + x1]);
+        }
+    }
+
+    /// Adds f_y⊗(q0[0] f″_x + q0[1] f′_x) + f′_y⊗(q1[0] f′_x + q1[1] f_x) + q2 f″_y⊗f_x of source `i` to a matrix (my, mx).
+    #[inline(always)]
+    pub fn add_bent(&self, i: usize, q0: [f64; 2], q1: [f64; 2], q2: f64, scratch: &mut Vec<f64>, matrix: &mut [f64]) {
+        let [[x0, x1], [y0, _]] = self.spans[i];
+        let m = x1 - x0;
+        scratch.resize(scratch.len().max(3 * m), 0.0);
+        let (s0, rest) = scratch.split_at_mut(m);
+        let (s1, rest) = rest.split_at_mut(m);
+        let s2 = &mut rest[..m];
+        let (f, f1, f2) = (self.x(i, 0), self.x(i, 1), self.x(i, 2));
+        for c in 0..m {
+            s0[c] = q0[0] * f2[c] + q0[1] * f1[c];
+            s1[c] = q1[0] * f1[c] + q1[1] * f[c];
+            s2[c] = q2 * f[c];
+        }
+        let (g, g1, g2) = (self.y(i, 0), self.y(i, 1), self.y(i, 2));
+        for c in 0..g.len() {
+            let start = (y0 + c) * self.mx;
+            let row = &mut matrix[start + x0..start + x1];
+            for k in 0..m {
+                row[k] += g[c] * s0[k] + g1[c] * s1[k] + g2[c] * s2[k];
+            }
+        }
+    }
+
+    /// Inner products of a matrix (my, mx) with f_y⊗f_x, f_y⊗f′_x and f′_y⊗f_x of source `i`.
+    #[inline(always)]
+    pub fn project(&self, i: usize, matrix: &[f64]) -> [f64; 3] {
+        let [[x0, x1], [y0, _]] = self.spans[i];
+        let (f, f1) = (self.x(i, 0), self.x(i, 1));
+        let mut sum = [0.0; 3];
+        for (c, (&g, &g1)) in self.y(i, 0).iter().zip(self.y(i, 1)).enumerate() {
+            let start = (y0 + c) * self.mx;
+            let row = &matrix[start + x0..start + x1];
+            let (t, t1) = (dot(row, f), dot(row, f1));
+            sum[0] += t * g;
+            sum[1] += t1 * g;
+            sum[2] += t * g1;
+        }
+        sum
+    }
+
+    /// Inner products with the second derivatives: xx, xy, yy.
+    #[inline(always)]
+    pub fn bend(&self, i: usize, matrix: &[f64]) -> [f64; 3] {
+        let [[x0, x1], [y0, _]] = self.spans[i];
+        let mut sum = [0.0; 3];
+        for c in 0..self.y(i, 0).len() {
+            let start = (y0 + c) * self.mx;
+            let row = &matrix[start + x0..start + x1];
+            sum[0] += self.y(i, 0)[c] * dot(row, self.x(i, 2));
+            sum[1] += self.y(i, 1)[c] * dot(row, self.x(i, 1));
+            sum[2] += self.y(i, 2)[c] * dot(row, self.x(i, 0));
+        }
+        sum
+    }
+
+    #[inline(always)]
+    fn shared(&self, i: usize, j: usize) -> [[usize; 2]; 2] {
+        let (p, q) = (&self.spans[i], &self.spans[j]);
+        [0, 1].map(|k| [p[k][0].max(q[k][0]), p[k][1].min(q[k][1])])
+    }
+
+    /// ⟨f_i, f_j⟩ under `weights` (my, mx), even where that is empty.
+    #[inline(always)]
+    pub fn overlap(&self, i: usize, j: usize, weights: &[f64]) -> f64 {
+        let [[x0, x1], [y0, y1]] = self.shared(i, j);
+        if x0 >= x1 || y0 >= y1 {
+            return 0.0;
+        }
+        let (mx, my) = (self.mx, self.my);
+        let x = |i: usize| &self.x[3 * i * mx + x0..3 * i * mx + x1];
+        let y = |i: usize| &self.y[3 * i * my + y0..3 * i * my + y1];
+        if weights.is_empty() {
+            return dot(x(i), x(j)) * dot(y(i), y(j));
+        }
+        let rows = y(i).iter().zip(y(j)).enumerate();
+        rows.map(|(c, (a, b))| {
+            let start = (y0 + c) * mx;
+            a * b * triple(&weights[start + x0..start + x1], x(i), x(j))
+        })
+        .sum()
+    }
+
+    /// Inner products of (f′_x f_y, f_x f′_y, f_x f_y) of source `i` with those of source `j`, 3 × 3 row-major.
+    #[inline(always)]
+    pub fn couple(&self, i: usize, j: usize, weights: &[f64]) -> [f64; 9] {
+        let [[x0, x1], [y0, y1]] = self.shared(i, j);
+        if x0 >= x1 || y0 >= y1 {
+            return [0.0; 9];
+        }
+        let (mx, my) = (self.mx, self.my);
+        let x = |i: usize, d: usize| &self.x[(3 * i + d) * mx + x0..(3 * i + d) * mx + x1];
+        let y = |i: usize, d: usize| &self.y[(3 * i + d) * my + y0..(3 * i + d) * my + y1];
+        let combine = |t: [f64; 4], v: [f64; 4]| {
+            let ([t00, t01, t10, t11], [v00, v01, v10, v11]) = (t, v);
+            [
+                t11 * v00,
+                t10 * v01,
+                t10 * v00,
+                t01 * v10,
+                t00 * v11,
+                t00 * v10,
+                t01 * v00,
+                t00 * v01,
+                t00 * v00,
+            ]
+        };
+        let pairs = [(0, 0), (0, 1), (1, 0), (1, 1)];
+        if weights.is_empty() {
+            return combine(
+                pairs.map(|(a, b)| dot(x(i, a), x(j, b))),
+                pairs.map(|(a, b)| dot(y(i, a), y(j, b))),
+            );
+        }
+        let mut sum = [0.0; 9];
+        for c in 0..y1 - y0 {
+            let start = (y0 + c) * mx;
+            let w = &weights[start + x0..start + x1];
+            let t = pairs.map(|(a, b)| triple(w, x(i, a), x(j, b)));
+            let v = pairs.map(|(a, b)| y(i, a)[c] * y(j, b)[c]);
+            for (s, p) in sum.iter_mut().zip(combine(t, v)) {
+                *s += p;
+            }
+        }
+        sum
+    }
+}
+
+/// Σ w a b; lengths are multiples of 4.
+#[inline(always)]
+fn triple(w: &[f64], a: &[f64], b: &[f64]) -> f64 {
+    let mut lanes = [0.0; 4];
+    let chunks = w.chunks_exact(4).zip(a.chunks_exact(4)).zip(b.chunks_exact(4));
+    for ((w, a), b) in chunks {
+        for l in 0..4 {
+            lanes[l] += w[l] * a[l] * b[l];
+        }
+    }
+    (lanes[0] + lanes[2]) + (lanes[1] + lanes[3])
+}
