@@ -16,6 +16,12 @@ pub struct Args {
     /// Frames a cell
     #[arg(long)]
     frames: Option<usize>,
+    /// Only these cells, as "P8/60,E1/64"
+    #[arg(long, value_delimiter = ',')]
+    cells: Vec<String>,
+    /// Only these rungs, as "pencil,ml"
+    #[arg(long, value_delimiter = ',')]
+    rungs: Vec<String>,
     /// The same seed gives the same frames
     #[arg(long)]
     seed: Option<u64>,
@@ -28,6 +34,17 @@ pub fn run(args: Args) -> Outcome {
     }
     if let Some(seed) = args.seed {
         plan.seed = seed;
+    }
+    if !args.cells.is_empty() {
+        plan.cells.retain(|c| args.cells.contains(&c.name()));
+    }
+    if !args.rungs.is_empty() {
+        plan.rungs.retain(|r| args.rungs.iter().any(|name| name == r.name));
+    }
+    if plan.is_empty() {
+        return Err(Failure::input(anyhow::anyhow!(
+            "nothing to measure: no such cell or rung; a run without --cells and --rungs names them all"
+        )));
     }
     let style =
         ProgressStyle::with_template("{bar:40} {pos}/{len} {elapsed} (left {eta}) {msg}").map_err(Failure::other)?;

@@ -150,34 +150,38 @@ impl Atoms {
 
     /// Inner products of a matrix (my, mx) with f_y⊗f_x, f_y⊗f′_x and f′_y⊗f_x of source `i`.
     #[inline(always)]
-    pub fn project(&self, i: usize, matrix: &[f64]) -> [f64; 3] {
-        let [[x0, x1], [y0, _]] = self.spans[i];
-        let (f, f1) = (self.x(i, 0), self.x(i, 1));
-        let mut sum = [0.0; 3];
-        for (c, (&g, &g1)) in self.y(i, 0).iter().zip(self.y(i, 1)).enumerate() {
-            let start = (y0 + c) * self.mx;
-            let row = &matrix[start + x0..start + x1];
-            let (t, t1) = (dot(row, f), dot(row, f1));
-            sum[0] += t * g;
-            sum[1] += t1 * g;
-            sum[2] += t * g1;
-        }
-        sum
+    pub fn project(&self, i: usize, matrix: &[f64], scratch: &mut Vec<f64>) -> [f64; 3] {
+        let [t, t1] = self.fold(i, [0, 1], matrix, scratch);
+        [dot(t, self.x(i, 0)), dot(t, self.x(i, 1)), dot(t1, self.x(i, 0))]
     }
 
     /// Inner products with the second derivatives: xx, xy, yy.
     #[inline(always)]
-    pub fn bend(&self, i: usize, matrix: &[f64]) -> [f64; 3] {
+    pub fn bend(&self, i: usize, matrix: &[f64], scratch: &mut Vec<f64>) -> [f64; 3] {
+        let [t, t1] = self.fold(i, [0, 1], matrix, scratch);
+        let (xx, xy) = (dot(t, self.x(i, 2)), dot(t1, self.x(i, 1)));
+        let [t2, _] = self.fold(i, [2, 2], matrix, scratch);
+        [xx, xy, dot(t2, self.x(i, 0))]
+    }
+
+    /// Rows of a matrix (my, mx) summed under two of the profiles along y of source `i`, over its columns.
+    #[inline(always)]
+    fn fold<'a>(&self, i: usize, profiles: [usize; 2], matrix: &[f64], scratch: &'a mut Vec<f64>) -> [&'a [f64]; 2] {
         let [[x0, x1], [y0, _]] = self.spans[i];
-        let mut sum = [0.0; 3];
-        for c in 0..self.y(i, 0).len() {
+        let m = x1 - x0;
+        scratch.clear();
+        scratch.resize(2 * m, 0.0);
+        let (t, t1) = scratch.split_at_mut(m);
+        let [a, b] = profiles.map(|d| self.y(i, d));
+        for (c, (&g, &g1)) in a.iter().zip(b).enumerate() {
             let start = (y0 + c) * self.mx;
             let row = &matrix[start + x0..start + x1];
-            sum[0] += self.y(i, 0)[c] * dot(row, self.x(i, 2));
-            sum[1] += self.y(i, 1)[c] * dot(row, self.x(i, 1));
-            sum[2] += self.y(i, 2)[c] * dot(row, self.x(i, 0));
+            for k in 0..m {
+                t[k] += g * row[k];
+                t1[k] += g1 * row[k];
+            }
         }
-        sum
+        [t, t1]
     }
 
     #[inline(always)]
@@ -188,7 +192,7 @@ impl Atoms {
 
     /// ⟨f_i, f_j⟩ under `weights` (my, mx), even where that is empty.
     #[inline(always)]
-    pub fn overlap(&self, i: usize, j: usize, weights: &[f64]) -> f64 {
+    pub fn overlap(&self, i: usize, j: usize, weights: &[f64], scratch: &mut Vec<f64>) -> f64 {
         let [[x0, x1], [y0, y1]] = self.shared(i, j);
         if x0 >= x1 || y0 >= y1 {
             return 0.0;
@@ -199,17 +203,18 @@ impl Atoms {
         if weights.is_empty() {
             return dot(x(i), x(j)) * dot(y(i), y(j));
         }
-        let rows = y(i).iter().zip(y(j)).enumerate();
-        rows.map(|(c, (a, b))| {
+        scratch.clear();
+        scratch.resize(x1 - x0, 0.0);
+        for (c, (a, b)) in y(i).iter().zip(y(j)).enumerate() {
             let start = (y0 + c) * mx;
-            a * b * triple(&weights[start + x0..start + x1], x(i), x(j))
-        })
-        .sum()
+            axpy(a * b, &weights[start + x0..start + x1], scratch);
+        }
+        triple(scratch, x(i), x(j))
     }
 
     /// Inner products of (f′_x f_y, f_x f′_y, f_x f_y) of source `i` with those of source `j`, 3 × 3 row-major.
     #[inline(always)]
-    pub fn couple(&self, i: usize, j: usize, weights: &[f64]) -> [f64; 9] {
+    pub fn couple(&self, i: usize, j: usize, weights: &[f64], scratch: &mut Vec<f64>) -> [f64; 9] {
         let [[x0, x1], [y0, y1]] = self.shared(i, j);
         if x0 >= x1 || y0 >= y1 {
             return [0.0; 9];
@@ -217,38 +222,41 @@ impl Atoms {
         let (mx, my) = (self.mx, self.my);
         let x = |i: usize, d: usize| &self.x[(3 * i + d) * mx + x0..(3 * i + d) * mx + x1];
         let y = |i: usize, d: usize| &self.y[(3 * i + d) * my + y0..(3 * i + d) * my + y1];
-        let combine = |t: [f64; 4], v: [f64; 4]| {
-            let ([t00, t01, t10, t11], [v00, v01, v10, v11]) = (t, v);
-            [
-                t11 * v00,
-                t10 * v01,
-                t10 * v00,
-                t01 * v10,
-                t00 * v11,
-                t00 * v10,
-                t01 * v00,
-                t00 * v01,
-                t00 * v00,
-            ]
-        };
-        let pairs = [(0, 0), (0, 1), (1, 0), (1, 1)];
+        // Which derivative of i and of j, along x and along y, makes each of the nine.
+        const ALONG_X: [[usize; 2]; 9] = [[1, 1], [1, 0], [1, 0], [0, 1], [0, 0], [0, 0], [0, 1], [0, 0], [0, 0]];
+        const ALONG_Y: [[usize; 2]; 9] = [[0, 0], [0, 1], [0, 0], [1, 0], [1, 1], [1, 0], [0, 0], [0, 1], [0, 0]];
         if weights.is_empty() {
-            return combine(
-                pairs.map(|(a, b)| dot(x(i, a), x(j, b))),
-                pairs.map(|(a, b)| dot(y(i, a), y(j, b))),
-            );
+            let pairs = [(0, 0), (0, 1), (1, 0), (1, 1)];
+            let tx = pairs.map(|(a, b)| dot(x(i, a), x(j, b)));
+            let ty = pairs.map(|(a, b)| dot(y(i, a), y(j, b)));
+            return std::array::from_fn(|k| {
+                let ([a, b], [c, d]) = (ALONG_X[k], ALONG_Y[k]);
+                tx[2 * a + b] * ty[2 * c + d]
+            });
         }
-        let mut sum = [0.0; 9];
+        let m = x1 - x0;
+        scratch.clear();
+        scratch.resize(4 * m, 0.0);
+        let (t00, rest) = scratch.split_at_mut(m);
+        let (t01, rest) = rest.split_at_mut(m);
+        let (t10, t11) = rest.split_at_mut(m);
         for c in 0..y1 - y0 {
             let start = (y0 + c) * mx;
             let w = &weights[start + x0..start + x1];
-            let t = pairs.map(|(a, b)| triple(w, x(i, a), x(j, b)));
-            let v = pairs.map(|(a, b)| y(i, a)[c] * y(j, b)[c]);
-            for (s, p) in sum.iter_mut().zip(combine(t, v)) {
-                *s += p;
+            let [a, a1, b, b1] = [y(i, 0)[c], y(i, 1)[c], y(j, 0)[c], y(j, 1)[c]];
+            let v = [a * b, a * b1, a1 * b, a1 * b1];
+            for k in 0..m {
+                t00[k] += v[0] * w[k];
+                t01[k] += v[1] * w[k];
+                t10[k] += v[2] * w[k];
+                t11[k] += v[3] * w[k];
             }
         }
-        sum
+        let t: [&[f64]; 4] = [t00, t01, t10, t11];
+        std::array::from_fn(|k| {
+            let ([a, b], [c, d]) = (ALONG_X[k], ALONG_Y[k]);
+            triple(t[2 * c + d], x(i, a), x(j, b))
+        })
     }
 }
 

@@ -26,10 +26,14 @@ const NO_DROP: f64 = 1e-4;
 const OVERLAP: f64 = 3.0;
 /// |acceleration|² over |velocity|² above which a step is not trusted (Transtrum and Sethna, 2012, eq. 15).
 const LARGEST_ACCELERATION: f64 = 0.56 / 4.0;
+/// A bar is out of reach when this many times the drop that a quadratic promises does not get there.
+const HOPE: f64 = 5.0;
 /// Amplitudes stay above this many standard deviations of noise, so that a position keeps its gradient.
 const AMPLITUDE_FLOOR: f64 = 0.05;
 /// Multiplications a frame may cost: the same for every run, unlike a clock. About 10 ms on one core of 2021.
 const MOST_WORK: f64 = 1e8;
+/// The same with what the last fit may take beyond.
+const LAST_WORK: f64 = 1.2 * MOST_WORK;
 
 /// The fit's scratch memory. Grows to the largest problem seen and then allocates nothing.
 pub(super) struct Fitter {
@@ -51,6 +55,7 @@ pub(super) struct Fitter {
     acceleration: Vec<f64>,
     bend: Vec<f64>,
     scratch: Vec<f64>,
+    strip: Vec<f64>,
     small: Vec<f64>,
     active: Vec<bool>,
     /// Multiplications since the last frame, and the time it must be done by.
@@ -78,6 +83,7 @@ impl Fitter {
             acceleration: Vec::new(),
             bend: Vec::new(),
             scratch,
+            strip: Vec::new(),
             small: Vec::new(),
             active: Vec::new(),
             work: 0.0,
@@ -103,11 +109,17 @@ impl Fitter {
 
     /// Fits `model` from where it stands, at most `steps` steps.
     pub fn fit(&mut self, reading: &Reading, model: &mut Model, steps: usize) {
+        self.fit_below(reading, model, steps, f64::INFINITY);
+    }
+
+    /// The same, given up as soon as a deviance below `bar` is out of reach.
+    pub fn fit_below(&mut self, reading: &Reading, model: &mut Model, steps: usize, bar: f64) {
         pulp::Arch::new().dispatch(Job {
             fitter: self,
             reading,
             model,
             steps,
+            bar,
             wants_information: false,
         });
     }
@@ -120,6 +132,7 @@ impl Fitter {
             reading,
             model,
             steps: 0,
+            bar: f64::INFINITY,
             wants_information: true,
         });
         &self.hessian
@@ -135,7 +148,7 @@ impl Fitter {
     pub fn curvatures(&mut self, reading: &Reading, model: &mut Model) -> Vec<[f64; 3]> {
         self.fit(reading, model, 0);
         (0..model.spots.len())
-            .map(|i| self.now.bend(i, &self.residual))
+            .map(|i| self.now.bend(i, &self.residual, &mut self.strip))
             .collect()
     }
 
@@ -181,7 +194,7 @@ impl Fitter {
     }
 
     #[inline(always)]
-    fn run(&mut self, reading: &Reading, model: &mut Model, steps: usize) {
+    fn run(&mut self, reading: &Reading, model: &mut Model, steps: usize, bar: f64) {
         let nuisances = model.nuisances;
         self.now.spots.clone_from(&model.spots);
         self.now.background = model.background;
@@ -202,7 +215,7 @@ impl Fitter {
                 .any(|t| (s.u[0] - t.u[0]).abs() < OVERLAP && (s.u[1] - t.u[1]).abs() < OVERLAP)
         });
         for _ in 0..steps {
-            if converged {
+            if converged || self.work > LAST_WORK {
                 break;
             }
             self.work += self.step_work(reading);
@@ -215,6 +228,9 @@ impl Fitter {
                 let expected = dot(&self.velocity[..parameters], &self.gradient[..parameters]);
                 if expected < NO_DROP {
                     converged = true;
+                    break;
+                }
+                if deviance - HOPE * expected > bar {
                     break;
                 }
             }
@@ -286,9 +302,9 @@ impl Fitter {
         rhs.resize(sources.max(rhs.len()), 0.0);
         for i in 0..sources {
             for j in 0..=i {
-                gram[i * sources + j] = atoms.overlap(i, j, &reading.weights);
+                gram[i * sources + j] = atoms.overlap(i, j, &reading.weights, &mut self.strip);
             }
-            rhs[i] = atoms.project(i, reading.weighted())[0];
+            rhs[i] = atoms.project(i, reading.weighted(), &mut self.strip)[0];
         }
         for bad in &reading.bad {
             let (ux, uy) = (&self.bx.row(bad.x)[..mx], &self.by.row(bad.y)[..my]);
@@ -425,7 +441,7 @@ impl Fitter {
             let ai = atoms.amplitude(i);
             for j in 0..=i {
                 let aj = atoms.amplitude(j);
-                let c = atoms.couple(i, j, &reading.weights);
+                let c = atoms.couple(i, j, &reading.weights, &mut self.strip);
                 if i < n {
                     let block = [
                         ai * aj * c[0],
@@ -449,7 +465,7 @@ impl Fitter {
                     h[(2 * n + i) * p + 2 * n + j] = c[8];
                 }
             }
-            let s = atoms.project(i, &self.residual);
+            let s = atoms.project(i, &self.residual, &mut self.strip);
             if i < n {
                 (g[3 * i], g[3 * i + 1], g[3 * i + 2]) = (ai * s[1], ai * s[2], s[0]);
             } else {
@@ -476,7 +492,7 @@ impl Fitter {
             }
             let row = &mut h[(first_width + w) * p..(first_width + w + 1) * p];
             for i in 0..sources {
-                let s = atoms.project(i, weighted);
+                let s = atoms.project(i, weighted, &mut self.strip);
                 if i < n {
                     let a = atoms.spots[i].a;
                     (row[3 * i], row[3 * i + 1], row[3 * i + 2]) = (a * s[1], a * s[2], s[0]);
@@ -593,7 +609,7 @@ impl Fitter {
         self.acceleration.resize(p, 0.0);
         let out = &mut self.acceleration;
         for i in 0..atoms.sources() {
-            let s = atoms.project(i, bend);
+            let s = atoms.project(i, bend, &mut self.strip);
             if i < n {
                 let a = atoms.spots[i].a;
                 (out[3 * i], out[3 * i + 1], out[3 * i + 2]) = (-a * s[1], -a * s[2], -s[0]);
@@ -614,6 +630,7 @@ struct Job<'a> {
     reading: &'a Reading,
     model: &'a mut Model,
     steps: usize,
+    bar: f64,
     wants_information: bool,
 }
 
@@ -622,7 +639,7 @@ impl pulp::NullaryFnOnce for Job<'_> {
 
     #[inline(always)]
     fn call(self) {
-        self.fitter.run(self.reading, self.model, self.steps);
+        self.fitter.run(self.reading, self.model, self.steps, self.bar);
         if self.wants_information {
             self.fitter.linearise(self.reading, self.model.nuisances);
         }

@@ -6,6 +6,9 @@ use super::linear::{axpy, dot};
 /// Grid spacing, σ: a spot half-way between grid points loses 3 % of its response.
 const SPACING: f64 = 0.5;
 
+/// Half-width of a template, σ: what lies beyond holds 1e-5 of a spot's square.
+const REACH: f64 = 3.0;
+
 /// A maximum of the heatmap.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) struct Peak {
@@ -25,6 +28,8 @@ pub(super) struct Heatmap {
     /// (grid, stride), each row of unit norm over the full basis.
     templates: [Vec<f64>; 2],
     norms: [Vec<f64>; 2],
+    /// Columns outside which a template is zero.
+    spans: [Vec<[usize; 2]>; 2],
     strides: [usize; 2],
     /// Response over its standard deviation, (grid y, grid x).
     map: Vec<f64>,
@@ -45,22 +50,25 @@ impl Heatmap {
                 .collect();
             let mut templates = vec![0.0; count * b.stride];
             let mut norms = Vec::with_capacity(count);
+            let mut spans = Vec::with_capacity(count);
             let (mut scratch, mut atom) = (vec![0.0; 3 * b.n], vec![0.0; 3 * b.stride]);
             for (k, row) in templates.chunks_exact_mut(b.stride).enumerate() {
-                b.atom(grid[k], 1.0, super::spot::REACH, b.stride, &mut scratch, &mut atom);
+                let span = b.atom(grid[k], 1.0, REACH, b.stride, &mut scratch, &mut atom);
+                spans.push([span.start, span.end]);
                 let norm = dot(&atom[..b.stride], &atom[..b.stride]).sqrt().max(1e-12);
                 for (t, a) in row.iter_mut().zip(&atom) {
                     *t = a / norm;
                 }
                 norms.push(norm);
             }
-            (grid, templates, norms)
+            (grid, templates, norms, spans)
         };
-        let ((gx, tx, wx), (gy, ty, wy)) = (axis(bx), axis(by));
+        let ((gx, tx, wx, sx), (gy, ty, wy, sy)) = (axis(bx), axis(by));
         Self {
             grid: [gx, gy],
             templates: [tx, ty],
             norms: [wx, wy],
+            spans: [sx, sy],
             strides: [bx.stride, by.stride],
             map: Vec::new(),
             strip: Vec::new(),
@@ -86,18 +94,18 @@ impl Heatmap {
         let (nx, ny) = (self.grid[0].len(), self.grid[1].len());
         self.map.resize(nx * ny, 0.0);
         self.strip.resize(mx, 0.0);
-        for (row, out) in self.templates[1]
-            .chunks_exact(self.strides[1])
-            .zip(self.map.chunks_exact_mut(nx))
-        {
+        for (j, out) in self.map.chunks_exact_mut(nx).enumerate() {
+            let row = &self.templates[1][j * self.strides[1]..(j + 1) * self.strides[1]];
+            let [lo, hi] = self.spans[1][j];
             self.strip.fill(0.0);
-            for c in 0..my {
-                if row[c] != 0.0 {
-                    axpy(row[c], &residual[c * mx..(c + 1) * mx], &mut self.strip);
-                }
+            for c in lo..hi.min(my) {
+                axpy(row[c], &residual[c * mx..(c + 1) * mx], &mut self.strip);
             }
-            for (o, column) in out.iter_mut().zip(self.templates[0].chunks_exact(self.strides[0])) {
-                *o = dot(&self.strip, &column[..mx]);
+            for (i, o) in out.iter_mut().enumerate() {
+                let column = &self.templates[0][i * self.strides[0]..(i + 1) * self.strides[0]];
+                let [lo, hi] = self.spans[0][i];
+                let hi = hi.min(mx);
+                *o = dot(&self.strip[lo..hi], &column[lo..hi]);
             }
         }
     }

@@ -4,7 +4,6 @@ use std::time::{Duration, Instant};
 
 use super::basis::Basis;
 use super::corrected::Corrected;
-use super::fit::Fitter;
 use super::learned::{Learned, LearnedEstimator};
 use super::model::{Model, Nuisances, Spot};
 use super::network::NetworkError;
@@ -124,6 +123,8 @@ pub fn rung(name: &str) -> Result<&'static Rung, ConfigError> {
 
 /// Builds the configured estimator for a camera.
 pub fn build(config: &Config, camera: &Camera) -> Result<Box<dyn Estimator>, ConfigError> {
+    // Frames are small: threads would cost more than they bring, and let the clock decide the last bits.
+    faer::set_global_parallelism(faer::Par::Seq);
     let name = config.name.as_deref().unwrap_or(DEFAULT);
     if let Some(budget) = config.budget_ms
         && !(budget.is_finite() && budget > 0.0)
@@ -150,32 +151,81 @@ struct Analytic {
     rung: &'static Rung,
     camera: Camera,
     frame: Screened,
-    reading: Reading,
     inspection: Inspection,
+    /// The frame in bases that leave room for noise alone, where the search itself leaves none.
+    compressed: Option<([Basis; 2], Reading)>,
     budget: Option<Duration>,
     search: Search,
-    /// Where spots are small against the array, pixels are fewer to touch than a basis has numbers.
-    has_small_spots: bool,
+    reading: Reading,
     weighing: Weighing,
 }
 
 impl Analytic {
     fn new(rung: &'static Rung, camera: &Camera, budget: Option<Duration>) -> Self {
-        let bx = Basis::new(&camera.x, camera.spot_sigma_m);
-        let by = Basis::new(&camera.y, camera.spot_sigma_m);
-        let window = (2.0 * REACH / bx.pitch()).min(bx.n as f64) * (2.0 * REACH / by.pitch()).min(by.n as f64);
-        let has_small_spots = window < 2.0 * (bx.rank(TYPICAL) * by.rank(TYPICAL)) as f64;
+        let sigma = camera.spot_sigma_m;
+        let [bx, by] = [&camera.x, &camera.y].map(|axis| Basis::new(axis, sigma));
+        let window = |b: &Basis| (2.0 * REACH / b.pitch()).min(b.n as f64);
+        let numbers = (bx.rank(TYPICAL) * by.rank(TYPICAL)) as f64;
+        // Where spots are small against the array, they touch fewer pixels than a basis has numbers.
+        let has_small_spots = window(&bx) * window(&by) < 2.0 * numbers && !Pencil::suits(&bx, &by);
+        let (search, compressed) = if has_small_spots {
+            let pixels = [&camera.x, &camera.y].map(|axis| Basis::pixels(axis, sigma));
+            (Search::new(pixels), Some(([bx, by], Reading::default())))
+        } else {
+            (Search::new([bx, by]), None)
+        };
         Self {
             rung,
-            has_small_spots: has_small_spots && !Pencil::suits(&bx, &by),
-            weighing: Weighing::new(camera),
             camera: camera.clone(),
             frame: Screened::default(),
-            reading: Reading::default(),
             inspection: Inspection::default(),
+            compressed,
             budget,
-            search: Search::new(Fitter::new(bx, by)),
+            search,
+            reading: Reading::default(),
+            weighing: Weighing::new(camera),
         }
+    }
+
+    /// Loads the frame into the search's bases; returns the noise in units of the configured.
+    fn inspect(&mut self) -> f64 {
+        let Self { search, reading, .. } = self;
+        let (bx, by) = (&search.fitter.bx, &search.fitter.by);
+        if self.rung.method != Method::MaximumLikelihood {
+            reading.load(&self.frame, bx, by);
+            return 1.0;
+        }
+        match &mut self.compressed {
+            None => {
+                reading.load(&self.frame, bx, by);
+                self.inspection.run(&mut self.frame, reading, bx, by)
+            }
+            Some(([cx, cy], compressed)) => {
+                compressed.load(&self.frame, cx, cy);
+                let scale = self.inspection.run(&mut self.frame, compressed, cx, cy);
+                reading.load(&self.frame, bx, by);
+                (reading.growth, reading.mean_variance, reading.lit_variance) =
+                    (compressed.growth, compressed.mean_variance, compressed.lit_variance);
+                scale
+            }
+        }
+    }
+
+    /// The emitters that stand out at once, after taking out pixels that are lit alone.
+    fn first_look(&mut self) -> Option<Model> {
+        let Self { search, reading, .. } = self;
+        for look in 0.. {
+            let mut model = search.first_look(reading, &self.frame)?;
+            if look == LOOKS || reading.is_explained(&model) {
+                return Some(model);
+            }
+            let residual = search.fitter.residual_of(reading, &mut model).to_vec();
+            let (bx, by) = (&search.fitter.bx, &search.fitter.by);
+            if !self.inspection.reject_lone(&mut self.frame, reading, &residual, bx, by) {
+                return Some(model);
+            }
+        }
+        None
     }
 }
 
@@ -187,64 +237,33 @@ impl Estimator for Analytic {
     fn estimate(&mut self, frame: &Frame) -> Result<Estimate, Error> {
         let deadline = self.budget.map(|b| Instant::now() + b);
         self.frame.load(frame, &self.camera)?;
-        let is_ml = self.rung.method == Method::MaximumLikelihood;
-        let mut scale = 1.0;
-        if is_ml || !self.has_small_spots {
-            let (bx, by) = (&self.search.fitter.bx, &self.search.fitter.by);
-            self.reading.load(&self.frame, bx, by);
-            if is_ml {
-                scale = self.inspection.run(&mut self.frame, &mut self.reading, bx, by);
-            }
-        }
-        let growth = self.reading.growth;
-        let Self { search, reading, .. } = self;
-        search.restart(deadline);
+        let scale = self.inspect();
+        self.search.restart(deadline);
         self.weighing.search.restart(deadline);
-        if is_ml {
-            for _ in 0..LOOKS {
-                let Some(mut model) = search.first_look(reading, &self.frame) else {
-                    break;
-                };
-                let residual = search.fitter.residual_of(reading, &mut model).to_vec();
-                let (bx, by) = (&search.fitter.bx, &search.fitter.by);
-                if !self.inspection.reject_lone(&mut self.frame, reading, &residual, bx, by) {
-                    break;
-                }
-            }
-        }
-        let (search, reading) = if self.has_small_spots {
-            let Weighing { search, reading } = &mut self.weighing;
-            reading.load(&self.frame, &search.fitter.bx, &search.fitter.by);
-            (reading.growth, reading.mean_variance, reading.lit_variance) =
-                (growth, self.reading.mean_variance, self.reading.lit_variance);
-            (search, reading)
-        } else {
-            (&mut self.search, &mut self.reading)
-        };
-        let nuisances = Nuisances::default();
+        let is_ml = self.rung.method == Method::MaximumLikelihood;
+        let look = if is_ml { self.first_look() } else { None };
+        let Self { search, reading, .. } = self;
         let mut model = match self.rung.method {
             Method::Peak { is_subpixel } => search.peaks(reading, is_subpixel),
             Method::Greedy => {
-                let mut model = search.greedy(reading, &self.frame, nuisances);
+                let mut model = search.greedy(reading, &self.frame, Model::empty(Nuisances::default()));
                 search.shrink(reading, &mut model);
                 model
             }
-            Method::Pencil { steps } => search.seeded(reading, &self.frame, steps),
-            Method::MaximumLikelihood => search.maximum_likelihood(reading, &self.frame),
+            Method::Pencil { steps } => search.start(reading, &self.frame, Nuisances::default(), steps),
+            Method::MaximumLikelihood => search.maximum_likelihood(reading, &self.frame, look),
         };
         let is_exhausted = search.is_exhausted();
-        let known = search.suspected.or((!growth.is_flat()).then_some(growth));
+        let known = search
+            .suspected
+            .or((!reading.growth.is_flat()).then_some(reading.growth));
         let is_weighted = is_ml
             && (known.is_some() || !reading.is_explained(&model))
             && self.weighing.run(&self.frame, known, &mut model);
-        let (search, reading) = match (self.has_small_spots, is_weighted) {
-            (_, true) => (&mut self.weighing.search, &mut self.weighing.reading),
-            (false, false) => (&mut self.search, &mut self.reading),
-            (true, false) => {
-                let Weighing { search, reading } = &mut self.weighing;
-                reading.load(&self.frame, &search.fitter.bx, &search.fitter.by);
-                (search, reading)
-            }
+        let (search, reading) = if is_weighted {
+            (&mut self.weighing.search, &self.weighing.reading)
+        } else {
+            (search, &*reading)
         };
         let noise_j = scale * self.camera.noise_std_j;
         let mut estimate = ground::locate(search, reading, &mut model, &self.frame, &self.camera, noise_j);

@@ -2,7 +2,6 @@
 //! joint fit.
 
 use super::basis::Basis;
-use super::fit::Fitter;
 use super::model::{Model, Nuisances, Spot};
 use super::network::{Network, NetworkError};
 use super::reading::Reading;
@@ -63,7 +62,7 @@ impl LearnedEstimator {
             camera: camera.clone(),
             frame: Screened::default(),
             reading: Reading::default(),
-            search: Search::new(Fitter::new(bx, by)),
+            search: Search::new([bx, by]),
         })
     }
 }

@@ -19,7 +19,7 @@ const SHARE: f64 = 0.5;
 /// Passes that settle the values of bad pixels.
 const SETTLING: usize = 3;
 /// Pixels wider than this, σ, can be lit alone by a spot.
-const WIDEST_PIXEL: f64 = 0.6;
+const WIDEST_PIXEL: f64 = 0.5;
 /// Signal levels that the noise is measured at.
 const LEVELS: usize = 8;
 /// Largest share of a pixel's noise that a fit is taken to have absorbed, and steps of the growth's own fit.
@@ -228,7 +228,7 @@ impl Inspection {
                 let beyond = (left[k] - if count > 0.0 { sum / count } else { 0.0 }).abs();
                 let noise = reading.growth.at(self.smooth[k]).sqrt();
                 // The mean of four neighbours adds a quarter of their variance.
-                if beyond > OUTLIER * noise * 1.12 && beyond > 0.5 * left[k].abs() && left[k].abs() > 0.6 * beyond {
+                if beyond > OUTLIER * noise * 1.12 && beyond > 0.8 * left[k].abs() && left[k].abs() > 0.6 * beyond {
                     found.push((x, y));
                 }
             }

@@ -177,6 +177,12 @@ impl Reading {
         let (mx, my) = (self.mx, self.my);
         out.clear();
         out.resize(bx.n * by.n, 0.0);
+        if bx.is_pixels && by.is_pixels {
+            for (out, row) in out.chunks_exact_mut(bx.n).zip(matrix.chunks_exact(mx)) {
+                out.copy_from_slice(&row[..bx.n]);
+            }
+            return;
+        }
         for y in 0..by.n {
             let mut row = vec![0.0; mx];
             for (c, &u) in by.row(y)[..my].iter().enumerate() {

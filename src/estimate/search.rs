@@ -2,6 +2,7 @@
 
 use std::time::Instant;
 
+use super::basis::Basis;
 use super::fit::Fitter;
 use super::heatmap::Heatmap;
 use super::model::{Model, Nuisances, Spot, Width};
@@ -19,6 +20,8 @@ const TRIAL_STEPS: usize = 30;
 const FINAL_STEPS: usize = 200;
 /// Fewer steps than this are asked for by rungs that only polish seeds.
 const MINIMAL_POLISH: usize = 10;
+/// So many further emitters that explain a frame are not asked for another explanation.
+const FEW: usize = 2;
 /// Rounds of moves.
 const ROUNDS: usize = 8;
 /// Spots nearer than this, σ, may be one.
@@ -46,9 +49,11 @@ pub(super) struct Search {
 }
 
 impl Search {
-    pub fn new(fitter: Fitter) -> Self {
+    pub fn new(bases: [Basis; 2]) -> Self {
+        let [bx, by] = bases;
+        let fitter = Fitter::new(bx, by);
         let heatmap = Heatmap::new(&fitter.bx, &fitter.by);
-        let area = |b: &super::basis::Basis| b.edges[b.n] - b.edges[0];
+        let area = |b: &Basis| b.edges[b.n] - b.edges[0];
         // The matched filter has about area/σ² independent positions; the price keeps the chance that any of
         // them exceeds it in an empty frame below 1e-3.
         let price = (6.0 + 2.0 * (area(&fitter.bx) * area(&fitter.by)).ln()).max(13.0);
@@ -74,22 +79,30 @@ impl Search {
         self.fitter.is_exhausted()
     }
 
+    /// Deviance that `next` must get below to score better than `best`.
+    fn bar(&self, best: &Model, next: &Model) -> f64 {
+        self.score(best) - self.penalty(next)
+    }
+
     /// What is held against each other: −2 ln likelihood plus the price of the emitters and nuisances.
     pub fn score(&self, model: &Model) -> f64 {
+        model.deviance + self.penalty(model)
+    }
+
+    fn penalty(&self, model: &Model) -> f64 {
         let nuisances = NUISANCE_PRICE * model.nuisances.count() as f64;
-        model.deviance + self.factor * (self.price * model.spots.len() as f64 + nuisances)
+        self.factor * (self.price * model.spots.len() as f64 + nuisances)
     }
 
     /// Maximum likelihood with the number of emitters unknown. Nuisances are fitted only where the frame cannot be
     /// explained without, and then within every hypothesis.
-    pub fn maximum_likelihood(&mut self, reading: &Reading, frame: &Screened) -> Model {
+    pub fn maximum_likelihood(&mut self, reading: &Reading, frame: &Screened, look: Option<Model>) -> Model {
         self.factor = reading.lit_variance;
-        let background = self.looks_lit(frame);
-        let plain = Nuisances {
-            background,
-            width: Width::Known,
+        let plain = look.as_ref().map_or(Nuisances::default(), |l| l.nuisances);
+        let mut model = match look {
+            Some(look) => self.greedy(reading, frame, look),
+            None => self.start(reading, frame, plain, 60),
         };
-        let mut model = self.start(reading, frame, plain, 60);
         if self.suspected.is_some() {
             return model;
         }
@@ -116,7 +129,7 @@ impl Search {
         if !reading.is_explained(&model) {
             self.lay_ghosts(reading, frame, &mut model);
         }
-        self.fitter.fit(reading, &mut model, FINAL_STEPS);
+        self.finish(reading, &mut model);
         model
     }
 
@@ -207,25 +220,23 @@ impl Search {
         let spots = peaks.iter().take_while(|p| p.significance >= least).take(MOST);
         model.spots = spots.map(|p| Spot { u: p.u, a: p.a }).collect();
         self.fitter.fit(reading, &mut model, TRIAL_STEPS);
-        (!reading.is_explained(&model)).then_some(model)
+        Some(model)
     }
 
-    /// Whether the frame's dark parts are lighter or darker than the noise allows. Only for spots that leave parts dark.
-    fn looks_lit(&mut self, frame: &Screened) -> bool {
+    /// Whether the frame's dark parts are clearly lighter or darker than the noise allows. Only for spots that leave parts
+    /// dark; a fainter background shows in what the emitters leave.
+    fn looks_lit(&self, frame: &Screened) -> bool {
         if Pencil::suits(&self.fitter.bx, &self.fitter.by) {
             return false;
         }
-        self.residual.clear();
-        let usable = frame.pixels.iter().zip(&frame.is_bad).filter(|(_, bad)| !**bad);
-        self.residual.extend(usable.map(|(p, _)| *p));
-        let count = self.residual.len();
-        // Every pixel may have been rejected by now.
-        if count == 0 {
-            return false;
+        let (mut usable, mut low) = (0.0, 0.0);
+        for (p, _) in frame.pixels.iter().zip(&frame.is_bad).filter(|(_, bad)| !**bad) {
+            usable += 1.0;
+            low += f64::from(u8::from(*p < -1.0));
         }
-        let (_, tenth, _) = self.residual.select_nth_unstable_by(count / 10, f64::total_cmp);
-        // The lowest decile of standard normal noise is −1.2816, with standard deviation 1.71/√count.
-        (*tenth + 1.2816).abs() > 5.0 * 1.71 / (count as f64).sqrt()
+        // The share of standard normal noise below −1.
+        let expected: f64 = 0.1587 * usable;
+        low < 0.25 * expected - 5.0 || low > expected + 5.0 * expected.sqrt()
     }
 
     /// Takes out nuisances that the frame can do without.
@@ -256,11 +267,9 @@ impl Search {
         }
     }
 
-    /// Adds peaks of the residual until none is significant, refitting all emitters each time.
-    pub fn greedy(&mut self, reading: &Reading, frame: &Screened, nuisances: Nuisances) -> Model {
-        let mut model = Model::empty(nuisances);
-        self.fitter.fit(reading, &mut model, TRIAL_STEPS);
-        while model.spots.len() < MOST {
+    /// Adds peaks of the residual to `model` until none is significant, refitting all emitters each time.
+    pub fn greedy(&mut self, reading: &Reading, frame: &Screened, mut model: Model) -> Model {
+        while model.spots.len() < MOST && (model.spots.is_empty() || !reading.is_explained(&model)) {
             let room = MOST - model.spots.len();
             let mut next = model.clone();
             let peaks = self.residual_peaks(reading, &mut model);
@@ -272,9 +281,11 @@ impl Search {
             }
             self.fitter.fit(reading, &mut next, TRIAL_STEPS);
             // What looks like more emitters may be a background or another width: the better explanation stands.
-            let wider = self.widened(reading, &model);
-            if let Some(wider) = wider.filter(|w| self.score(w) < self.score(&next)) {
-                next = wider;
+            if !reading.is_explained(&next) || next.spots.len() > model.spots.len() + FEW {
+                let wider = self.widened(reading, &model);
+                if let Some(wider) = wider.filter(|w| self.score(w) < self.score(&next)) {
+                    next = wider;
+                }
             }
             if !reading.is_explained(&next) {
                 self.suspected = self.suspect(reading, frame, &mut model, &next);
@@ -283,7 +294,7 @@ impl Search {
                 break;
             }
             model = next;
-            if reading.is_explained(&model) || self.is_exhausted() {
+            if self.is_exhausted() {
                 break;
             }
         }
@@ -339,7 +350,8 @@ impl Search {
             let Some(seeds) = pencil.seeds(count) else { break };
             let mut model = Model::empty(nuisances);
             model.spots.extend(seeds.into_iter().map(|u| Spot { u, a: 0.0 }));
-            self.fitter.fit(reading, &mut model, polish);
+            let bar = self.bar(best, &model);
+            self.fitter.fit_below(reading, &mut model, polish, bar);
             if self.score(&model) < self.score(best) {
                 *best = model;
                 worse = 0;
@@ -356,7 +368,11 @@ impl Search {
         } else {
             None
         };
-        model.unwrap_or_else(|| self.greedy(reading, frame, nuisances))
+        model.unwrap_or_else(|| {
+            let mut dark = Model::empty(nuisances);
+            self.fitter.fit(reading, &mut dark, TRIAL_STEPS);
+            self.greedy(reading, frame, dark)
+        })
     }
 
     /// Fits `model` under new weights: nuisances where the frame cannot be explained without, then moves.
@@ -395,7 +411,7 @@ impl Search {
         for _ in 0..rounds {
             let before = self.score(model);
             if !reading.is_explained(model) {
-                self.fitter.fit(reading, model, FINAL_STEPS);
+                self.finish(reading, model);
             }
             self.grow(reading, model);
             self.shrink(reading, model);
@@ -403,7 +419,13 @@ impl Search {
                 break;
             }
         }
-        self.fitter.fit(reading, model, FINAL_STEPS);
+        self.finish(reading, model);
+    }
+
+    fn finish(&mut self, reading: &Reading, model: &mut Model) {
+        if !model.converged {
+            self.fitter.fit(reading, model, FINAL_STEPS);
+        }
     }
 
     /// Tries `next` and keeps it where it is better.
@@ -411,7 +433,8 @@ impl Search {
         if next.spots.len() > MOST || self.is_exhausted() {
             return false;
         }
-        self.fitter.fit(reading, &mut next, TRIAL_STEPS);
+        let bar = self.bar(model, &next);
+        self.fitter.fit_below(reading, &mut next, TRIAL_STEPS, bar);
         let is_better = self.score(&next) < self.score(model) - 1e-6;
         if is_better {
             *model = next;
@@ -562,10 +585,5 @@ impl Search {
             .collect();
         bent.sort_by(|a, b| b.0.total_cmp(&a.0));
         bent.into_iter().map(|(_, i, d)| (i, d)).collect()
-    }
-
-    /// Seeds by the pencil (or residual peaks) with a given number of fit steps, and nothing more.
-    pub fn seeded(&mut self, reading: &Reading, frame: &Screened, steps: usize) -> Model {
-        self.start(reading, frame, Nuisances::default(), steps)
     }
 }

@@ -2,7 +2,6 @@
 //! every pixel weighs as much as it says and an emitter must stand out of the noise where it stands.
 
 use super::basis::Basis;
-use super::fit::Fitter;
 use super::model::Model;
 use super::noise::Growth;
 use super::reading::Reading;
@@ -25,7 +24,7 @@ impl Weighing {
     pub fn new(camera: &Camera) -> Self {
         let basis = |axis| Basis::pixels(axis, camera.spot_sigma_m);
         Self {
-            search: Search::new(Fitter::new(basis(&camera.x), basis(&camera.y))),
+            search: Search::new([&camera.x, &camera.y].map(basis)),
             reading: Reading::default(),
         }
     }

@@ -9,6 +9,8 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
+use crate::estimate::{LADDER, Rung};
+
 pub use scene::{Cell, Noise};
 pub use score::Row;
 
@@ -16,6 +18,7 @@ pub use score::Row;
 #[derive(Clone, Debug)]
 pub struct Plan {
     pub cells: Vec<Cell>,
+    pub rungs: Vec<&'static Rung>,
     /// Frames a cell.
     pub frames: usize,
     pub seed: u64,
@@ -71,6 +74,7 @@ impl Plan {
         }
         Self {
             cells,
+            rungs: LADDER.iter().collect(),
             frames: 250,
             seed: 1,
         }
@@ -87,6 +91,7 @@ impl Plan {
         cells.extend([1, 20].map(|emitters| Cell::new(Noise::Energy, 1.0, 100).holding(emitters)));
         Self {
             cells,
+            rungs: LADDER.iter().collect(),
             frames: 12,
             seed: 1,
         }
@@ -94,11 +99,11 @@ impl Plan {
 
     /// Measurements that the plan asks for.
     pub fn len(&self) -> usize {
-        self.cells.len() * crate::estimate::LADDER.len()
+        self.cells.len() * self.rungs.len()
     }
 
     pub fn is_empty(&self) -> bool {
-        self.cells.is_empty()
+        self.len() == 0
     }
 }
 
@@ -122,7 +127,7 @@ pub fn run(plan: &Plan, out: &Path, progress: &mut dyn FnMut(&Row)) -> Result<St
     let mut kept = Vec::new();
     for cell in &plan.cells {
         let mut scenes = None;
-        for rung in crate::estimate::LADDER {
+        for &rung in &plan.rungs {
             let known = study
                 .rows
                 .iter()
