@@ -89,6 +89,11 @@ impl Basis {
         &self.u[k * self.stride..(k + 1) * self.stride]
     }
 
+    /// Largest norm that a spot leaves outside the first `m` columns.
+    pub fn tail(&self, m: usize) -> f64 {
+        self.tail.get(m).copied().unwrap_or(0.0)
+    }
+
     /// Fewest columns that leave at most `tolerance` of a unit spot outside.
     pub fn rank(&self, tolerance: f64) -> usize {
         if self.is_pixels {

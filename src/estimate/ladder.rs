@@ -8,7 +8,7 @@ use super::learned::{Learned, LearnedEstimator};
 use super::model::{Model, Nuisances, Spot};
 use super::network::NetworkError;
 use super::noise::Inspection;
-use super::pencil::Pencil;
+use super::pencil::Sampler;
 use super::reading::Reading;
 use super::screen::Screened;
 use super::search::Search;
@@ -167,7 +167,7 @@ impl Analytic {
         let window = |b: &Basis| (2.0 * REACH / b.pitch()).min(b.n as f64);
         let numbers = (bx.rank(TYPICAL) * by.rank(TYPICAL)) as f64;
         // Where spots are small against the array, they touch fewer pixels than a basis has numbers.
-        let has_small_spots = window(&bx) * window(&by) < 2.0 * numbers && !Pencil::suits(&bx, &by);
+        let has_small_spots = window(&bx) * window(&by) < 2.0 * numbers && Sampler::new(&bx, &by).is_none();
         let (search, compressed) = if has_small_spots {
             let pixels = [&camera.x, &camera.y].map(|axis| Basis::pixels(axis, sigma));
             (Search::new(pixels), Some(([bx, by], Reading::default())))

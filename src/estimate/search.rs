@@ -7,7 +7,7 @@ use super::fit::Fitter;
 use super::heatmap::Heatmap;
 use super::model::{Model, Nuisances, Spot, Width};
 use super::noise::Growth;
-use super::pencil::Pencil;
+use super::pencil::{Pencil, Sampler};
 use super::reading::Reading;
 use super::screen::Screened;
 
@@ -39,6 +39,8 @@ const NUISANCE_PRICE: f64 = 5.0;
 pub(super) struct Search {
     pub fitter: Fitter,
     pub heatmap: Heatmap,
+    /// Where spots are wide enough against the sensor for the pencil.
+    sampler: Option<Sampler>,
     /// Least drop of the deviance that an emitter must bring.
     pub price: f64,
     /// What the noise of the frame's light multiplies prices by.
@@ -51,6 +53,7 @@ pub(super) struct Search {
 impl Search {
     pub fn new(bases: [Basis; 2]) -> Self {
         let [bx, by] = bases;
+        let sampler = Sampler::new(&bx, &by);
         let fitter = Fitter::new(bx, by);
         let heatmap = Heatmap::new(&fitter.bx, &fitter.by);
         let area = |b: &Basis| b.edges[b.n] - b.edges[0];
@@ -60,6 +63,7 @@ impl Search {
         Self {
             fitter,
             heatmap,
+            sampler,
             price,
             factor: 1.0,
             suspected: None,
@@ -208,7 +212,7 @@ impl Search {
     /// The emitters that stand out at once, with a background where the frame looks lit: enough to tell what in the
     /// residual cannot be light.
     pub fn first_look(&mut self, reading: &Reading, frame: &Screened) -> Option<Model> {
-        if Pencil::suits(&self.fitter.bx, &self.fitter.by) {
+        if self.sampler.is_some() {
             return None;
         }
         let mut model = Model::empty(Nuisances {
@@ -226,7 +230,7 @@ impl Search {
     /// Whether the frame's dark parts are clearly lighter or darker than the noise allows. Only for spots that leave parts
     /// dark; a fainter background shows in what the emitters leave.
     fn looks_lit(&self, frame: &Screened) -> bool {
-        if Pencil::suits(&self.fitter.bx, &self.fitter.by) {
+        if self.sampler.is_some() {
             return false;
         }
         let (mut usable, mut low) = (0.0, 0.0);
@@ -303,8 +307,11 @@ impl Search {
 
     /// Seeds by the pencil for rising N until the frame is explained: as configured first, then with a background and
     /// another width, both of which have singular values of their own.
-    fn pencil(&mut self, reading: &Reading, pixels: &[f64], nuisances: Nuisances, polish: usize) -> Option<Model> {
-        let pencil = Pencil::new(pixels, &self.fitter.bx, &self.fitter.by)?;
+    fn pencil(&mut self, reading: &Reading, nuisances: Nuisances, polish: usize) -> Option<Model> {
+        let pencil = self
+            .sampler
+            .as_mut()?
+            .analyse(reading, &self.fitter.bx, &self.fitter.by)?;
         let sure = pencil.strength.iter().take_while(|&&s| s > 4.0).count();
         let likely = pencil.strength.iter().take_while(|&&s| s > 0.5).count();
         let last = (likely + 2).min(pencil.most()).min(MOST);
@@ -363,12 +370,7 @@ impl Search {
 
     /// Seeds by the pencil where spots overlap, by residual peaks elsewhere.
     pub fn start(&mut self, reading: &Reading, frame: &Screened, nuisances: Nuisances, polish: usize) -> Model {
-        let model = if Pencil::suits(&self.fitter.bx, &self.fitter.by) {
-            self.pencil(reading, &frame.pixels, nuisances, polish)
-        } else {
-            None
-        };
-        model.unwrap_or_else(|| {
+        self.pencil(reading, nuisances, polish).unwrap_or_else(|| {
             let mut dark = Model::empty(nuisances);
             self.fitter.fit(reading, &mut dark, TRIAL_STEPS);
             self.greedy(reading, frame, dark)
