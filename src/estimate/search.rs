@@ -357,8 +357,7 @@ impl Search {
             let Some(seeds) = pencil.seeds(count) else { break };
             let mut model = Model::empty(nuisances);
             model.spots.extend(seeds.into_iter().map(|u| Spot { u, a: 0.0 }));
-            let bar = self.bar(best, &model);
-            self.fitter.fit_below(reading, &mut model, polish, bar);
+            self.fitter.fit(reading, &mut model, polish);
             if self.score(&model) < self.score(best) {
                 *best = model;
                 worse = 0;
