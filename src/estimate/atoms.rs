@@ -123,7 +123,7 @@ impl Atoms {
         }
     }
 
-    /// Adds f_y⊗(q0[0] f″_x + q0[1] f′_x) + f′_y⊗(q1[0] f′_x + q1[1] f_x) + q2 f″_y⊗f_x of source `i` to a matrix (my, mx).
+    /// Adds `f_y⊗(q0[0] f″_x + q0[1] f′_x) + f′_y⊗(q1[0] f′_x + q1[1] f_x) + q2 f″_y⊗f_x` of source `i` to a matrix (my, mx).
     #[inline(always)]
     pub fn add_bent(&self, i: usize, q0: [f64; 2], q1: [f64; 2], q2: f64, scratch: &mut Vec<f64>, matrix: &mut [f64]) {
         let [[x0, x1], [y0, _]] = self.spans[i];
