@@ -25,17 +25,26 @@ setup:
 
 setup-test:
 	$(call need,command -v chromium,chromium chromium-driver)
+	@command -v cargo-deny >/dev/null || { echo "Installing cargo-deny"; cargo install --locked --quiet cargo-deny; }
+
+.PHONY: test-licences
+test-licences: setup-test
+	cargo deny --locked check licenses bans sources
 
 .PHONY: deb
+# The Debian package, target/oapwatch.deb, linted and measured. PROFILE=release builds what the tests have built already.
+PROFILE ?= dist
 deb: setup
+	$(call need,sh -c 'command -v lintian && command -v python3 && command -v systemd-analyze',lintian python3-minimal systemd)
 	@command -v cargo-deb >/dev/null || cargo install --locked cargo-deb
-	cargo build --profile dist --locked
+	cargo build --profile $(PROFILE) --locked
 	rm -rf target/man target/completions && mkdir -p target/completions
-	target/dist/oapwatch man target/man
-	target/dist/oapwatch completions bash > target/completions/oapwatch.bash
-	target/dist/oapwatch completions zsh > target/completions/_oapwatch
-	target/dist/oapwatch completions fish > target/completions/oapwatch.fish
-	cargo deb --no-build --profile dist --output target/oapwatch.deb
+	target/$(PROFILE)/oapwatch man target/man
+	target/$(PROFILE)/oapwatch completions bash > target/completions/oapwatch.bash
+	target/$(PROFILE)/oapwatch completions zsh > target/completions/_oapwatch
+	target/$(PROFILE)/oapwatch completions fish > target/completions/oapwatch.fish
+	cargo deb --no-build --profile $(PROFILE) --output target/oapwatch.deb
+	tests/deploy/package.py target/oapwatch.deb
 
 .PHONY: test-v4l2
 # Capture from a real V4L2 device (the kernel's virtual camera) in a virtual machine.
@@ -43,3 +52,10 @@ test-v4l2: setup
 	$(call need,sh -c 'command -v qemu-system-x86_64 && command -v busybox && command -v depmod && command -v cpio && command -v v4l2-ctl && command -v xz',qemu-system-x86 busybox-static kmod cpio v4l-utils xz-utils)
 	cargo build --release --locked --bin oapwatch --example v4l2_guest
 	tests/v4l2/run.sh target/release/examples/v4l2_guest target/release/oapwatch
+
+.PHONY: test-deploy
+# The package in a virtual machine with systemd: installed, attacked, upgraded, purged. Needs root for mmdebstrap.
+test-deploy:
+	$(call need,sh -c 'command -v qemu-system-x86_64 && command -v busybox && command -v depmod && command -v cpio && command -v mmdebstrap && command -v mksquashfs',qemu-system-x86 busybox-static kmod cpio mmdebstrap squashfs-tools)
+	@test -f target/oapwatch.deb || $(MAKE) deb
+	tests/deploy/run.sh

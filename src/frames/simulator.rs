@@ -7,18 +7,26 @@ use jiff::Timestamp;
 
 use super::{Config, Error, FrameSource, Next};
 use crate::claim::Claim;
+use crate::metric;
 use crate::optics::Camera;
-use crate::scene::{Plan, Scene};
+use crate::scene::{Fate, Plan, Scene};
 
 /// Frames whose claims are still handed on when many were passed over at once (a suspended machine).
 const MOST_CAUGHT_UP: u64 = 10_000;
+/// Without a frame for this long (two intervals of a slower scene), the monitor is told; and again after as long.
+const SILENCE: Duration = Duration::from_secs(1);
 
 /// Frames of a scene. Frame k is exposed at start + k/rate; one that is late by a whole interval is passed over,
-/// and its claims come with the next.
+/// one that the scene drops never arrives, and its claims come with the next. One that the scene repeats arrives
+/// under a number and a time of its own, with the pixels of the last that was delivered.
 pub struct Simulator {
     plan: Plan,
     began: Instant,
     next: u64,
+    /// Claims that came with frames that did not arrive.
+    waiting: Vec<Claim>,
+    /// The frame after the last that arrived, or of whose absence the monitor was told.
+    untold: u64,
 }
 
 impl Simulator {
@@ -41,11 +49,29 @@ impl Simulator {
             plan: plan.starting_at(config.start.unwrap_or_else(Timestamp::now)),
             began: Instant::now(),
             next: 0,
+            waiting: Vec::new(),
+            untold: 0,
         })
     }
 
     fn due(&self, k: u64) -> Duration {
         Duration::try_from_secs_f64(k as f64 / self.plan.rate_hz()).unwrap_or(Duration::MAX)
+    }
+
+    /// Frame `index` was lost on its way: a gap in the numbers, as with a device.
+    fn lost(&mut self, index: u64) -> Next {
+        metrics::counter!(metric::SOURCE_FRAMES_LOST).increment(1);
+        let silent = self.due(self.next - self.untold);
+        if silent < SILENCE.max(self.due(2)) {
+            return Next::Nothing;
+        }
+        self.untold = self.next;
+        Next::Unusable {
+            index,
+            time: self.plan.time(index),
+            reason: format!("no frame for {:.0} s", silent.as_secs_f64()),
+            claims: std::mem::take(&mut self.waiting),
+        }
     }
 }
 
@@ -61,17 +87,22 @@ impl FrameSource for Simulator {
         let latest = (self.began.elapsed().as_secs_f64() * self.plan.rate_hz()) as u64;
         let index = latest.max(self.next);
         let passed_over = self.next.max(index.saturating_sub(MOST_CAUGHT_UP))..index;
-        let mut claims: Vec<Claim> = passed_over.flat_map(|k| self.plan.claims(k)).collect();
+        self.waiting.extend(passed_over.flat_map(|k| self.plan.claims(k)));
         self.next = index + 1;
         let made = self.plan.frame(index);
-        claims.extend(made.claims);
-        Next::Frame(made.frame, claims)
+        self.waiting.extend(made.claims);
+        if made.fate == Fate::Dropped {
+            return self.lost(index);
+        }
+        self.untold = self.next;
+        Next::Frame(made.frame, std::mem::take(&mut self.waiting))
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::scene::FrameLoss;
 
     fn simulator() -> Simulator {
         let camera = Scene::builtin().optics.camera().unwrap();
@@ -111,6 +142,98 @@ mod tests {
         let all: Vec<Claim> = (0..=late.index).flat_map(|k| source.plan.claims(k)).collect();
         assert!(!all.is_empty());
         assert_eq!(claims, all);
+    }
+
+    /// What comes of the scene's first `count` frames, each asked for when it is due.
+    fn arrivals(frame_loss: FrameLoss, count: u64) -> (Plan, Vec<Next>) {
+        let mut scene = Scene::builtin();
+        scene.rate_hz = 1.0;
+        scene.effects.frame_loss = Some(frame_loss);
+        let mut source = Simulator {
+            plan: Plan::compile(&scene, 3).unwrap(),
+            began: Instant::now(),
+            next: 0,
+            waiting: Vec::new(),
+            untold: 0,
+        };
+        let mut came = Vec::new();
+        for k in 0..count {
+            // Half an interval, 0.5 s, after frame k was due: leeway for a busy host.
+            source.began = Instant::now()
+                .checked_sub(source.due(k) + source.due(1) / 2)
+                .expect("a clock that started earlier");
+            came.push(source.next(Duration::ZERO));
+        }
+        (source.plan, came)
+    }
+
+    #[test]
+    fn dropped_frames_leave_a_gap_repeated_ones_come_again_and_no_claim_is_lost() {
+        let loss = FrameLoss {
+            dropped: 0.3,
+            repeated: 0.3,
+        };
+        let (plan, came) = arrivals(loss, 60);
+        let fate = |k| plan.frame(k).fate;
+        for wanted in [Fate::Delivered, Fate::Dropped, Fate::Repeated] {
+            assert!((0..60).filter(|k| fate(*k) == wanted).count() > 5, "{wanted:?}");
+        }
+        let mut last: Option<crate::frame::Frame> = None;
+        let mut heard = Vec::new();
+        let mut until = 0;
+        for next in came {
+            let (frame, claims) = match next {
+                Next::Frame(frame, claims) => (frame, claims),
+                Next::Unusable { index, claims, .. } => {
+                    assert_eq!(fate(index), Fate::Dropped);
+                    heard.extend(claims);
+                    until = index;
+                    continue;
+                }
+                Next::Nothing => continue,
+                Next::End => panic!("a simulator has no end"),
+            };
+            assert_ne!(fate(frame.index), Fate::Dropped);
+            assert!(frame.pixels.iter().all(|p| p.is_finite()));
+            assert_eq!(frame.time, plan.time(frame.index));
+            if let Some(last) = &last {
+                assert!(frame.index > last.index);
+                let between = last.index + 1..frame.index;
+                let is_repeated = fate(frame.index) == Fate::Repeated;
+                if between.clone().all(|k| fate(k) != Fate::Delivered) {
+                    assert_eq!(frame.digest() == last.digest(), is_repeated, "frame {}", frame.index);
+                }
+            }
+            heard.extend(claims);
+            until = frame.index;
+            last = Some(frame);
+        }
+        let all: Vec<Claim> = (0..=until).flat_map(|k| plan.claims(k)).collect();
+        assert_eq!(heard, all);
+    }
+
+    #[test]
+    fn the_monitor_is_told_when_nothing_arrives() {
+        let loss = FrameLoss {
+            dropped: 1.0 - 1e-12,
+            repeated: 0.0,
+        };
+        let (_, came) = arrivals(loss, 7);
+        let told: Vec<u64> = came
+            .iter()
+            .filter_map(|next| match next {
+                Next::Unusable { index, reason, .. } => {
+                    assert_eq!(reason, "no frame for 2 s");
+                    Some(*index)
+                }
+                other => {
+                    assert!(matches!(other, Next::Nothing), "{other:?}");
+                    None
+                }
+            })
+            .collect();
+        // Two intervals of one second.
+        assert_eq!(told, [1, 3, 5]);
     }
 
     #[test]

@@ -1,17 +1,15 @@
-"""Webhook receiver: answers 204 and appends each body to /received."""
-import http.server
+"""Webhook receiver: answers 204 and appends each body to /received. Needs no more than Python's minimal library."""
+import socket
 
-
-class Receiver(http.server.BaseHTTPRequestHandler):
-    def do_POST(self):
-        body = self.rfile.read(int(self.headers["content-length"]))
+server = socket.create_server(("127.0.0.1", 9100))
+while True:
+    connection, _ = server.accept()
+    with connection, connection.makefile("rb") as request:
+        length = 0
+        while (line := request.readline().strip()):
+            name, _, value = line.partition(b":")
+            if name.lower() == b"content-length":
+                length = int(value)
         with open("/received", "ab") as out:
-            out.write(body + b"\n")
-        self.send_response(204)
-        self.end_headers()
-
-    def log_message(self, *args):
-        pass
-
-
-http.server.HTTPServer(("127.0.0.1", 9100), Receiver).serve_forever()
+            out.write(request.read(length) + b"\n")
+        connection.sendall(b"HTTP/1.1 204 No Content\r\nConnection: close\r\n\r\n")

@@ -54,7 +54,7 @@ fn devices_are_listed() -> Outcome {
 }
 
 /// A running capture of the camera's test image.
-fn running() -> Result<Capture, Box<dyn std::error::Error>> {
+pub fn running() -> Result<Capture, Box<dyn std::error::Error>> {
     allow(true)?;
     v4l2_ctl(CAPTURE, &["-c", "percentage_of_dropped_buffers=0"])?;
     resize(640, 480)?;
@@ -74,7 +74,7 @@ fn resize(width: u32, height: u32) -> Outcome {
 }
 
 /// Twenty frames, numbered upwards, at times that grow.
-fn frames_go_on(capture: &Capture) -> Outcome {
+pub fn frames_go_on(capture: &Capture) -> Outcome {
     let mut last = wait_for(capture, "a frame", frame)?;
     for _ in 0..20 {
         let next = wait_for(capture, "more frames", frame)?;
@@ -96,7 +96,7 @@ fn value(metrics: &PrometheusHandle, name: &str) -> u64 {
     line.and_then(|v| v.parse().ok()).unwrap_or(0)
 }
 
-fn fault(metrics: &PrometheusHandle, fault: &str) -> u64 {
+pub fn fault(metrics: &PrometheusHandle, fault: &str) -> u64 {
     value(metrics, &format!("oapwatch_source_faults_total{{fault=\"{fault}\"}}"))
 }
 

@@ -3,6 +3,7 @@
 //! that the virtual camera offers.
 
 mod bit_exact;
+mod daemon;
 mod faults;
 mod output;
 
@@ -34,7 +35,7 @@ fn main() -> ExitCode {
         .without_time()
         .init();
 
-    let scenarios: Vec<Scenario> = [bit_exact::SCENARIOS, faults::SCENARIOS].concat();
+    let scenarios: Vec<Scenario> = [bit_exact::SCENARIOS, faults::SCENARIOS, daemon::SCENARIOS].concat();
     let chosen: Vec<String> = std::env::args().skip(1).collect();
     let (mut passed, mut failed) = (0, 0);
     for (name, run) in scenarios {

@@ -120,6 +120,10 @@ impl V4l2 {
         match Session::start(&self.device, &self.config, self.rate_hz, self.shape, &mut self.faults) {
             Ok(session) => {
                 let format = session.granted();
+                if self.last_format.is_none() {
+                    // The first frame is waited for from here on, however long the start took.
+                    self.last_told = Instant::now();
+                }
                 if let Some(before) = self.last_format.replace(format).filter(|before| *before != format) {
                     self.faults
                         .count(Fault::FormatChanged, format_args!("from {before:?} to {format:?}"));
