@@ -131,6 +131,7 @@ impl Config {
     }
 
     fn rebase(&mut self, base: &Path) {
+        let credentials = std::env::var_os(&CREDENTIALS[1..]).map(PathBuf::from);
         let optional = [
             &mut self.optics.calibration,
             &mut self.estimator.network,
@@ -145,11 +146,58 @@ impl Config {
             &mut self.journal.path,
         ];
         for path in optional.into_iter().flatten() {
-            *path = base.join(&*path);
+            *path = located(base, path, credentials.as_deref());
         }
         for webhook in &mut self.webhook {
-            webhook.secret_file = base.join(&webhook.secret_file);
-            webhook.ca_file = webhook.ca_file.as_ref().map(|path| base.join(path));
+            let files = [Some(&mut webhook.secret_file), webhook.ca_file.as_mut()];
+            for path in files.into_iter().flatten() {
+                *path = located(base, path, credentials.as_deref());
+            }
+        }
+    }
+}
+
+/// What a path in a config may begin with to name a credential that systemd hands over.
+const CREDENTIALS: &str = "$CREDENTIALS_DIRECTORY";
+
+/// Where a path in a config of the folder `base` leads. Without credentials, one among them stays as it is written, so
+/// that the error that nothing is there tells why.
+fn located(base: &Path, path: &Path, credentials: Option<&Path>) -> PathBuf {
+    match (path.strip_prefix(CREDENTIALS), credentials) {
+        (Ok(name), Some(folder)) => folder.join(name),
+        (Ok(_), None) => path.to_owned(),
+        (Err(_), _) => base.join(path),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn paths_lead_from_the_config_s_folder_or_to_a_credential() {
+        let base = Path::new("/etc/oapwatch");
+        let credentials = Some(Path::new("/run/credentials/oapwatch.service"));
+        for (written, credentials, expected) in [
+            ("token", credentials, "/etc/oapwatch/token"),
+            ("/srv/token", credentials, "/srv/token"),
+            (
+                "$CREDENTIALS_DIRECTORY/oapwatch_token",
+                credentials,
+                "/run/credentials/oapwatch.service/oapwatch_token",
+            ),
+            (
+                "$CREDENTIALS_DIRECTORY/oapwatch_token",
+                None,
+                "$CREDENTIALS_DIRECTORY/oapwatch_token",
+            ),
+            (
+                "$CREDENTIALS_DIRECTORY2/x",
+                credentials,
+                "/etc/oapwatch/$CREDENTIALS_DIRECTORY2/x",
+            ),
+        ] {
+            assert_eq!(located(base, Path::new(written), credentials), Path::new(expected));
         }
     }
 }

@@ -138,7 +138,7 @@ check "a stop loses no alert" within 20 kept "$before"
 # A camera: vivid's test image with its running clock; 10 × 10 camera pixels to a pixel of the array.
 sed -i 's/^kind = "simulator".*/kind = "v4l2"\ndevice = "\/dev\/video0"/; s/^pixels = .*/pixels = [32, 32]\njoules_per_count = 1e-9/; s/^rate_hz = .*/rate_hz = 60.0/' $config
 sed -i 's/^\[claims\]/[source.v4l2]\npixel_format = "Y16"\nroi = [0, 0, 320, 320]\n\n[claims]/' $config
-check "the config with a camera is good" oapwatch check $config
+check "the config with a camera is good" env CREDENTIALS_DIRECTORY=/run/credentials/oapwatch.service oapwatch check $config
 systemctl restart oapwatch
 check "it starts without its camera and says so" within 30 is oapwatch_source_connected 0
 old=$(pid)
