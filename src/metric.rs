@@ -19,7 +19,7 @@ pub const USERS_UNSEEN: &str = "oapwatch_users_unseen";
 pub const ALERTS_RAISED: &str = "oapwatch_alerts_raised_total";
 /// Label `kind`.
 pub const ALERTS_OPEN: &str = "oapwatch_alerts_open";
-/// Label `outcome`: accepted, malformed, refused.
+/// Label `outcome`: accepted, late (kept as history), duplicate, refused (contradicts, too old, no room), malformed.
 pub const CLAIMS: &str = "oapwatch_claims_total";
 pub const CLAIMS_LAST: &str = "oapwatch_claims_last_timestamp_seconds";
 /// Labels `endpoint` and `outcome`.
@@ -98,7 +98,11 @@ pub fn describe() {
     c!(ALERTS_RAISED, "Alerts raised, by kind.");
     g!(ALERTS_OPEN, "Alerts not yet cleared, by kind.");
     c!(CLAIMS, "Claims received, by outcome.");
-    g!(CLAIMS_LAST, Unit::Seconds, "Unix time of the newest claim accepted.");
+    g!(
+        CLAIMS_LAST,
+        Unit::Seconds,
+        "Unix time that the newest accepted claim was made for."
+    );
     c!(WEBHOOK_ATTEMPTS, "Webhook delivery attempts, by endpoint and outcome.");
     g!(WEBHOOK_QUEUED, "Webhook deliveries that wait.");
     g!(

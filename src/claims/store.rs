@@ -181,6 +181,11 @@ impl Store {
         self.newest.map(|n| (seconds(n.came, now), seconds(n.made, now)))
     }
 
+    /// The time that the newest claim of all was made for.
+    pub fn newest(&self) -> Option<Timestamp> {
+        self.newest.map(|n| n.made)
+    }
+
     fn count(&mut self, outcome: Outcome) {
         let c = &mut self.counts;
         *match outcome {

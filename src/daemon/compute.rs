@@ -246,6 +246,13 @@ impl Compute {
         let health = self.journal.health();
         let counts = self.pipeline.claims.counts();
         metrics::counter!(metric::CLAIMS, "outcome" => "accepted").absolute(counts.accepted);
+        metrics::counter!(metric::CLAIMS, "outcome" => "late").absolute(counts.late);
+        metrics::counter!(metric::CLAIMS, "outcome" => "duplicate").absolute(counts.duplicate);
+        let refused = counts.too_late + counts.conflicting + counts.full;
+        metrics::counter!(metric::CLAIMS, "outcome" => "refused").absolute(refused);
+        if let Some(newest) = self.pipeline.claims.newest() {
+            metrics::gauge!(metric::CLAIMS_LAST).set(newest.as_millisecond() as f64 * 1e-3);
+        }
         Status {
             version: env!("CARGO_PKG_VERSION"),
             started_at: s.started_at,

@@ -110,6 +110,36 @@ impl Block {
 }
 
 impl Blend {
+    /// A beam known from before a restart by the mean and standard deviation of its ln energy.
+    pub fn remembering(mean: f64, std: f64) -> Self {
+        let block = Block {
+            n: BLOCK,
+            mean,
+            squares: f64::from(BLOCK - 1) * std * std,
+        };
+        Self {
+            blocks: std::iter::repeat_n(block, DRIFT_BLOCKS).collect(),
+            ..Self::default()
+        }
+    }
+
+    /// Mean and standard deviation of the past's ln energy.
+    pub fn past_energy(&self) -> Option<(f64, f64)> {
+        Some((self.past()?, self.within().sqrt()))
+    }
+
+    /// Whether enough frames have been seen to say that there is no second beam.
+    pub fn is_judged(&self) -> bool {
+        self.energies.len() >= WINDOWS[2]
+    }
+
+    /// Variance of ln energies within blocks.
+    fn within(&self) -> f64 {
+        let freedom = self.blocks.iter().map(|b| f64::from(b.n - 1)).sum::<f64>();
+        let variance = self.blocks.iter().map(|b| b.squares).sum::<f64>() / freedom.max(1.0);
+        variance.max(ENERGY_FLOOR * ENERGY_FLOOR)
+    }
+
     /// Second difference of the newest three positions and its covariance, where they are from frames in a row.
     pub fn jump(&mut self, time: Timestamp, detection: &Detection) -> Option<(Vector2<f64>, Matrix2<f64>)> {
         self.last.push_back((time, detection.position, detection.cov));
@@ -210,8 +240,7 @@ impl Blend {
         let past = self.past()?;
         let blocks = self.blocks.len() as f64;
         let frames_freedom = self.blocks.iter().map(|b| f64::from(b.n - 1)).sum::<f64>();
-        let within = self.blocks.iter().map(|b| b.squares).sum::<f64>() / frames_freedom;
-        let within = within.max(ENERGY_FLOOR * ENERGY_FLOOR);
+        let within = self.within();
         let of_block = within / f64::from(BLOCK);
         let own = self.scatter();
         let scatter = match own.variance() > UNLIKE_DRIFT * company.variance() {

@@ -42,6 +42,8 @@ pub(super) struct Book {
     open: BTreeMap<Cause, Open>,
     /// When causes cleared lately, and how often they had come back.
     cleared: BTreeMap<Cause, (Timestamp, u32)>,
+    /// Alerts of each kind raised at the newest instant: a flood of them must not cost more than their number.
+    numbered: (Timestamp, BTreeMap<AlertKind, u32>),
     events: Vec<AlertEvent>,
     source_kind: String,
     source_file: Option<String>,
@@ -50,6 +52,8 @@ pub(super) struct Book {
 
 /// A cause absent for this long is over, at its first occurrence.
 const CLEAR_S: f64 = 1.0;
+/// Causes remembered after they cleared.
+const MOST_CLEARED: usize = 10_000;
 
 impl Cause {
     pub fn kind(&self) -> AlertKind {
@@ -85,6 +89,7 @@ impl Book {
         Self {
             open: BTreeMap::new(),
             cleared: BTreeMap::new(),
+            numbered: (Timestamp::UNIX_EPOCH, BTreeMap::new()),
             events: Vec::new(),
             source_kind,
             source_file,
@@ -134,11 +139,14 @@ impl Book {
             }
             return;
         }
-        let cool_down = self.cool_down_s;
-        self.cleared.retain(|_, (at, _)| seconds(*at, now) <= cool_down);
-        let recurrences = self.cleared.remove(cause).map_or(0, |(_, n)| n + 1);
+        let recent = self
+            .cleared
+            .remove(cause)
+            .filter(|(at, _)| seconds(*at, now) <= self.cool_down_s);
+        let recurrences = recent.map_or(0, |(_, n)| n + 1);
+        let id = self.new_id(cause.kind(), now);
         let mut alert = Alert {
-            id: self.new_id(cause.kind(), now),
+            id,
             kind: cause.kind(),
             severity: finding.severity,
             state: AlertState::Open,
@@ -190,7 +198,13 @@ impl Book {
         if let Some(mut open) = self.open.remove(cause) {
             open.alert.state = AlertState::Cleared;
             open.alert.cleared_at = Some(now);
-            self.cleared.insert(cause.clone(), (now, open.recurrences));
+            let cool_down = self.cool_down_s;
+            if self.cleared.len() >= MOST_CLEARED {
+                self.cleared.retain(|_, (at, _)| seconds(*at, now) <= cool_down);
+            }
+            if self.cleared.len() < MOST_CLEARED {
+                self.cleared.insert(cause.clone(), (now, open.recurrences));
+            }
             self.events.push(AlertEvent {
                 event: AlertEventKind::Cleared,
                 alert: open.alert,
@@ -231,22 +245,16 @@ impl Book {
     }
 
     /// Kind, time and a count within the same instant: the same input gives the same ids.
-    fn new_id(&self, kind: AlertKind, now: Timestamp) -> String {
+    fn new_id(&mut self, kind: AlertKind, now: Timestamp) -> String {
+        if self.numbered.0 != now {
+            self.numbered = (now, BTreeMap::new());
+        }
+        let next = self.numbered.1.entry(kind).or_default();
+        let number = *next;
+        *next += 1;
         let kind = serde_json::to_value(kind).ok();
         let kind = kind.as_ref().and_then(Value::as_str).unwrap_or("alert");
-        let stem = format!("{kind}-{}", now.strftime("%Y%m%dT%H%M%S%6fZ"));
-        let taken = |id: &String| {
-            let earlier = self.events.iter().map(|e| &e.alert.id);
-            self.open
-                .values()
-                .map(|o| &o.alert.id)
-                .chain(earlier)
-                .any(|other| other == id)
-        };
-        (0..)
-            .map(|n| format!("{stem}-{n}"))
-            .find(|id| !taken(id))
-            .expect("fewer alerts than numbers")
+        format!("{kind}-{}-{number}", now.strftime("%Y%m%dT%H%M%S%6fZ"))
     }
 }
 

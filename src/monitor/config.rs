@@ -6,6 +6,8 @@ use serde::{Deserialize, Serialize};
 pub struct Config {
     /// A user this far from the claim is still where they say.
     pub tolerated_distance_m: f64,
+    /// A user's clock may be this much off ours, either way: their claims are then compared with where they were.
+    pub tolerated_clock_offset_s: f64,
     /// A user's light may grow by this factor for good before the rest counts as somebody else's in the same spot.
     pub tolerated_brightening: f64,
     /// False alerts a month of continuous watching may bring, all kinds together.
@@ -38,6 +40,7 @@ impl Default for Config {
     fn default() -> Self {
         Self {
             tolerated_distance_m: 5.0,
+            tolerated_clock_offset_s: 1.0,
             tolerated_brightening: 1.35,
             false_alerts_per_month: 1.0,
             decision_s: 1.0,
@@ -56,6 +59,7 @@ impl Config {
         const POSITIVE: &str = "a positive finite number";
         let positive = [
             ("tolerated_distance_m", self.tolerated_distance_m),
+            ("tolerated_clock_offset_s", self.tolerated_clock_offset_s),
             ("false_alerts_per_month", self.false_alerts_per_month),
             ("decision_s", self.decision_s),
             ("sensor_lost_s", self.sensor_lost_s),

@@ -83,6 +83,10 @@ impl Motion {
         self.state.fixed_rows::<2>(0).into()
     }
 
+    pub fn velocity(&self) -> Vector2<f64> {
+        self.state.fixed_rows::<2>(2).into()
+    }
+
     pub fn position_cov(&self) -> Matrix2<f64> {
         self.cov.fixed_view::<2, 2>(0, 0).into()
     }

@@ -8,7 +8,9 @@ use jiff::{SignedDuration, Timestamp};
 use oapwatch::claim::{Claim, ClaimState};
 use oapwatch::claims::{self, Store};
 use oapwatch::estimate::{Emitter, Error, Estimate, Flags};
-use oapwatch::monitor::{AlertEvent, AlertEventKind, AlertKind, Config, Monitor, Observation, Report, Source};
+use oapwatch::monitor::{
+    AlertEvent, AlertEventKind, AlertKind, AlertState, Config, Monitor, Observation, Report, Source,
+};
 use oapwatch::optics::{self, Camera};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -103,6 +105,10 @@ pub struct Story {
     /// When a claim made at a time comes in; `None` loses it.
     pub delivery: Box<dyn Fn(f64) -> Option<f64>>,
     pub monitor: Config,
+    /// Claims beside the actors', with the time they come in.
+    pub forged: Vec<(f64, Claim)>,
+    /// The monitor is killed and started again then.
+    pub restarts_at: Option<f64>,
 }
 
 impl Story {
@@ -121,6 +127,8 @@ impl Story {
             sensor: Box::new(|_| Sensor::Fine),
             delivery: Box::new(Some),
             monitor: Config::default(),
+            forged: Vec::new(),
+            restarts_at: None,
         }
     }
 }
@@ -362,6 +370,7 @@ pub fn claims(story: &Story) -> Vec<(f64, Claim)> {
             t += actor.period_s;
         }
     }
+    all.extend(story.forged.iter().cloned());
     all.sort_by(|a, b| a.0.total_cmp(&b.0));
     all
 }
@@ -379,14 +388,24 @@ pub fn tell_with(story: &Story, keep: bool) -> Told {
         file: None,
         rate_hz: story.rate_hz,
     };
-    let mut monitor = Monitor::new(&story.monitor, &config, &camera, source);
+    let mut monitor = Monitor::new(&story.monitor, &config, &camera, source.clone());
     let mut store = Store::new(&config);
     let mut rng = ChaCha8Rng::seed_from_u64(story.seed);
     let mut upcoming = claims(story).into_iter().peekable();
-    let (mut events, mut reports) = (Vec::new(), Vec::new());
+    let (mut events, mut reports) = (Vec::<AlertEvent>::new(), Vec::new());
     let mut last_digest = 0;
     for frame in 0..(story.seconds * story.rate_hz).round() as u64 {
         let t = frame as f64 / story.rate_hz;
+        if story.restarts_at == Some(t) {
+            // What the journal holds.
+            let mut open: BTreeMap<String, oapwatch::monitor::Alert> = BTreeMap::new();
+            for event in &events {
+                open.insert(event.alert.id.clone(), event.alert.clone());
+            }
+            open.retain(|_, alert| alert.state != AlertState::Cleared);
+            monitor = Monitor::new(&story.monitor, &config, &camera, source.clone());
+            monitor.restore(open.into_values().collect());
+        }
         while let Some((_, claim)) = upcoming.next_if(|(comes, _)| *comes <= t + 1e-9) {
             store.insert(claim, at(t));
         }

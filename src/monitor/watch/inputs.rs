@@ -2,11 +2,16 @@ use jiff::Timestamp;
 use serde_json::json;
 
 use super::Monitor;
-use crate::claims::Store;
+use super::users::claimed;
+use crate::claims::{Store, seconds};
 use crate::monitor::book::{Cause, Finding};
 use crate::monitor::residuals::surprise;
 use crate::monitor::users::Asserted;
 use crate::monitor::{AlertKind, Severity};
+
+/// Claims in a row that may be lost, and how much longer than the whole log one user may be silent.
+const MOST_LOST: f64 = 20.0;
+const USER_PATIENCE: f64 = 4.0;
 
 impl Monitor {
     /// The health of what we are given: frames and claims.
@@ -23,6 +28,9 @@ impl Monitor {
         let stale = Cause::Whole(AlertKind::ClaimsStale);
         let period = self.period_s.unwrap_or(0.0);
         let limit = self.config.claims_stale_s.max(5.0 * period);
+        let log_is_stale =
+            self.book.is_open(&stale) || claims.quiet_s(now).is_some_and(|(came, made)| came.max(made) > limit);
+        self.watch_users_claims(asserted, log_is_stale, now);
         match claims.quiet_s(now) {
             Some((came, made)) if came.max(made) > limit && self.expects_claims(asserted) => {
                 let severity = if came.max(made) > 6.0 * limit {
@@ -40,6 +48,32 @@ impl Monitor {
                     .report(&stale, Finding::new(severity, evidence), now, self.frame);
             }
             _ => self.book.absent(&stale, now),
+        }
+    }
+
+    /// A beam whose user's claims have stopped while the others' go on: somebody may hold them back. Lost claims are no
+    /// matter: thirty in a hundred lost at random leave a gap of twenty periods once in 10¹⁰.
+    fn watch_users_claims(&mut self, asserted: &[Asserted], log_is_stale: bool, now: Timestamp) {
+        let period = self.period_s.unwrap_or(0.0);
+        for a in asserted {
+            let cause = Cause::User(AlertKind::ClaimsStale, a.claim.user.clone());
+            let periods = MOST_LOST * a.period_s.unwrap_or(0.0).clamp(period, 10.0 * period.max(0.1));
+            let limit = periods.max(USER_PATIENCE * self.config.claims_stale_s);
+            let user = self.users.get(&a.claim.user);
+            let is_lit = user.is_some_and(|u| u.last_answered.is_some_and(|t| seconds(t, now) < 1.0));
+            // The whole log's silence is one cause and not one a user.
+            if a.ended || a.age_s <= limit || !is_lit || (log_is_stale && !self.book.is_open(&cause)) {
+                self.book.absent(&cause, now);
+                continue;
+            }
+            let evidence = json!({
+                "newest_made_s_ago": a.age_s,
+                "limit_s": limit,
+                "typical_period_s": period,
+            });
+            let mut finding = Finding::new(Severity::Warning, evidence);
+            finding.claimed = claimed(a);
+            self.book.report(&cause, finding, now, self.frame);
         }
     }
 

@@ -13,6 +13,7 @@ use std::collections::BTreeMap;
 use jiff::Timestamp;
 use nalgebra::{Matrix2, Vector2};
 
+use super::blend::Blend;
 use super::book::{Book, Cause, Finding};
 use super::pose::Pose;
 use super::sight::Sight;
@@ -147,7 +148,16 @@ impl Monitor {
     /// Takes over the alerts that were open when the last run ended: they go on, or clear when their cause is gone.
     pub fn restore(&mut self, open: Vec<Alert>) {
         for alert in open {
+            let shared = alert.evidence["shares_the_spot_of"].as_str();
             let cause = match (alert.kind, &alert.user) {
+                (AlertKind::UnclaimedEmitter, None) if shared.is_some() => {
+                    let name = shared.unwrap_or_default().to_owned();
+                    let past = &alert.evidence["energy_over_the_past"];
+                    if let (Some(mean), Some(std)) = (past["past_ln_j"].as_f64(), past["past_ln_std"].as_f64()) {
+                        self.users.entry(name.clone()).or_default().blend = Blend::remembering(mean, std);
+                    }
+                    Cause::Spot(name)
+                }
                 (kind, Some(user)) => Cause::User(kind, user.clone()),
                 (AlertKind::UnclaimedEmitter, None) => Cause::Track(alert.kind, self.tracks.reserve()),
                 (kind, None) => Cause::Whole(kind),

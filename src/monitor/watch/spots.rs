@@ -41,6 +41,7 @@ impl Monitor {
                 continue;
             }
             suspects.insert(name.clone());
+            let past = user.blend.past_energy();
             if !open && let Some(old) = self.alert_melted_into(track) {
                 self.book.rename(&old, cause.clone());
             }
@@ -54,7 +55,12 @@ impl Monitor {
                 "shares_the_spot_of": name,
                 "resolution_m": track.detection.resolution_m,
                 "energy_j": track.detection.energy_j,
-                "energy_over_the_past": { "ratio": seen.brighter, "surprise": seen.energy_surprise },
+                "energy_over_the_past": {
+                    "ratio": seen.brighter,
+                    "surprise": seen.energy_surprise,
+                    "past_ln_j": past.map(|p| p.0),
+                    "past_ln_std": past.map(|p| p.1),
+                },
                 "unrest_over_the_expected": { "ratio": seen.restless, "surprise": seen.unrest_surprise },
                 "surprise": seen.surprise(),
                 "threshold": level,
@@ -64,6 +70,12 @@ impl Monitor {
             self.book.report(&cause, finding, now, self.frame);
         }
         // A spot that cannot be judged now keeps its alert; one whose beam is gone does not.
+        let unjudged = |name: &str| {
+            let i = asserted.iter().position(|a| a.claim.user == name);
+            let answered = i.is_some_and(|i| answers[i].is_some());
+            let watched = watched.iter().any(|(j, _)| Some(*j) == i);
+            answered && !(watched && self.users.get(name).is_some_and(|u| u.blend.is_judged()))
+        };
         let over: Vec<Cause> = self
             .book
             .open()
@@ -71,7 +83,7 @@ impl Monitor {
                 Cause::Spot(name) => Some((cause.clone(), name)),
                 _ => None,
             })
-            .filter(|(_, name)| !suspects.contains(*name))
+            .filter(|(_, name)| !suspects.contains(*name) && !unjudged(name))
             .map(|(cause, _)| cause)
             .collect();
         for cause in over {

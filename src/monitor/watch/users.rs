@@ -20,6 +20,7 @@ impl Monitor {
         let tolerated = self.config.tolerated_distance_m;
         let gate = self.thresholds.level(asserted.len() as f64);
         let floor = self.floor();
+        let clock_s = self.config.tolerated_clock_offset_s;
         for (a, answer) in asserted.iter().zip(answers) {
             let hidden = answer.is_none() && self.is_hidden(a);
             let user = self.users.entry(a.claim.user.clone()).or_default();
@@ -48,14 +49,17 @@ impl Monitor {
                 match track.at(a.claim.time) {
                     Some(then) if track.confirmed && !track.merged => {
                         let beam = track.motion.position_cov();
-                        user.residuals.push(a.claim.time, then - claimed, beam, a.variance);
+                        let velocity = track.motion.velocity();
+                        user.residuals
+                            .push(a.claim.time, then - claimed, velocity, beam, a.variance);
                     }
                     _ if track.confirmed => user.residuals.skip(a.claim.time),
                     _ => {}
                 }
             }
             let cov = track.motion.position_cov() + Matrix2::identity() * a.variance + floor;
-            let offset = track.motion.position() - a.position;
+            let late_s = user.residuals.clock_offset_s(clock_s);
+            let offset = track.motion.position() - a.position - track.motion.velocity() * late_s;
             let is_outside = track.hit && track.confirmed && surprise(offset, &cov, tolerated + a.slack_m) > gate;
             user.outside = if is_outside { user.outside + 1 } else { 0 };
         }
@@ -70,6 +74,7 @@ impl Monitor {
                 ]
                 .iter()
                 .any(|k| book.is_open(&Cause::User(*k, name.clone())))
+                || book.is_open(&Cause::Spot(name.clone()))
         });
     }
     pub(super) fn decide_users(&mut self, asserted: &[Asserted], answers: &[Option<u64>], now: Timestamp) {
@@ -100,13 +105,14 @@ impl Monitor {
         let Some(user) = self.users.get_mut(&a.claim.user) else {
             return;
         };
-        if user.mismatched && user.outside == 0 && user.residuals.agree(2, tolerated) {
+        let late_s = user.residuals.clock_offset_s(self.config.tolerated_clock_offset_s);
+        if user.mismatched && user.outside == 0 && user.residuals.agree(2, tolerated, late_s) {
             // What told of the mismatch is over and must not tell of another one.
             user.residuals.forget();
             user.mismatched = false;
             user.displaced = false;
         }
-        let excess = user.residuals.excess(tolerated, &floor);
+        let excess = user.residuals.excess(tolerated, &floor, late_s);
         user.mismatched |= user.outside >= OUTSIDE_FRAMES || excess.surprise > level;
         let Some(track) = track.filter(|_| !a.ended && user.mismatched) else {
             self.book.absent(&cause, now);
@@ -127,6 +133,7 @@ impl Monitor {
             "claims_in_window": excess.window,
             "mean_distance_m": excess.distance_m,
             "frames_outside": user.outside,
+            "clock_offset_s": late_s,
             "answered_from_elsewhere": user.displaced,
         });
         let mut finding = self.at_track(Finding::new(severity, evidence), track);
@@ -184,7 +191,7 @@ impl Monitor {
     }
 }
 
-fn claimed(a: &Asserted) -> Option<Value> {
+pub(super) fn claimed(a: &Asserted) -> Option<Value> {
     Some(json!({
         "x_m": a.claim.x_m,
         "y_m": a.claim.y_m,

@@ -1,5 +1,8 @@
 //! The monitor held to stories: what it must raise, when, and that it raises nothing else.
 
+mod hostile;
+mod restart;
+#[path = "../stories/mod.rs"]
 mod stories;
 
 use oapwatch::monitor::AlertKind::*;
@@ -321,4 +324,29 @@ fn an_intruder_is_alerted_while_the_pose_is_off() {
         (PoseInconsistent, None, 10.0, 12.0),
         (UnclaimedEmitter, None, 20.0, 21.0),
     ]);
+}
+
+/// Somebody holds one user's claims back while their beam stays on.
+#[test]
+fn a_user_whose_claims_stop_alone_is_one_stale_alert() {
+    let mut actors = crowd();
+    actors[2] = Actor::new("u-2", |_| [80.0, -50.0]).claim(|t| (t < 10.0 || t >= 40.0).then_some([80.0, -50.0]));
+    let mut story = Story::new(9, actors);
+    story.seconds = 60.0;
+    let told = tell(&story);
+    told.expect(&[(ClaimsStale, Some("u-2"), 28.0, 32.0)]);
+    assert!((40.0..42.5).contains(&told.cleared()[0].2));
+}
+
+/// On a bicycle, with a clock that is off by most of a second: five metres and more along the way.
+#[test]
+fn a_clock_within_limits_is_no_false_position() {
+    for (seed, late) in [0.8, -0.8].into_iter().enumerate() {
+        let way = move |t: f64| [100.0 * (0.08 * t).sin(), -50.0 + 40.0 * (0.08 * t).cos()];
+        let mut actors = crowd();
+        actors[2] = Actor::new("u-2", way).claim(move |t| Some(way(t - late)));
+        let mut story = Story::new(seed as u64, actors);
+        story.seconds = 60.0;
+        tell(&story).expect(&[]);
+    }
 }

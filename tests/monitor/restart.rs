@@ -1,0 +1,67 @@
+//! The monitor is killed and started again: what stood goes on, what is over clears, nothing is raised twice.
+
+use oapwatch::monitor::AlertKind::*;
+
+use super::stories::{Actor, Story, crowd, tell};
+
+#[test]
+fn an_intruder_that_stays_is_still_the_same_alert() {
+    let mut actors = crowd();
+    actors.push(Actor::intruder(|t| (10.0..25.0).contains(&t).then_some([20.0, 10.0])));
+    let mut story = Story::new(1, actors);
+    story.restarts_at = Some(15.0);
+    let told = tell(&story);
+    told.expect(&[(UnclaimedEmitter, None, 10.0, 11.0)]);
+    assert!((25.5..28.0).contains(&told.cleared()[0].2), "{:?}", told.cleared());
+}
+
+#[test]
+fn a_shadow_within_a_users_spot_is_still_the_same_alert() {
+    let mut actors = crowd();
+    let victim = |t: f64| [15.0 * (0.06 * t + 1.0).sin(), -50.0 + 15.0 * (0.05 * t + 2.0).cos()];
+    actors.push(Actor::intruder(move |t| {
+        let [x, y] = victim(t);
+        (30.0..60.0).contains(&t).then_some([x + 0.3, y])
+    }));
+    let mut story = Story::new(2, actors);
+    story.seconds = 75.0;
+    story.restarts_at = Some(45.0);
+    let told = tell(&story);
+    told.expect(&[(UnclaimedEmitter, None, 30.5, 36.0)]);
+    let cleared = told.cleared();
+    assert!(
+        cleared.len() == 1 && (60.5..66.0).contains(&cleared[0].2),
+        "{cleared:?}"
+    );
+}
+
+#[test]
+fn a_mismatch_and_an_absence_go_on() {
+    let mut actors = crowd();
+    actors[0] =
+        Actor::new("u-0", |_| [-80.0, -50.0]).beam(|t| Some(if t < 10.0 { [-80.0, -50.0] } else { [-80.0, -30.0] }));
+    actors[3] = Actor::new("u-3", |_| [-80.0, 50.0]).beam(|t| (t < 10.0).then_some([-80.0, 50.0]));
+    let mut story = Story::new(3, actors);
+    story.restarts_at = Some(15.0);
+    let told = tell(&story);
+    let mut raised: Vec<_> = told.raised().into_iter().map(|(kind, user, _)| (kind, user)).collect();
+    raised.sort();
+    assert_eq!(
+        raised,
+        [(PositionMismatch, Some("u-0".into())), (UserUnseen, Some("u-3".into()))],
+        "{}",
+        told.ndjson()
+    );
+    assert!(told.cleared().is_empty(), "{}", told.ndjson());
+}
+
+#[test]
+fn what_ended_while_nobody_watched_clears() {
+    let mut actors = crowd();
+    actors.push(Actor::intruder(|t| (10.0..14.95).contains(&t).then_some([20.0, 10.0])));
+    let mut story = Story::new(4, actors);
+    story.restarts_at = Some(15.0);
+    let told = tell(&story);
+    told.expect(&[(UnclaimedEmitter, None, 10.0, 11.0)]);
+    assert!((15.5..18.0).contains(&told.cleared()[0].2));
+}
