@@ -34,26 +34,39 @@ struct Open {
     quiet_since: Option<Timestamp>,
     /// How often the cause came back after it had been absent.
     recurrences: u32,
+    /// Taken over from an earlier run and not seen in this one.
+    is_unseen: bool,
+}
+
+/// A cause that cleared lately.
+#[derive(Clone, Copy, Debug)]
+struct Cleared {
+    at: Timestamp,
+    /// How often it had come back.
+    recurrences: u32,
+    place: Option<[f64; 2]>,
 }
 
 /// The alerts of a run: raised once per cause, updated, acknowledged, cleared.
 #[derive(Debug)]
 pub(super) struct Book {
     open: BTreeMap<Cause, Open>,
-    /// When causes cleared lately, and how often they had come back.
-    cleared: BTreeMap<Cause, (Timestamp, u32)>,
+    cleared: BTreeMap<Cause, Cleared>,
     /// Alerts of each kind raised at the newest instant: a flood of them must not cost more than their number.
     numbered: (Timestamp, BTreeMap<AlertKind, u32>),
     events: Vec<AlertEvent>,
     source_kind: String,
     source_file: Option<String>,
     cool_down_s: f64,
+    has_caught_up: bool,
 }
 
 /// A cause absent for this long is over, at its first occurrence.
 const CLEAR_S: f64 = 1.0;
 /// Causes remembered after they cleared.
 const MOST_CLEARED: usize = 10_000;
+/// Beams without a claim this near to each other, one after the other, are one cause, m.
+pub(super) const SAME_PLACE_M: f64 = 10.0;
 
 impl Cause {
     pub fn kind(&self) -> AlertKind {
@@ -94,7 +107,13 @@ impl Book {
             source_kind,
             source_file,
             cool_down_s,
+            has_caught_up: false,
         }
+    }
+
+    /// Until then the absence of a cause from before this run says nothing.
+    pub fn catch_up(&mut self, has_caught_up: bool) {
+        self.has_caught_up |= has_caught_up;
     }
 
     /// The recording that holds the frames from now on.
@@ -120,6 +139,7 @@ impl Book {
     /// The cause is there: raises its alert, or brings the open one up to date (an event only when its severity changed).
     pub fn report(&mut self, cause: &Cause, finding: Finding, now: Timestamp, frame: u64) {
         if let Some(open) = self.open.get_mut(cause) {
+            open.is_unseen = false;
             if open.quiet_since.take().is_some() {
                 open.recurrences += 1;
             }
@@ -139,11 +159,7 @@ impl Book {
             }
             return;
         }
-        let recent = self
-            .cleared
-            .remove(cause)
-            .filter(|(at, _)| seconds(*at, now) <= self.cool_down_s);
-        let recurrences = recent.map_or(0, |(_, n)| n + 1);
+        let recurrences = self.cleared_lately(cause, &finding, now).map_or(0, |n| n + 1);
         let id = self.new_id(cause.kind(), now);
         let mut alert = Alert {
             id,
@@ -176,8 +192,26 @@ impl Book {
                 alert,
                 quiet_since: None,
                 recurrences,
+                is_unseen: false,
             },
         );
+    }
+
+    /// How often a cause that cleared within the cool-down had come back by then. A beam has another name each time it
+    /// comes on: it is known by its place.
+    fn cleared_lately(&mut self, cause: &Cause, finding: &Finding, now: Timestamp) -> Option<u32> {
+        let cool_down = self.cool_down_s;
+        let is_recent = |c: &Cleared| seconds(c.at, now) <= cool_down;
+        let same = match (cause, finding.x_m, finding.y_m) {
+            (Cause::Track(..), Some(x), Some(y)) => self
+                .cleared
+                .iter()
+                .filter(|(other, c)| matches!(other, Cause::Track(..)) && is_recent(c))
+                .find(|(_, c)| c.place.is_some_and(|[px, py]| (px - x).hypot(py - y) < SAME_PLACE_M))
+                .map(|(other, _)| other.clone()),
+            _ => Some(cause.clone()),
+        };
+        self.cleared.remove(&same?).filter(is_recent).map(|c| c.recurrences)
     }
 
     /// The cause is absent. Its alert clears after a second of that; twice as long each time it comes back within the
@@ -186,6 +220,9 @@ impl Book {
         let Some(open) = self.open.get_mut(cause) else {
             return;
         };
+        if open.is_unseen && !self.has_caught_up {
+            return;
+        }
         let since = *open.quiet_since.get_or_insert(now);
         let hold = (CLEAR_S * 2f64.powi(open.recurrences.min(20) as i32)).min(self.cool_down_s);
         if seconds(since, now) >= hold {
@@ -200,10 +237,16 @@ impl Book {
             open.alert.cleared_at = Some(now);
             let cool_down = self.cool_down_s;
             if self.cleared.len() >= MOST_CLEARED {
-                self.cleared.retain(|_, (at, _)| seconds(*at, now) <= cool_down);
+                self.cleared.retain(|_, c| seconds(c.at, now) <= cool_down);
             }
             if self.cleared.len() < MOST_CLEARED {
-                self.cleared.insert(cause.clone(), (now, open.recurrences));
+                let place = open.alert.x_m.zip(open.alert.y_m).map(|(x, y)| [x, y]);
+                let cleared = Cleared {
+                    at: now,
+                    recurrences: open.recurrences,
+                    place,
+                };
+                self.cleared.insert(cause.clone(), cleared);
             }
             self.events.push(AlertEvent {
                 event: AlertEventKind::Cleared,
@@ -233,10 +276,13 @@ impl Book {
 
     /// Takes over an alert that was open when the last run ended.
     pub fn restore(&mut self, cause: Cause, alert: Alert) {
+        // Sight shows at once whether it is back.
+        let is_unseen = cause != Cause::Whole(AlertKind::SensorLost);
         self.open.entry(cause).or_insert(Open {
             alert,
             quiet_since: None,
             recurrences: 0,
+            is_unseen,
         });
     }
 

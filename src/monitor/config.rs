@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 pub struct Config {
     /// A user this far from the claim is still where they say.
     pub tolerated_distance_m: f64,
-    /// A user's clock may be this much off ours, either way: their claims are then compared with where they were.
+    /// The log's clock may be this much off ours, either way: what users on the move tell of it is corrected for.
     pub tolerated_clock_offset_s: f64,
     /// A user's light may grow by this factor for good before the rest counts as somebody else's in the same spot.
     pub tolerated_brightening: f64,

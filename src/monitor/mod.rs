@@ -4,6 +4,7 @@
 mod alert;
 mod blend;
 mod book;
+mod clock;
 mod config;
 mod motion;
 mod pose;

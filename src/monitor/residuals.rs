@@ -15,8 +15,6 @@ pub(super) const COMMON_SHARE: f64 = 0.25;
 #[derive(Clone, Copy, Debug)]
 struct Residual {
     offset: Vector2<f64>,
-    /// Of the beam, m/s.
-    velocity: Vector2<f64>,
     /// Covariance of the beam's position.
     beam: Matrix2<f64>,
     /// Variance per axis of the claim.
@@ -66,21 +64,9 @@ impl Residuals {
         self.newest
     }
 
-    pub fn push(
-        &mut self,
-        time: Timestamp,
-        offset: Vector2<f64>,
-        velocity: Vector2<f64>,
-        beam: Matrix2<f64>,
-        claim: f64,
-    ) {
+    pub fn push(&mut self, time: Timestamp, offset: Vector2<f64>, beam: Matrix2<f64>, claim: f64) {
         self.newest = Some(time);
-        self.kept.push_back(Residual {
-            offset,
-            velocity,
-            beam,
-            claim,
-        });
+        self.kept.push_back(Residual { offset, beam, claim });
         if self.kept.len() > WINDOWS[WINDOWS.len() - 1] {
             self.kept.pop_front();
         }
@@ -95,29 +81,12 @@ impl Residuals {
         self.kept.clear();
     }
 
-    /// Seconds by which the user's clock is behind ours: a claim of a moving user stamped τ too early lies τ·v from the beam.
-    /// Least squares over the claims kept, shrunk by `limit_s` taken for its standard deviation before any, and bounded by
-    /// it: who lies about the time gains that many seconds of their own way and no more.
-    pub fn clock_offset_s(&self, limit_s: f64) -> f64 {
-        let mut information = 1.0 / (limit_s * limit_s);
-        let mut sum = 0.0;
-        for r in &self.kept {
-            let weight = 1.0 / (r.claim + 0.01);
-            information += weight * r.velocity.norm_squared();
-            sum += weight * r.offset.dot(&r.velocity);
-        }
-        (sum / information).clamp(-limit_s, limit_s)
-    }
-
-    /// The most surprising of the windows that end now, with the user's clock `late_s` off.
-    pub fn excess(&self, radius_m: f64, floor: &Matrix2<f64>, late_s: f64) -> Excess {
+    /// The most surprising of the windows that end now.
+    pub fn excess(&self, radius_m: f64, floor: &Matrix2<f64>) -> Excess {
         let mut worst = Excess::default();
         for m in WINDOWS.into_iter().take_while(|&m| m <= self.kept.len()) {
             let of = |f: &dyn Fn(&Residual) -> f64| self.kept.iter().rev().take(m).map(f).sum::<f64>() / m as f64;
-            let mean = Vector2::new(
-                of(&|r| r.offset.x - late_s * r.velocity.x),
-                of(&|r| r.offset.y - late_s * r.velocity.y),
-            );
+            let mean = Vector2::new(of(&|r| r.offset.x), of(&|r| r.offset.y));
             let beam = Matrix2::from_fn(|i, j| of(&|r| r.beam[(i, j)]));
             let claim = of(&|r| r.claim) * (COMMON_SHARE + (1.0 - COMMON_SHARE) / m as f64);
             let cov = beam + Matrix2::identity() * claim + floor;
@@ -134,11 +103,14 @@ impl Residuals {
     }
 
     /// Whether the newest `n` claims all agree with the beam to within `radius_m` and a standard deviation.
-    pub fn agree(&self, n: usize, radius_m: f64, late_s: f64) -> bool {
+    pub fn agree(&self, n: usize, radius_m: f64) -> bool {
         self.kept.len() >= n
-            && self.kept.iter().rev().take(n).all(|r| {
-                (r.offset - r.velocity * late_s).norm() <= radius_m + (r.claim + largest_eigenvalue(&r.beam)).sqrt()
-            })
+            && self
+                .kept
+                .iter()
+                .rev()
+                .take(n)
+                .all(|r| r.offset.norm() <= radius_m + (r.claim + largest_eigenvalue(&r.beam)).sqrt())
     }
 }
 
@@ -184,34 +156,14 @@ mod tests {
         let stamp = Timestamp::UNIX_EPOCH;
         let mut r = Residuals::default();
         let none = Matrix2::zeros();
-        r.push(stamp, Vector2::new(6.0, 0.0), Vector2::zeros(), none, 0.25);
-        let one = r.excess(5.0, &none, 0.0).surprise;
+        r.push(stamp, Vector2::new(6.0, 0.0), none, 0.25);
+        let one = r.excess(5.0, &none).surprise;
         for _ in 0..15 {
-            r.push(stamp, Vector2::new(6.0, 0.0), Vector2::zeros(), none, 0.25);
+            r.push(stamp, Vector2::new(6.0, 0.0), none, 0.25);
         }
-        let many = r.excess(5.0, &none, 0.0);
+        let many = r.excess(5.0, &none);
         assert!(many.surprise > 2.0 * one && many.window == 16, "{one} {many:?}");
         // But not without limit: a common error does not average out.
         assert!(many.surprise < 16.0 * one / 3.0);
-    }
-
-    #[test]
-    fn a_clock_that_is_off_explains_what_lies_on_the_way_and_no_more() {
-        let (none, v) = (Matrix2::zeros(), Vector2::new(8.0, 0.0));
-        let mut r = Residuals::default();
-        for _ in 0..16 {
-            r.push(Timestamp::UNIX_EPOCH, v * 0.8, v, none, 0.09);
-        }
-        let late = r.clock_offset_s(1.0);
-        // Shrunk towards zero by the prior of one claim's worth against sixteen.
-        assert!((late - 0.8).abs() < 0.01, "{late}");
-        assert!(r.excess(5.0, &none, late).surprise == 0.0 && r.excess(5.0, &none, 0.0).surprise > 3.0);
-        // Three seconds of the same are a lie about the place.
-        let mut r = Residuals::default();
-        for _ in 0..16 {
-            r.push(Timestamp::UNIX_EPOCH, v * 3.0, v, none, 0.09);
-        }
-        assert_eq!(r.clock_offset_s(1.0), 1.0);
-        assert!(r.excess(5.0, &none, 1.0).surprise > 20.0);
     }
 }

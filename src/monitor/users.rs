@@ -2,6 +2,7 @@ use jiff::Timestamp;
 use nalgebra::{Matrix2, Vector2};
 
 use super::blend::Blend;
+use super::clock::ClockEvidence;
 use super::pose::Witness;
 use super::residuals::Residuals;
 use crate::claims::{Claim, ClaimState, Standing, seconds};
@@ -21,6 +22,8 @@ pub(super) struct Asserted {
     pub position: Vector2<f64>,
     /// Variance per axis.
     pub variance: f64,
+    /// When the claim was made, by our clock; never after the frame.
+    pub made: Timestamp,
     /// Age of the claim, s.
     pub age_s: f64,
     /// How far the user may have gone since, m.
@@ -34,13 +37,17 @@ pub(super) struct Asserted {
 
 impl Asserted {
     /// `largest_sigma_m` bounds what a claim may say of its own error: a lie there must not hide a lie about the place.
-    pub fn new(standing: &Standing, now: Timestamp, default_sigma_m: f64, largest_sigma_m: f64) -> Self {
+    /// The log's clock is `ahead_s` ahead of ours.
+    pub fn new(standing: &Standing, now: Timestamp, default_sigma_m: f64, largest_sigma_m: f64, ahead_s: f64) -> Self {
         let claim = standing.claim;
-        let age_s = seconds(claim.time, now).max(0.0);
+        let ahead = jiff::SignedDuration::from_millis((ahead_s * 1e3).round() as i64);
+        let made = claim.time.saturating_sub(ahead).map_or(now, |made| made.min(now));
+        let age_s = seconds(made, now);
         let sigma = claim.sigma_m.unwrap_or(default_sigma_m).clamp(0.01, largest_sigma_m);
         Self {
             position: Vector2::new(claim.x_m, claim.y_m),
             variance: sigma * sigma,
+            made,
             age_s,
             slack_m: (FREE_SPEED_M_S + standing.pace_m_s.min(FASTEST_M_S)) * age_s,
             expected: false,
@@ -51,12 +58,17 @@ impl Asserted {
         }
     }
 
-    /// The claim as a witness of our own pose: reach for its error and for a step since it was made.
-    pub fn witness(&self) -> Witness {
+    /// The claim as a witness of our own pose: reach for its error and for a step since it was made, where the user's beam
+    /// does not tell how far it has `moved` since.
+    pub fn witness(&self, moved: Option<Vector2<f64>>) -> Witness {
+        let step_m = match moved {
+            Some(_) => 0.0,
+            None => 0.3 * self.slack_m.min(10.0),
+        };
         Witness {
-            claimed: Vector2::new(self.claim.x_m, self.claim.y_m),
+            claimed: Vector2::new(self.claim.x_m, self.claim.y_m) + moved.unwrap_or_default(),
             variance: self.variance,
-            reach_m: 0.5 + 3.0 * self.variance.sqrt() + 0.3 * self.slack_m.min(10.0),
+            reach_m: 0.5 + 3.0 * self.variance.sqrt() + step_m,
         }
     }
 
@@ -73,6 +85,7 @@ pub(super) struct User {
     /// The beam that answered last.
     pub track: Option<u64>,
     pub residuals: Residuals,
+    pub clock: ClockEvidence,
     /// First frame since which no beam answers.
     pub unanswered_since: Option<Timestamp>,
     /// ln likelihood ratio of "absent" to "missed by chance".

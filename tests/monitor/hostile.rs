@@ -40,7 +40,7 @@ fn a_flood_of_invented_users_hides_no_intruder_and_holds_nobody_up() {
     for k in 0..5000 {
         let (x, y) = (f64::from(k % 71) * 3.4 - 120.0, f64::from(k / 71) * 3.3 - 117.0);
         // Nobody claims to be where the intruder is: that would be another story.
-        if (x - 20.0).hypot(y - 10.0) > 12.0 {
+        if (x - 20.0).hypot(y - 10.0) > 20.0 {
             story.forged.push((9.0, forged(&format!("!{k}"), 9.0, x, y)));
         }
     }
@@ -149,4 +149,91 @@ fn liars_in_league_do_not_move_our_pose() {
         "{}",
         told.ndjson()
     );
+}
+
+/// Two of seven lie as if we were turned by three degrees; being far out makes their lies large.
+#[test]
+fn liars_in_league_do_not_turn_us() {
+    let mut actors = crowd();
+    actors.push(Actor::new("u-6", |_| [40.0, 0.0]));
+    for (k, place) in [(0, [-90.0, -60.0]), (5, [90.0, 60.0])] {
+        actors[k] = Actor::new(&format!("u-{k}"), move |_| place).claim(move |t| {
+            let turn = 0.15 * ((t - 10.0) / 40.0).clamp(0.0, 1.0);
+            Some([place[0] + turn * place[1], place[1] - turn * place[0]])
+        });
+    }
+    let mut story = Story::new(7, actors);
+    story.seconds = 60.0;
+    let told = tell(&story);
+    let mut who: Vec<_> = told.raised().into_iter().map(|(kind, user, _)| (kind, user)).collect();
+    who.sort();
+    let expected = ["u-0", "u-5"].map(|u| (PositionMismatch, Some(u.to_owned())));
+    assert_eq!(who, expected, "{}", told.ndjson());
+}
+
+/// A user goes off the air without a word. Their last claim is nobody's licence to appear near it.
+#[test]
+fn a_silent_users_old_claim_covers_for_no_stranger() {
+    let mut actors = crowd();
+    let there = |t: f64| (t < 10.0).then_some([80.0, -50.0]);
+    actors[2] = Actor::new("u-2", |_| [80.0, -50.0]).beam(there).claim(there);
+    actors.push(Actor::intruder(|t| (t >= 22.0).then_some([60.0, -20.0])));
+    let told = tell(&Story::new(8, actors));
+    let found = told.raised().into_iter().find(|(kind, ..)| *kind == UnclaimedEmitter);
+    assert!(
+        found.is_some_and(|(_, _, t)| (22.0..=23.0).contains(&t)),
+        "{}",
+        told.ndjson()
+    );
+}
+
+/// Claims that were true once are sent again, with their old times and with new ones.
+#[test]
+fn replayed_claims_hide_no_lie() {
+    let mut story = Story::new(9, crowd());
+    story.actors[2] = Actor::new("u-2", |_| [80.0, -50.0])
+        .beam(|t| Some(if t < 10.0 { [80.0, -50.0] } else { [80.0, -35.0] }))
+        .claim(|t| (t < 10.0).then_some([80.0, -50.0]));
+    for k in 0..100 {
+        let t = 10.0 + 0.2 * f64::from(k);
+        story
+            .forged
+            .push((t, forged("u-2", 9.0 - 0.1 * f64::from(k % 20), 80.0, -50.0)));
+        story.forged.push((t, forged("u-2", t, 80.0, -50.0)));
+    }
+    assert!(first(&story, PositionMismatch, Some("u-2")).is_some_and(|t| t <= 11.0));
+}
+
+/// Step by step with a user, never near enough to share the spot for long, never claimed.
+#[test]
+fn an_eavesdropper_that_follows_a_user_is_one_alert() {
+    for (seed, away) in [(10, 2.0), (11, 4.0), (12, 8.0)] {
+        let mut actors = crowd();
+        let victim = |t: f64| [15.0 * (0.06 * t + 1.0).sin(), -50.0 + 15.0 * (0.05 * t + 2.0).cos()];
+        actors.push(Actor::intruder(move |t| {
+            let [x, y] = victim((t - 1.0).max(0.0));
+            (t >= 10.0).then_some([x + away * (0.2 * t).cos(), y + away * (0.2 * t).sin()])
+        }));
+        let mut story = Story::new(seed, actors);
+        story.seconds = 60.0;
+        tell(&story).expect(&[(UnclaimedEmitter, None, 10.0, 11.0)]);
+    }
+}
+
+/// A beam that blinks is not an alert a blink: what goes out dies down, and the alert counts how often it came back.
+#[test]
+fn a_beam_that_blinks_does_not_flood() {
+    let mut actors = crowd();
+    actors.push(Actor::intruder(|t| {
+        (t >= 10.0 && (t - 10.0) % 5.0 < 2.0).then_some([20.0, 10.0])
+    }));
+    let mut story = Story::new(13, actors);
+    story.seconds = 310.0;
+    let told = tell(&story);
+    let raised = told.raised();
+    assert!(raised.iter().all(|(kind, ..)| *kind == UnclaimedEmitter), "{raised:?}");
+    // Held for 1, 2, 4 s: the third time it outlasts the three seconds of dark.
+    assert_eq!(raised.len(), 3, "{raised:?}");
+    let last = &told.events.last().expect("events").alert;
+    assert!(last.evidence["recurrences"].as_u64() >= Some(2), "{last:?}");
 }

@@ -101,6 +101,8 @@ pub struct Story {
     /// Share of a claim's variance that wanders over a minute instead of being fresh in each claim.
     pub claim_wander: f64,
     pub shift: Box<dyn Fn(f64) -> [f64; 2]>,
+    /// Relative error of scale, and turn in rad, that positions have beside the shift.
+    pub turn: Box<dyn Fn(f64) -> [f64; 2]>,
     pub sensor: Box<dyn Fn(f64) -> Sensor>,
     /// When a claim made at a time comes in; `None` loses it.
     pub delivery: Box<dyn Fn(f64) -> Option<f64>>,
@@ -124,6 +126,7 @@ impl Story {
             ghosts: 0.0,
             claim_wander: 0.0,
             shift: Box::new(|_| [0.0, 0.0]),
+            turn: Box::new(|_| [0.0, 0.0]),
             sensor: Box::new(|_| Sensor::Fine),
             delivery: Box::new(Some),
             monitor: Config::default(),
@@ -288,10 +291,11 @@ impl Told {
 fn detect(story: &Story, t: f64, rng: &mut ChaCha8Rng) -> Vec<Emitter> {
     let camera = camera();
     let shift = (story.shift)(t);
+    let [s, a] = (story.turn)(t);
     let mut spots: Vec<([f64; 2], f64)> = Vec::new();
     for actor in &story.actors {
         let Some([x, y]) = (actor.beam)(t) else { continue };
-        let p = [x + shift[0], y + shift[1]];
+        let p = [x + shift[0] + s * x - a * y, y + shift[1] + a * x + s * y];
         if !camera.sees(p) || rng.random::<f64>() >= story.detected {
             continue;
         }

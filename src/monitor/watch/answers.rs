@@ -2,9 +2,11 @@ use std::collections::BTreeSet;
 
 use super::Monitor;
 use crate::assign::assign;
+use crate::monitor::AlertKind;
+use crate::monitor::book::Cause;
 use crate::monitor::motion::mahalanobis2;
 use crate::monitor::tracks::Track;
-use crate::monitor::users::Asserted;
+use crate::monitor::users::{Asserted, CLAIM_LIFE_S};
 
 /// Squared Mahalanobis distance within which a beam can answer a claim.
 const ANSWER_GATE: f64 = 25.0;
@@ -36,7 +38,7 @@ impl Monitor {
                 let r = t.motion.position() - a.position;
                 let d2 = mahalanobis2(r, t.motion.position_cov() + a.spread(self.config.tolerated_distance_m));
                 let incumbent = self.users.get(&a.claim.user).and_then(|u| u.track) == Some(t.id);
-                if d2 > ANSWER_GATE {
+                if d2 > ANSWER_GATE || (!incumbent && a.age_s > self.fresh_s(a)) {
                     f64::INFINITY
                 } else if incumbent {
                     d2
@@ -63,6 +65,16 @@ impl Monitor {
         }
         answers
     }
+    /// Age up to which a claim answers for a beam that was not its user's before, s: the longer a user is silent, the
+    /// wider the ground that a stranger could appear on under their name.
+    fn fresh_s(&self, a: &Asserted) -> f64 {
+        if self.book.is_open(&Cause::Whole(AlertKind::ClaimsStale)) {
+            return CLAIM_LIFE_S;
+        }
+        let period = self.period_s.unwrap_or(CLAIM_LIFE_S).max(a.period_s.unwrap_or(0.0));
+        self.config.claims_stale_s.max(5.0 * period).min(CLAIM_LIFE_S)
+    }
+
     /// Whether the claimed place lies so near a beam of someone else that a second spot there could not be told apart.
     pub(super) fn is_hidden(&self, a: &Asserted) -> bool {
         self.tracks.all.iter().filter(|t| t.hit).any(|t| {

@@ -1,4 +1,5 @@
 use jiff::Timestamp;
+use nalgebra::Vector2;
 use serde_json::json;
 
 use super::Monitor;
@@ -83,19 +84,23 @@ impl Monitor {
             .config
             .pose_limit_m
             .unwrap_or(0.5 * self.config.tolerated_distance_m);
-        let shift = self.pose.shift();
+        let pose = self.pose.displacement();
         let (agreeing, of) = self.pose.support();
-        let surprise = surprise(shift, &self.floor(), limit);
+        let (place, worst) = self.worst_displacement();
+        let surprise = surprise(worst, &self.floor(place), limit);
         let level = self.thresholds.level(1.0);
         let is_open = self.book.is_open(&cause);
-        if surprise > level || (is_open && shift.norm() > 0.9 * limit) {
-            let severity = if shift.norm() > 4.0 * limit {
+        if surprise > level || (is_open && worst.norm() > 0.9 * limit) {
+            let severity = if worst.norm() > 4.0 * limit {
                 Severity::Critical
             } else {
                 Severity::Warning
             };
             let evidence = json!({
-                "shift_m": [shift.x, shift.y],
+                "shift_m": [pose.shift.x, pose.shift.y],
+                "turned_deg": pose.turn.to_degrees(),
+                "scale": 1.0 + pose.scale,
+                "largest_in_view_m": worst.norm(),
                 "limit_m": limit,
                 "users_agreeing": agreeing,
                 "users": of,
@@ -107,6 +112,18 @@ impl Monitor {
         } else {
             self.book.absent(&cause, now);
         }
+    }
+
+    /// Where in view our pose error displaces positions most, of the middle and the four edges, and by how much.
+    fn worst_displacement(&self) -> (Vector2<f64>, Vector2<f64>) {
+        let pose = self.pose.displacement();
+        let [w, h] = [&self.camera.x, &self.camera.y].map(|axis| axis.half_width() * self.camera.ground_scale());
+        [[0.0, 0.0], [w, 0.0], [-w, 0.0], [0.0, h], [0.0, -h]]
+            .map(|[x, y]| Vector2::new(x, y))
+            .map(|p| (p, pose.at(p)))
+            .into_iter()
+            .max_by(|a, b| a.1.norm().total_cmp(&b.1.norm()))
+            .expect("five places")
     }
 
     /// A network without users has nothing to say.

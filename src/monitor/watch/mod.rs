@@ -28,6 +28,8 @@ use crate::optics::Camera;
 const SYSTEMATIC_M: f64 = 0.05;
 /// A beam and an absence that began within this of each other have one cause, s.
 const COINCIDENCE_S: f64 = 1.5;
+/// Users that have been seen, from which on only such ones tell of our pose.
+const KNOWN_WITNESSES: usize = 3;
 /// An alert that lasts this long is critical, s.
 const ESCALATE_S: f64 = 10.0;
 
@@ -44,9 +46,12 @@ pub struct Monitor {
     pose: Pose,
     first: Option<Timestamp>,
     first_claim: Option<Timestamp>,
+    first_usable: Option<Timestamp>,
     /// Typical seconds between a user's claims, and from a claim's own time to its arrival.
     period_s: Option<f64>,
     delay_s: f64,
+    /// Seconds by which the log's clock is ahead of ours.
+    ahead_s: f64,
     time: Option<Timestamp>,
     frame: u64,
     /// Since when each track has had no claim, by track.
@@ -68,8 +73,10 @@ impl Monitor {
             pose: Pose::default(),
             first: None,
             first_claim: None,
+            first_usable: None,
             period_s: None,
             delay_s: 0.0,
+            ahead_s: 0.0,
             time: None,
             frame: 0,
             alone: BTreeMap::new(),
@@ -100,7 +107,10 @@ impl Monitor {
             .filter(|t| seconds(*t, now) < 2.0 + self.sight.blind_s(now))
             .count();
         self.learn_habits(&asserted, claims, now);
+        self.book.catch_up(self.has_caught_up(now));
+        self.learn_clock();
         if let Some(estimate) = self.sight.judge(&seen, lit) {
+            self.first_usable.get_or_insert(now);
             let detections = Detection::of(estimate, &self.camera);
             self.tracks.step(now, &detections, dt);
             self.find_pose(&mut asserted, dt);
@@ -158,7 +168,14 @@ impl Monitor {
                     }
                     Cause::Spot(name)
                 }
-                (kind, Some(user)) => Cause::User(kind, user.clone()),
+                (kind, Some(user)) => {
+                    if kind == AlertKind::PositionMismatch {
+                        let displaced = alert.evidence["answered_from_elsewhere"].as_bool().unwrap_or(false);
+                        let known = self.users.entry(user.clone()).or_default();
+                        (known.mismatched, known.displaced) = (true, displaced);
+                    }
+                    Cause::User(kind, user.clone())
+                }
                 (AlertKind::UnclaimedEmitter, None) => Cause::Track(alert.kind, self.tracks.reserve()),
                 (kind, None) => Cause::Whole(kind),
             };
@@ -171,7 +188,7 @@ impl Monitor {
         let tolerated = self.config.tolerated_distance_m;
         claims
             .standing()
-            .map(|s| Asserted::new(&s, now, self.default_sigma_m, tolerated))
+            .map(|s| Asserted::new(&s, now, self.default_sigma_m, tolerated, self.ahead_s))
             .filter(|a| self.bears(a))
             .map(|mut a| {
                 a.expected = !a.ended && self.must_be_seen(&a);
@@ -196,9 +213,9 @@ impl Monitor {
         self.is_near_view(a.position, (self.spot_m() - off).min(0.0))
     }
 
-    /// Covariance of what all of a user's residuals share: our own pose and what is systematic in the positions.
-    fn floor(&self) -> Matrix2<f64> {
-        Matrix2::identity() * (SYSTEMATIC_M.powi(2) + self.pose.variance())
+    /// Covariance of what all residuals of a user at `p` share: our own pose and what is systematic in the positions.
+    fn floor(&self, p: Vector2<f64>) -> Matrix2<f64> {
+        Matrix2::identity() * (SYSTEMATIC_M.powi(2) + self.pose.variance(p))
     }
 
     /// Learns our own pose error from the frame and moves the claims by it.
@@ -210,10 +227,26 @@ impl Monitor {
             .filter(|t| t.hit)
             .map(|t| t.motion.position())
             .collect();
-        let witnesses: Vec<_> = asserted.iter().filter(|a| a.expected).map(Asserted::witness).collect();
+        // Claims that no beam ever answered say nothing of our pose, unless there are no others.
+        let (known, invented): (Vec<&Asserted>, Vec<&Asserted>) =
+            asserted.iter().filter(|a| a.expected).partition(|a| {
+                let user = self.users.get(&a.claim.user);
+                user.is_some_and(|u| u.last_answered.is_some())
+            });
+        let heard = if known.len() >= KNOWN_WITNESSES {
+            known
+        } else {
+            [known, invented].concat()
+        };
+        let moved = |a: &Asserted| {
+            let track = self.tracks.get(self.users.get(&a.claim.user)?.track?)?;
+            Some(track.motion.position() - track.at(a.made)?)
+        };
+        let witnesses: Vec<_> = heard.into_iter().map(|a| a.witness(moved(a))).collect();
         self.pose.update(&beams, &witnesses, dt, self.period_s.unwrap_or(1.0));
+        let displacement = self.pose.displacement();
         for a in asserted {
-            a.position += self.pose.shift();
+            a.position += displacement.at(a.position);
         }
     }
 

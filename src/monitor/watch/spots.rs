@@ -17,6 +17,8 @@ use crate::monitor::{AlertKind, Severity};
 const FEWEST_OTHERS: usize = 2;
 /// Share of the level from which a beam's present is no longer taken into its past.
 const SUSPECT: f64 = 0.2;
+/// Resolutions within which one beam's light disturbs another's.
+const BESIDE: f64 = 3.0;
 
 impl Monitor {
     /// Looks for a second beam within each user's spot.
@@ -40,8 +42,11 @@ impl Monitor {
             if seen.surprise() <= if open { SUSPECT * level } else { level } {
                 continue;
             }
-            suspects.insert(name.clone());
             let past = user.blend.past_energy();
+            if !open && self.is_beside_unclaimed(track) {
+                continue;
+            }
+            suspects.insert(name.clone());
             if !open && let Some(old) = self.alert_melted_into(track) {
                 self.book.rename(&old, cause.clone());
             }
@@ -157,6 +162,17 @@ impl Monitor {
                 freedom: sum.freedom + s.freedom,
             }),
         }
+    }
+
+    /// Whether an emitter that has its alert stands so near that its light explains what is odd about this beam.
+    fn is_beside_unclaimed(&self, track: &Track) -> bool {
+        let here = track.motion.position();
+        self.book.open().any(|(cause, _)| match cause {
+            Cause::Track(AlertKind::UnclaimedEmitter, id) => self.tracks.get(*id).is_some_and(|t| {
+                (t.hit || t.merged) && (t.motion.position() - here).norm() < BESIDE * track.detection.resolution_m
+            }),
+            _ => false,
+        })
     }
 
     /// The alert of an emitter that can no longer be told apart from this beam: the same cause.

@@ -5,7 +5,7 @@ use serde_json::{Value, json};
 use super::habits::median;
 use super::{COINCIDENCE_S, ESCALATE_S, Monitor};
 use crate::claims::seconds;
-use crate::monitor::book::{Cause, Finding};
+use crate::monitor::book::{Cause, Finding, SAME_PLACE_M};
 use crate::monitor::tracks::Track;
 use crate::monitor::users::Asserted;
 use crate::monitor::{AlertKind, Severity};
@@ -23,7 +23,7 @@ impl Monitor {
         for track in &self.tracks.all {
             if answers.contains(&Some(track.id)) {
                 self.alone.remove(&track.id);
-            } else if track.hit {
+            } else if track.hit || track.merged {
                 self.alone.entry(track.id).or_insert(now);
             }
         }
@@ -82,14 +82,38 @@ impl Monitor {
         for (cause, id) in open {
             let still = self.tracks.get(id).is_some_and(|t| t.hit || t.merged) && self.alone.contains_key(&id);
             if !still {
-                self.book.absent(&cause, now);
+                match self.swapped_with(id) {
+                    Some(other) => self
+                        .book
+                        .rename(&cause, Cause::Track(AlertKind::UnclaimedEmitter, other)),
+                    None => self.book.absent(&cause, now),
+                }
             }
         }
     }
 
-    /// A user whose beam vanished as this one appeared.
+    /// The beam without a claim in the spot that track `id` is in, when `id` itself answers one: where two beams melt, which
+    /// is whose is a guess, and that one of them is nobody's is not.
+    fn swapped_with(&self, id: u64) -> Option<u64> {
+        let track = self.tracks.get(id).filter(|_| !self.alone.contains_key(&id))?;
+        let here = track.motion.position();
+        let reach = 2.0 * track.detection.resolution_m;
+        let others = self.tracks.all.iter().filter(|t| {
+            let cause = Cause::Track(AlertKind::UnclaimedEmitter, t.id);
+            t.id != id && self.alone.contains_key(&t.id) && t.confirmed && !self.book.is_open(&cause)
+        });
+        let near = others.filter(|t| (t.motion.position() - here).norm() < reach);
+        near.map(|t| t.id).next()
+    }
+
+    /// A user whose beam vanished as this one appeared, or who has not been seen yet. Where several have not been seen, which
+    /// of them it is would be a guess, and the beam is nobody's.
     fn displaced_user(&self, asserted: &[Asserted], answers: &[Option<u64>], since: Timestamp) -> Option<usize> {
-        (0..asserted.len())
+        let seen = |i: usize| {
+            let user = self.users.get(&asserted[i].claim.user);
+            user.is_some_and(|u| u.last_answered.is_some())
+        };
+        let candidates = (0..asserted.len())
             .filter(|&i| answers[i].is_none() && asserted[i].expected)
             .filter_map(|i| {
                 let name = &asserted[i].claim.user;
@@ -99,9 +123,11 @@ impl Monitor {
                 let user = self.users.get(name)?;
                 let gap = seconds(user.unanswered_since?, since).abs();
                 (user.absence >= VANISHED && gap <= COINCIDENCE_S).then_some((i, gap))
-            })
-            .min_by(|a, b| a.1.total_cmp(&b.1))
-            .map(|(i, _)| i)
+            });
+        let (known, new): (Vec<_>, Vec<_>) = candidates.partition(|(i, _)| seen(*i));
+        let candidates = if known.is_empty() && new.len() == 1 { new } else { known };
+        let nearest = candidates.into_iter().min_by(|a, b| a.1.total_cmp(&b.1));
+        nearest.map(|(i, _)| i)
     }
 
     /// An open alert near here whose own track was lost, or took the place of the beam that answered a claim: the same cause.
@@ -116,7 +142,7 @@ impl Monitor {
                 _ => return None,
             };
             let (x, y) = (alert.x_m?, alert.y_m?);
-            (lost && (p - Vector2::new(x, y)).norm() < 10.0).then(|| cause.clone())
+            (lost && (p - Vector2::new(x, y)).norm() < SAME_PLACE_M).then(|| cause.clone())
         })
     }
 

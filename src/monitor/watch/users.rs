@@ -4,7 +4,7 @@ use jiff::Timestamp;
 use nalgebra::{Matrix2, Vector2};
 use serde_json::{Value, json};
 
-use super::{COINCIDENCE_S, ESCALATE_S, Monitor};
+use super::{COINCIDENCE_S, ESCALATE_S, Monitor, SYSTEMATIC_M};
 use crate::claims::seconds;
 use crate::monitor::book::{Cause, Finding};
 use crate::monitor::residuals::{WINDOWS, surprise};
@@ -19,8 +19,10 @@ impl Monitor {
     pub(super) fn weigh(&mut self, asserted: &[Asserted], answers: &[Option<u64>], now: Timestamp) {
         let tolerated = self.config.tolerated_distance_m;
         let gate = self.thresholds.level(asserted.len() as f64);
-        let floor = self.floor();
-        let clock_s = self.config.tolerated_clock_offset_s;
+        let displacement = self.pose.displacement();
+        let unsure_s = self.unsure_of_clock_s(now);
+        // Before everybody has claimed once our own pose and the log's clock are not known.
+        let settled = self.claims_settled(now);
         for (a, answer) in asserted.iter().zip(answers) {
             let hidden = answer.is_none() && self.is_hidden(a);
             let user = self.users.entry(a.claim.user.clone()).or_default();
@@ -44,23 +46,27 @@ impl Monitor {
             if a.ended {
                 continue;
             }
-            let claimed = Vector2::new(a.claim.x_m, a.claim.y_m) + self.pose.shift();
+            let claimed = Vector2::new(a.claim.x_m, a.claim.y_m);
+            let claimed = claimed + displacement.at(claimed);
             if user.residuals.newest().is_none_or(|t| t < a.claim.time) {
-                match track.at(a.claim.time) {
-                    Some(then) if track.confirmed && !track.merged => {
+                let is_clear = track.confirmed && !track.merged;
+                if let Some(stamped) = track.at(a.claim.time).filter(|_| is_clear && !user.mismatched) {
+                    user.clock.push(stamped - claimed, track.motion.velocity(), a.variance);
+                }
+                match track.at(a.made) {
+                    Some(then) if is_clear && settled => {
                         let beam = track.motion.position_cov();
-                        let velocity = track.motion.velocity();
-                        user.residuals
-                            .push(a.claim.time, then - claimed, velocity, beam, a.variance);
+                        user.residuals.push(a.claim.time, then - claimed, beam, a.variance);
                     }
                     _ if track.confirmed => user.residuals.skip(a.claim.time),
                     _ => {}
                 }
             }
+            let floor = Matrix2::identity() * (SYSTEMATIC_M.powi(2) + self.pose.variance(a.position));
             let cov = track.motion.position_cov() + Matrix2::identity() * a.variance + floor;
-            let late_s = user.residuals.clock_offset_s(clock_s);
-            let offset = track.motion.position() - a.position - track.motion.velocity() * late_s;
-            let is_outside = track.hit && track.confirmed && surprise(offset, &cov, tolerated + a.slack_m) > gate;
+            let offset = track.motion.position() - a.position;
+            let reach = tolerated + a.slack_m + unsure_s * track.motion.velocity().norm();
+            let is_outside = track.hit && track.confirmed && surprise(offset, &cov, reach) > gate;
             user.outside = if is_outside { user.outside + 1 } else { 0 };
         }
         let present: BTreeSet<&str> = asserted.iter().map(|a| a.claim.user.as_str()).collect();
@@ -99,21 +105,23 @@ impl Monitor {
 
     fn decide_mismatch(&mut self, a: &Asserted, answer: Option<u64>, level: f64, now: Timestamp) {
         let tolerated = self.config.tolerated_distance_m;
-        let floor = self.floor();
+        let floor = self.floor(a.position);
         let cause = Cause::User(AlertKind::PositionMismatch, a.claim.user.clone());
         let track = answer.and_then(|id| self.tracks.get(id));
+        let unsure_s = self.unsure_of_clock_s(now);
+        let settled = self.claims_settled(now);
         let Some(user) = self.users.get_mut(&a.claim.user) else {
             return;
         };
-        let late_s = user.residuals.clock_offset_s(self.config.tolerated_clock_offset_s);
-        if user.mismatched && user.outside == 0 && user.residuals.agree(2, tolerated, late_s) {
+        if user.mismatched && user.outside == 0 && user.residuals.agree(2, tolerated) {
             // What told of the mismatch is over and must not tell of another one.
             user.residuals.forget();
             user.mismatched = false;
             user.displaced = false;
         }
-        let excess = user.residuals.excess(tolerated, &floor, late_s);
-        user.mismatched |= user.outside >= OUTSIDE_FRAMES || excess.surprise > level;
+        let unsure = track.map_or(0.0, |t| unsure_s * t.motion.velocity().norm());
+        let excess = user.residuals.excess(tolerated + unsure, &floor);
+        user.mismatched |= settled && (user.outside >= OUTSIDE_FRAMES || excess.surprise > level);
         let Some(track) = track.filter(|_| !a.ended && user.mismatched) else {
             self.book.absent(&cause, now);
             return;
@@ -133,7 +141,7 @@ impl Monitor {
             "claims_in_window": excess.window,
             "mean_distance_m": excess.distance_m,
             "frames_outside": user.outside,
-            "clock_offset_s": late_s,
+            "clock_offset_s": self.ahead_s,
             "answered_from_elsewhere": user.displaced,
         });
         let mut finding = self.at_track(Finding::new(severity, evidence), track);
