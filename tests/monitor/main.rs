@@ -331,7 +331,7 @@ fn an_intruder_is_alerted_while_the_pose_is_off() {
 #[test]
 fn a_user_whose_claims_stop_alone_is_one_stale_alert() {
     let mut actors = crowd();
-    actors[2] = Actor::new("u-2", |_| [80.0, -50.0]).claim(|t| (t < 10.0 || t >= 40.0).then_some([80.0, -50.0]));
+    actors[2] = Actor::new("u-2", |_| [80.0, -50.0]).claim(|t| (!(10.0..40.0).contains(&t)).then_some([80.0, -50.0]));
     let mut story = Story::new(9, actors);
     story.seconds = 60.0;
     let told = tell(&story);

@@ -215,6 +215,11 @@ pub fn honest(seed: u64, seconds: f64) -> Story {
     story.position_std_m = 10f64.powf(rng.random_range(-2.0..0.0));
     let (a, b) = (rng.random_range(0.0..0.5), rng.random_range(0.02..0.5));
     story.shift = Box::new(move |t| [a * (b * t).sin(), a * (0.7 * b * t).cos()]);
+    // Half a per cent of altitude, half a degree of heading, a quarter of a second.
+    let off = [rng.random_range(-0.005..0.005), rng.random_range(-0.009..0.009)];
+    story.turn = Box::new(move |_| off);
+    let late = rng.random_range(0.0..0.25);
+    story.delivery = Box::new(move |t| Some(t + late));
     story
 }
 
