@@ -197,3 +197,46 @@ fn a_bad_file_changes_nothing_on_reload() {
     assert_eq!(code, Some(0));
     assert!(log.iter().any(|l| l.contains("nothing was changed")), "{log:?}");
 }
+
+#[test]
+fn what_the_daemon_records_is_reviewed_to_the_same_alert() {
+    let dir = tempfile::tempdir().unwrap();
+    let record = "[record]\nfolder = \"recordings\"\nsegment_s = 2.0\nbefore_s = 1.0\nafter_s = 0.5\n";
+    let daemon = Daemon::start(dir.path(), record);
+    let list = daemon.wait_for("/v1/alerts", "alert", |v| !alerts(v).is_empty());
+    let raised = alerts(&list)[0].clone();
+    daemon.wait_for("/v1/positions", "frames after the alert", |v| {
+        v["frame"].as_u64() > raised["source"]["frame"].as_u64().map(|k| k + 10)
+    });
+    daemon.signal("-TERM");
+    assert_eq!(daemon.end().0, Some(0));
+
+    let file = Path::new(raised["source"]["file"].as_str().unwrap());
+    assert!(file.is_file(), "the alert names {}", file.display());
+    let id = raised["id"].as_str().unwrap();
+    assert!(dir.path().join(format!("recordings/evidence/{id}.npy")).is_file());
+    let config = dir.path().join("review.toml");
+    for recording in ["recordings".to_owned(), format!("recordings/evidence/{id}.npy")] {
+        std::fs::write(
+            &config,
+            format!("[source]\nkind = \"replay\"\nframes = \"{recording}\"\n"),
+        )
+        .unwrap();
+        let review = Command::new(env!("CARGO_BIN_EXE_oapwatch"))
+            .args(["review", "--config"])
+            .arg(&config)
+            .output()
+            .unwrap();
+        assert!(review.status.success(), "{}", String::from_utf8_lossy(&review.stderr));
+        let told = String::from_utf8(review.stdout).unwrap();
+        let events: Vec<Value> = told.lines().map(|l| serde_json::from_str(l).unwrap()).collect();
+        let found = events.iter().find(|e| e["event"] == "alert.raised");
+        let found = &found.unwrap_or_else(|| panic!("no alert in {recording}: {told}"))["alert"];
+        if recording == "recordings" {
+            for member in ["id", "kind", "raised_at", "user", "claimed"] {
+                assert_eq!(found[member], raised[member], "{member}");
+            }
+            assert_eq!(found["source"]["frame"], raised["source"]["frame"]);
+        }
+    }
+}

@@ -78,8 +78,8 @@ fn all(mut source: Box<dyn FrameSource>) -> Vec<(String, Option<String>)> {
 /// Waits for the disk where a test would outrun it.
 fn record(recorder: &mut Recorder, frame: &Frame, claims: &[Claim]) -> Arc<Path> {
     loop {
-        if let Some(path) = recorder.frame(frame, claims) {
-            return path;
+        if let Some(taken) = recorder.frame(frame, claims) {
+            return taken.file.expect("a disk that works");
         }
         std::thread::sleep(Duration::from_millis(1));
     }
@@ -93,7 +93,11 @@ fn a_replay_gives_what_was_recorded_bit_for_bit_over_all_files() {
     for k in 0..35 {
         let name = |path: Arc<Path>| Some(path.file_name().unwrap().to_str().unwrap().to_owned());
         if k == 12 {
-            let path = recorder.unusable(36, time(12), "short", &[claim(12)]).unwrap();
+            let path = recorder
+                .unusable(36, time(12), "short", &[claim(12)])
+                .unwrap()
+                .file
+                .unwrap();
             let next = Next::Unusable {
                 index: 36,
                 time: time(12),
@@ -210,6 +214,42 @@ fn evidence_holds_what_lies_around_the_alert_and_the_claims_that_stood() {
         rest.last()
     );
     assert_eq!(rest.len(), 45 - 25);
+}
+
+#[test]
+fn a_recorder_whose_disk_fails_names_no_file_and_goes_on_when_it_can() {
+    let folder = tempfile::tempdir().unwrap();
+    let ring = folder.path().join("ring");
+    let mut recorder = Recorder::start(&config(&ring)).unwrap().unwrap();
+    record(&mut recorder, &frame(0), &[claim(0)]);
+    std::fs::rename(&ring, folder.path().join("unplugged")).unwrap();
+    let mut k = 1;
+    let mut until = |is_named: bool| {
+        for _ in 0..10_000 {
+            k += 1;
+            let taken = recorder.frame(&frame(k), &[]);
+            if taken.is_some_and(|taken| taken.file.is_some() == is_named) {
+                return k;
+            }
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        panic!(
+            "10,000 frames later a file {} named",
+            if is_named { "is not" } else { "is still" }
+        );
+    };
+    until(false);
+    std::fs::create_dir(&ring).unwrap();
+    let again = until(true);
+    drop(recorder);
+    let seen = all(replay(&ring).unwrap());
+    assert!(
+        seen.iter()
+            .any(|(next, _)| next.contains(&format!("index: {},", 3 * again))),
+        "{seen:?}"
+    );
+    // The claim that stood when the disk came back is in the head of the first file.
+    assert!(seen[0].0.contains("u-0"), "{}", seen[0].0);
 }
 
 #[test]

@@ -40,7 +40,43 @@ impl Failure {
         if reader_left {
             return ExitCode::SUCCESS;
         }
-        eprintln!("oapwatch: {error:#}");
+        eprintln!("oapwatch: {}", message(&error));
         ExitCode::from(code)
+    }
+}
+
+/// The error and its causes, each said once: many name their cause in their own words already.
+fn message(error: &anyhow::Error) -> String {
+    let mut told = error.to_string();
+    for cause in error.chain().skip(1).map(ToString::to_string) {
+        if !told.ends_with(&cause) {
+            told = format!("{told}: {cause}");
+        }
+    }
+    told
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_cause_is_said_once() {
+        let disk = || std::io::Error::other("disk full");
+        let error = anyhow::Error::new(crate::frames::Error::Recording {
+            path: "a.npy".into(),
+            source: disk(),
+        });
+        assert_eq!(
+            error.to_string(),
+            "a.npy: disk full",
+            "the error names its cause itself"
+        );
+        assert_eq!(
+            message(&error.context("nothing kept")),
+            "nothing kept: a.npy: disk full"
+        );
+        let silent = anyhow::Error::new(disk()).context("reading").context("starting");
+        assert_eq!(message(&silent), "starting: reading: disk full");
     }
 }

@@ -16,7 +16,7 @@ use crate::api::{
 };
 use crate::claims::{Claim, ClaimState, Follower, Outcome};
 use crate::frame::Frame;
-use crate::frames::record::Recorder;
+use crate::frames::record::{Recorder, Taken};
 use crate::frames::{Capture, Next};
 use crate::journal::Journal;
 use crate::metric;
@@ -111,12 +111,13 @@ impl Compute {
     }
 
     /// Lets alerts name the file that holds their frame: the recorder's, or the one being replayed.
-    fn recorded(&mut self, recorded: Option<Arc<Path>>, replayed: Option<Arc<Path>>) {
-        // What the disk could not take goes with the next frame, unless the disk is gone for good.
+    fn recorded(&mut self, recorded: Option<Taken>, replayed: Option<Arc<Path>>) {
+        // What the recorder could not take goes with the next frame, unless the disk hangs for good.
         if recorded.is_some() || self.unrecorded.len() > MOST_UNRECORDED {
             self.unrecorded.clear();
         }
-        self.pipeline.monitor.recorded_in(recorded.or(replayed).as_deref());
+        let file = recorded.and_then(|taken| taken.file).or(replayed);
+        self.pipeline.monitor.recorded_in(file.as_deref());
     }
 
     fn frame(&mut self, frame: Frame, arrived: Instant) {

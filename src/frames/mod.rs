@@ -108,6 +108,17 @@ impl Error {
             Self::Npy(_) | Self::Recording { .. } | Self::Index { .. } | Self::NoRecording { .. }
         )
     }
+
+    /// Whether there was no room to write.
+    pub fn is_full_disk(&self) -> bool {
+        use std::io::ErrorKind::{QuotaExceeded, StorageFull};
+        match self {
+            Self::Npy(npy::Error::Io { source, .. }) | Self::Recording { source, .. } => {
+                matches!(source.kind(), StorageFull | QuotaExceeded)
+            }
+            _ => false,
+        }
+    }
 }
 
 /// Opens the configured source. A device that is not there yet is no error: it is waited for.

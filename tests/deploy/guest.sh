@@ -40,14 +40,17 @@ metric() { # metric NAME: its value
     curl -fsS -m 5 $api/metrics | sed -n "s/^$1 //p"
 }
 is() { [ "$(metric "$1")" = "$2" ]; }
-grows() { # grows METRIC
-    local before after
-    before=$(metric "$1")
-    sleep 3
-    after=$(metric "$1")
-    [ -n "$before" ] && [ "$after" -gt "$before" ]
+more() { # more METRIC THAN
+    [ "$(metric "$1")" -gt "$2" ]
 }
-delivered() { grep -q "$1" /received; }
+grows() { # grows METRIC
+    local before
+    before=$(metric "$1")
+    [ -n "$before" ] && within 30 more "$1" "$before"
+}
+delivered() { grep -q "$1" /run/received; }
+owes_nothing() { curl -fsS -m 5 $api/metrics | grep -q '^oapwatch_webhook_queued{.*} 0$'; }
+gave_nothing_up() { curl -fsS -m 5 $api/metrics | grep -q '^oapwatch_webhook_dead_letters{.*} 0$'; }
 result() { [ "$(systemctl show -P Result oapwatch)" = "$1" ]; }
 status() { systemctl show -P StatusText oapwatch | grep -E 'frames/s, .* open alerts'; }
 
@@ -60,7 +63,7 @@ if ! ready >/dev/null 2>&1; then
     finish
 fi
 check "it is enabled for the next boot" systemctl is-enabled oapwatch
-check "its status line says what it does" within 20 status
+check "its status line says what it does" within 60 status
 check "the eavesdropper is alerted" within 90 has_alert
 check "it does not run as root" bash -c '[ "$(stat -c %u /proc/'"$(pid)"')" != 0 ]'
 check "memory stays below 100 MB" bash -c 'awk "/VmRSS/ { print; exit \$2 > 100000 }" /proc/'"$(pid)"'/status'
@@ -80,7 +83,7 @@ check "an alert is delivered to the receiver" within 90 delivered alert.raised
 before=$(ids)
 old=$(pid)
 kill -9 "$old"
-check "kill -9 is followed by a restart" within 30 restarted "$old"
+check "kill -9 is followed by a restart" within 60 restarted "$old"
 check "kill -9 loses no alert" kept "$before"
 
 mkdir -p /etc/systemd/system/oapwatch.service.d
@@ -96,26 +99,26 @@ systemctl restart oapwatch
 
 old=$(pid)
 check "reload keeps the process" bash -c 'systemctl reload oapwatch && sleep 1'
-check "and it goes on" same "$old"
+check "and it goes on" within 30 same "$old"
 cp $config /tmp/good
 echo 'nonsense = 1' >>$config
 systemctl reload oapwatch
 sleep 1
-check "a bad config changes nothing on reload" same "$old"
+check "a bad config changes nothing on reload" within 30 same "$old"
 check "and is refused by name at a restart" bash -c "oapwatch check $config; [ \$? = 64 ]"
 cp /tmp/good $config
 
 date -s '+1 hour' >/dev/null
 sleep 2
-check "the clock stepped an hour forward" same "$old"
+check "the clock stepped an hour forward" within 30 same "$old"
 check "frames go on after it" grows oapwatch_frames_captured_total
 date -s '-2 hours' >/dev/null
 sleep 2
-check "the clock stepped two hours back" same "$old"
+check "the clock stepped two hours back" within 30 same "$old"
 check "frames go on after that" grows oapwatch_frames_captured_total
 
 systemctl restart oapwatch
-check "the journal is writable" within 20 is oapwatch_journal_writable 1
+check "the journal is writable" within 60 is oapwatch_journal_writable 1
 dd if=/dev/zero of=/var/tmp/fill bs=1M 2>/dev/null
 dd if=/dev/zero of=/var/tmp/rest bs=4k 2>/dev/null
 check "a full disk is told by the metric" within 120 is oapwatch_journal_writable 0
@@ -123,8 +126,10 @@ check "monitoring goes on with a full disk" grows oapwatch_frames_captured_total
 before=$(ids)
 rm /var/tmp/fill /var/tmp/rest
 check "with room again the journal recovers" within 60 is oapwatch_journal_writable 1
-check "nothing waits in memory then" within 20 is oapwatch_journal_unwritten_events 0
+check "nothing waits in memory then" within 60 is oapwatch_journal_unwritten_events 0
 check "a full disk loses no alert" kept "$before"
+check "and no delivery" within 90 owes_nothing
+check "none was given up" gave_nothing_up
 
 before=$(ids)
 old=$(date +%s%N)
@@ -132,29 +137,51 @@ systemctl stop oapwatch
 took=$((($(date +%s%N) - old) / 1000000))
 check "it stops within two seconds: $took ms" [ $took -lt 2000 ]
 check "and cleanly" result success
+
+# A disk of 4 MB, which twelve seconds of frames would fill; the ring believes it may have 64 MB.
+small=/run/small
+mkdir $small
+mount -t tmpfs -o size=4m tmpfs $small
+printf '[estimator]\nname = "subpixel-peak"\n[record]\nfolder = "ring"\nlimit_mb = 64.0\nsegment_s = 2.0\n[journal]\npath = "journal.db"\n' >$small/oapwatch.toml
+oapwatch run --config $small/oapwatch.toml 2>$small.log &
+recorder=$!
+made_way() { grep -q "oldest recordings made way" $small.log && grep -q "recording again" $small.log; }
+check "on a full disk the oldest recordings make way" within 120 made_way
+check "the journal has the room" within 60 is oapwatch_journal_writable 1
+kill $recorder
+wait $recorder
+check "what is left of the ring can be reviewed" bash -c "printf '[source]\nkind = \"replay\"\nframes = \"ring\"\nspeed = 0.0\n[estimator]\nname = \"subpixel-peak\"\n' >$small/review.toml && oapwatch review --config $small/review.toml"
+umount $small
+
 systemctl start oapwatch
-check "a stop loses no alert" within 20 kept "$before"
+check "a stop loses no alert" within 60 kept "$before"
 
 # A camera: vivid's test image with its running clock; 10 × 10 camera pixels to a pixel of the array.
 sed -i 's/^kind = "simulator".*/kind = "v4l2"\ndevice = "\/dev\/video0"/; s/^pixels = .*/pixels = [32, 32]\njoules_per_count = 1e-9/; s/^rate_hz = .*/rate_hz = 60.0/' $config
 sed -i 's/^\[claims\]/[source.v4l2]\npixel_format = "Y16"\nroi = [0, 0, 320, 320]\n\n[claims]/' $config
 check "the config with a camera is good" env CREDENTIALS_DIRECTORY=/run/credentials/oapwatch.service oapwatch check $config
 systemctl restart oapwatch
-check "it starts without its camera and says so" within 30 is oapwatch_source_connected 0
+check "it starts without its camera and says so" within 60 is oapwatch_source_connected 0
 old=$(pid)
 modprobe vivid n_devs=1 node_types=0x1 num_inputs=1 input_types=3
 check "a camera plugged in is opened" within 60 is oapwatch_source_connected 1
 check "its frames come" grows oapwatch_frames_captured_total
-check "frames are usable" within 30 ready
+check "frames are usable" within 60 ready
 echo vivid.0 >$vivid/unbind
-check "the camera unplugged is noticed" within 30 is oapwatch_source_connected 0
+check "the camera unplugged is noticed" within 60 is oapwatch_source_connected 0
 check "a lost camera is an alert" within 60 bash -c "curl -fsS '$api/v1/alerts?state=open' | grep sensor_lost"
 echo vivid.0 >$vivid/bind
 check "plugged in again it is opened again" within 60 is oapwatch_source_connected 1
 check "its frames come again" grows oapwatch_frames_captured_total
 check "all by the same process" [ "$(pid)" = "$old" ]
 
+# Back to the simulator: an emulated camera leaves an emulated processor little for anything else.
+cp /tmp/good $config
+systemctl restart oapwatch
+rmmod vivid
+check "it goes back to the simulator" within 60 ready
 before=$(ids)
+old=$(pid)
 check "apt upgrades the package" apt-get install -qq -y --no-install-recommends -o Dpkg::Options::=--force-confold /upgrade.deb
 check "the new version runs" within 60 restarted "$old"
 check "upgrade keeps the config" grep -q 9100 $config

@@ -1,4 +1,4 @@
-"""Webhook receiver: answers 204 and appends each body to /received. Needs no more than Python's minimal library."""
+"""Webhook receiver: answers 204 and appends each body to /run/received, which a full disk leaves alone. Needs no more than Python's minimal library."""
 import socket
 
 server = socket.create_server(("127.0.0.1", 9100))
@@ -10,6 +10,6 @@ while True:
             name, _, value = line.partition(b":")
             if name.lower() == b"content-length":
                 length = int(value)
-        with open("/received", "ab") as out:
+        with open("/run/received", "ab") as out:
             out.write(request.read(length) + b"\n")
         connection.sendall(b"HTTP/1.1 204 No Content\r\nConnection: close\r\n\r\n")

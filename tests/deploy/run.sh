@@ -124,7 +124,7 @@ echo "Booting (software emulation; a few minutes at most)"
 status=0
 timeout 900 qemu-system-x86_64 -accel tcg -cpu max -smp 1 -m 1024 -nodefaults -display none -no-reboot \
     -kernel "$vmlinuz" -initrd "$work/initramfs.gz" \
-    -append "console=ttyS0 quiet panic=-1 nokaslr mitigations=off tsc=reliable no_timer_check random.trust_cpu=on cryptomgr.notests systemd.show_status=false rd.systemd.show_status=false" \
+    -append "console=ttyS0 quiet loglevel=2 panic=-1 nokaslr mitigations=off tsc=reliable no_timer_check random.trust_cpu=on cryptomgr.notests systemd.show_status=false rd.systemd.show_status=false" \
     -drive "file=$work/root.squashfs,format=raw,if=virtio,readonly=on" \
     -device isa-debug-exit,iobase=0xf4,iosize=0x04 -serial stdio </dev/null | tee "$work/log" || status=${PIPESTATUS[0]}
 # The guest writes v to the port and QEMU ends with (v << 1) | 1.

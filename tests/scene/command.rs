@@ -84,6 +84,43 @@ fn an_interrupted_recording_is_valid_and_its_files_agree() {
 }
 
 #[test]
+fn a_disk_without_room_leaves_valid_files_that_agree() {
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("out");
+    // A limit on a file's size stands in for a full disk: 2 MB hold 61 frames and the header.
+    let done = Command::new("sh")
+        .args([
+            "-c",
+            "trap '' XFSZ; ulimit -f 3906; exec \"$@\"",
+            "sh",
+            env!("CARGO_BIN_EXE_oapwatch"),
+        ])
+        .args([
+            "simulate",
+            "--frames",
+            "1000",
+            "--scene",
+            &builtin(),
+            "--out",
+            out.to_str().unwrap(),
+        ])
+        .output()
+        .unwrap();
+    let message = String::from_utf8_lossy(&done.stderr);
+    assert_eq!(done.status.code(), Some(1), "{message}");
+    let file = out.join("frames.npy");
+    let frames = npy::Reader::open(&file, None).unwrap().frames();
+    assert_eq!(frames, (3906 * 512 - 128) / (64 * 64 * 8));
+    assert!(
+        message.contains(&format!("{frames} of 1000 frames were written")) && message.contains("files are valid"),
+        "{message}"
+    );
+    assert_eq!(message.matches("os error").count(), 1, "{message}");
+    assert_eq!(std::fs::metadata(&file).unwrap().len(), 128 + frames * 64 * 64 * 8);
+    assert_eq!(count(&out.join("truth.ndjson")), frames);
+}
+
+#[test]
 fn a_bad_scene_ends_with_64_and_names_the_field() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("bad.toml");

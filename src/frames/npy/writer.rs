@@ -71,9 +71,13 @@ impl Writer {
         }
         self.bytes.clear();
         self.bytes.extend(pixels.iter().flat_map(|v| v.to_le_bytes()));
-        self.append().map_err(|source| Error::Io {
-            path: self.path.clone(),
-            source,
+        self.append().map_err(|source| {
+            // A part of a frame is no harm where it cannot be cut off: the header does not count it.
+            let _ = self.file.set_len(self.end_of(self.header.frames));
+            Error::Io {
+                path: self.path.clone(),
+                source,
+            }
         })
     }
 

@@ -1,5 +1,6 @@
 //! Keeps what the monitor was given: a ring on disk, and around each alert a copy as evidence. A thread of its
-//! own writes, so that a slow disk costs recordings and never alerts.
+//! own writes, so that a slow disk costs recordings and never alerts. On a full disk the oldest recordings make way,
+//! so that the ring does not take the journal's room.
 
 mod config;
 mod player;
@@ -14,12 +15,13 @@ pub(super) use tape::index_of;
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::thread::JoinHandle;
 
 use jiff::{SignedDuration, Timestamp};
 
-use super::Error;
+use super::{Error, npy};
 use crate::claim::Claim;
 use crate::frame::Frame;
 use crate::metric;
@@ -30,6 +32,8 @@ use tape::{Entry, Seen, TapeReader, TapeWriter};
 const MOST_CLIPS: usize = 8;
 /// Frames that may wait for the disk.
 const QUEUE: usize = 64;
+/// After this long a file that could not be written is given up for a new one.
+const RETRY: SignedDuration = SignedDuration::from_secs(1);
 
 /// Records on a thread of its own. Dropping it writes what waits and ends the thread.
 #[derive(Debug)]
@@ -40,8 +44,17 @@ pub struct Recorder {
     segment_bytes: u64,
     next_number: u64,
     current: Option<Segment>,
+    /// The clerk could not write the latest frame it was given.
+    failing: Arc<AtomicBool>,
     queue: Option<SyncSender<Order>>,
     thread: Option<JoinHandle<()>>,
+}
+
+/// The recorder's thread has it.
+#[derive(Clone, Debug)]
+pub struct Taken {
+    /// The file that holds it; `None` while the disk fails. Claims stand in the next file's head all the same.
+    pub file: Option<Arc<Path>>,
 }
 
 /// The file that frames go to.
@@ -81,12 +94,14 @@ impl Recorder {
         std::fs::create_dir_all(&evidence).map_err(failed(&evidence))?;
         let next_number = ring::next_number(&folder).map_err(failed(&folder))?;
         let (queue, orders) = sync_channel(QUEUE);
+        let failing = Arc::new(AtomicBool::new(false));
         let clerk = Clerk {
             folder: folder.clone(),
             evidence,
             config: config.clone(),
             tape: None,
             broken: None,
+            failing: failing.clone(),
             standing: Standing::default(),
             clips: Vec::new(),
         };
@@ -100,20 +115,21 @@ impl Recorder {
             folder,
             next_number,
             current: None,
+            failing,
             queue: Some(queue),
             thread: Some(thread),
         }))
     }
 
-    /// Records a frame as it came, before any correction, with the claims taken in since the one before. Gives the
-    /// file that holds it, or `None` when the disk cannot keep up and the frame was let go.
-    pub fn frame(&mut self, frame: &Frame, claims: &[Claim]) -> Option<Arc<Path>> {
+    /// Records a frame as it came, before any correction, with the claims taken in since the one before. `None`
+    /// when the disk cannot keep up and the frame was let go.
+    pub fn frame(&mut self, frame: &Frame, claims: &[Claim]) -> Option<Taken> {
         let bytes = 8 * frame.pixels.len() as u64;
         self.write(Some(frame.pixels.dim()), bytes, Seen::frame(frame, claims))
     }
 
     /// Records that there was no usable frame.
-    pub fn unusable(&mut self, index: u64, time: Timestamp, reason: &str, claims: &[Claim]) -> Option<Arc<Path>> {
+    pub fn unusable(&mut self, index: u64, time: Timestamp, reason: &str, claims: &[Claim]) -> Option<Taken> {
         let entry = Entry {
             index,
             time,
@@ -131,11 +147,13 @@ impl Recorder {
         self.order(Order::Evidence { name, time });
     }
 
-    fn write(&mut self, shape: Option<(usize, usize)>, bytes: u64, seen: Seen) -> Option<Arc<Path>> {
+    fn write(&mut self, shape: Option<(usize, usize)>, bytes: u64, seen: Seen) -> Option<Taken> {
         let time = seen.entry.time;
+        let is_failing = self.failing.load(Ordering::Relaxed);
+        let longest = if is_failing { RETRY } else { self.segment };
         let fits = |segment: &Segment| {
             shape.is_none_or(|shape| shape == segment.shape)
-                && time.duration_since(segment.began).abs() < self.segment
+                && time.duration_since(segment.began).abs() < longest
                 && segment.bytes + bytes <= self.segment_bytes.max(bytes)
         };
         let mut segment = match self.current.take().filter(fits) {
@@ -155,12 +173,13 @@ impl Recorder {
         let path = segment.path.clone();
         let shape = segment.shape;
         self.current = Some(segment);
-        self.order(Order::Write {
+        let sent = self.order(Order::Write {
             path: path.clone(),
             shape,
             seen,
-        })
-        .then_some(path)
+        });
+        let file = (!is_failing).then_some(path);
+        sent.then_some(Taken { file })
     }
 
     fn order(&self, order: Order) -> bool {
@@ -191,6 +210,7 @@ struct Clerk {
     tape: Option<TapeWriter>,
     /// The file that could not be written; the next one is tried again.
     broken: Option<Arc<Path>>,
+    failing: Arc<AtomicBool>,
     standing: Standing,
     clips: Vec<Clip>,
 }
@@ -204,14 +224,29 @@ struct Clip {
 impl Clerk {
     fn run(mut self, orders: &Receiver<Order>) {
         for order in orders {
+            let was_failing = self.failing.load(Ordering::Relaxed);
             let done = match order {
                 Order::Write { path, shape, seen } => self.write(path, shape, &seen),
                 Order::Evidence { name, time } => self.keep(&name, time),
             };
-            if let Err(error) = done {
-                metrics::counter!(metric::RECORDER_ERRORS).increment(1);
+            let Err(error) = done else { continue };
+            metrics::counter!(metric::RECORDER_ERRORS).increment(1);
+            if !was_failing {
                 tracing::error!(%error, "not recorded");
             }
+            if error.is_full_disk() {
+                self.make_way();
+            }
+        }
+    }
+
+    /// Gives half of the ring's room back to the disk.
+    fn make_way(&self) {
+        let half = ring::size(&self.folder).map(|bytes| bytes / 2);
+        match half.and_then(|half| ring::trim(&self.folder, half, Path::new(""))) {
+            Ok(0) => {}
+            Ok(removed) => tracing::warn!(removed, "the disk is full: the oldest recordings made way"),
+            Err(error) => tracing::error!(%error, "the disk is full, and the oldest recordings could not be removed"),
         }
     }
 
@@ -230,9 +265,12 @@ impl Clerk {
                 false
             }
         });
+        let was_failing = self.failing.swap(written.is_err(), Ordering::Relaxed);
         if written.is_err() {
             self.broken = Some(path);
             self.tape = None;
+        } else if was_failing {
+            tracing::info!(path = %path.display(), "recording again");
         }
         written.and(grown)
     }
@@ -297,9 +335,10 @@ impl Clerk {
                     Some(writer) => writer,
                     None => clip.insert(TapeWriter::create(&path, shape, standing.claims())?),
                 };
-                // A camera whose array changed its shape meanwhile: the evidence ends where it changed.
-                if writer.push(&seen).is_err() {
-                    break;
+                match writer.push(&seen) {
+                    // A camera whose array changed its shape meanwhile: the evidence ends where it changed.
+                    Err(Error::Npy(npy::Error::Shape { .. })) => break,
+                    done => done?,
                 }
             }
         }

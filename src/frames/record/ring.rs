@@ -24,13 +24,23 @@ pub(super) fn next_number(folder: &Path) -> io::Result<u64> {
     Ok(recordings(folder)?.iter().filter_map(number).max().map_or(0, |n| n + 1))
 }
 
+/// Bytes of all recordings of a folder.
+pub(super) fn size(folder: &Path) -> io::Result<u64> {
+    Ok(recordings(folder)?.iter().map(|path| bytes(path)).sum())
+}
+
+/// Bytes of a recording and its index.
+fn bytes(path: &Path) -> u64 {
+    let size = |path: &Path| std::fs::metadata(path).map_or(0, |m| m.len());
+    size(path) + size(&index_of(path))
+}
+
 /// Removes the oldest recordings until all are within `limit` bytes; `keep` stays. Gives the number removed.
 pub(super) fn trim(folder: &Path, limit: u64, keep: &Path) -> io::Result<u64> {
-    let size = |path: &Path| std::fs::metadata(path).map_or(0, |m| m.len());
     let mut all: Vec<(PathBuf, u64)> = recordings(folder)?
         .into_iter()
         .map(|path| {
-            let bytes = size(&path) + size(&index_of(&path));
+            let bytes = bytes(&path);
             (path, bytes)
         })
         .collect();

@@ -113,7 +113,16 @@ pub(super) struct TapeWriter {
 }
 
 impl TapeWriter {
+    /// Creates both files, or leaves neither.
     pub fn create(path: &Path, shape: (usize, usize), claims: Vec<Claim>) -> Result<Self, Error> {
+        Self::create_both(path, shape, claims).inspect_err(|_| {
+            // What could not be written can be absent too.
+            let _ = std::fs::remove_file(path);
+            let _ = std::fs::remove_file(index_of(path));
+        })
+    }
+
+    fn create_both(path: &Path, shape: (usize, usize), claims: Vec<Claim>) -> Result<Self, Error> {
         let frames = npy::Writer::create(path, shape)?;
         let index = File::create(index_of(path)).map_err(|source| Error::Recording {
             path: index_of(path),
