@@ -59,3 +59,10 @@ test-deploy:
 	$(call need,sh -c 'command -v qemu-system-x86_64 && command -v busybox && command -v depmod && command -v cpio && command -v mmdebstrap && command -v mksquashfs',qemu-system-x86 busybox-static kmod cpio mmdebstrap squashfs-tools)
 	@test -f target/oapwatch.deb || $(MAKE) deb
 	tests/deploy/run.sh
+
+.PHONY: soak
+# Whether memory, file descriptors or threads grow, over SOAK_S seconds of 40 times the usual pace. Not in CI: it takes its time.
+SOAK_S ?= 600
+soak: build
+	$(call need,command -v python3,python3-minimal)
+	tests/deploy/soak.py target/release/oapwatch $(SOAK_S)
