@@ -2,6 +2,8 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
+use super::KnownPower;
+
 /// `[estimator]`.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -12,4 +14,6 @@ pub struct Config {
     pub network: Option<PathBuf>,
     /// Time allowed a frame; the best rung finished within it is returned.
     pub budget_ms: Option<f64>,
+    /// What the `map` rung may take for known of users' power; `map` without it is `ml` with another price of emitters.
+    pub known_power: Option<KnownPower>,
 }

@@ -12,7 +12,7 @@ use std::time::Instant;
 use super::atoms::{self, Atoms};
 use super::basis::Basis;
 use super::linear::{axpy, cholesky, dot, invert, solve};
-use super::model::{Model, Nuisances};
+use super::model::{Model, Nuisances, pull};
 use super::reading::Reading;
 
 const LAMBDA_START: f64 = 1e-3;
@@ -28,8 +28,6 @@ const OVERLAP: f64 = 3.0;
 const LARGEST_ACCELERATION: f64 = 0.56 / 4.0;
 /// A bar is out of reach when this many times the drop that a quadratic promises does not get there.
 const HOPE: f64 = 5.0;
-/// Amplitudes stay above this many standard deviations of noise, so that a position keeps its gradient.
-const AMPLITUDE_FLOOR: f64 = 0.05;
 /// Multiplications a frame may cost: the same for every run, unlike a clock. About 10 ms on one core of 2021.
 const MOST_WORK: f64 = 1e8;
 /// The same with what the last fit may take beyond.
@@ -40,8 +38,8 @@ pub(super) struct Fitter {
     pub bx: Basis,
     pub by: Basis,
     backgrounds: [[Vec<f64>; 2]; 2],
-    now: Atoms,
-    trial: Atoms,
+    pub(super) now: Atoms,
+    pub(super) trial: Atoms,
     /// Weighted residual, (my, mx).
     residual: Vec<f64>,
     trial_residual: Vec<f64>,
@@ -49,15 +47,15 @@ pub(super) struct Fitter {
     broadening: [Vec<f64>; 2],
     weighted: Vec<f64>,
     hessian: Vec<f64>,
-    factor: Vec<f64>,
+    pub(super) factor: Vec<f64>,
     gradient: Vec<f64>,
     velocity: Vec<f64>,
-    acceleration: Vec<f64>,
-    bend: Vec<f64>,
-    scratch: Vec<f64>,
-    strip: Vec<f64>,
-    small: Vec<f64>,
-    active: Vec<bool>,
+    pub(super) acceleration: Vec<f64>,
+    pub(super) bend: Vec<f64>,
+    pub(super) scratch: Vec<f64>,
+    pub(super) strip: Vec<f64>,
+    pub(super) small: Vec<f64>,
+    pub(super) active: Vec<bool>,
     /// Multiplications since the last frame, and the time it must be done by.
     work: f64,
     deadline: Option<Instant>,
@@ -193,6 +191,21 @@ impl Fitter {
         true
     }
 
+    /// ln det of an information matrix of `n` parameters over its first `size`, with `floor` added to the precision of
+    /// the positions in x and y.
+    pub fn log_det(&mut self, n: usize, size: usize, floor: [f64; 2]) -> Option<f64> {
+        self.factor.clear();
+        for i in 0..size {
+            self.factor.extend_from_slice(&self.hessian[i * n..i * n + size]);
+            self.factor[i * size + i] *= 1.0 + 1e-13;
+            if i % 3 < 2 {
+                self.factor[i * size + i] += floor[i % 3];
+            }
+        }
+        let is_regular = cholesky(&mut self.factor, size);
+        is_regular.then(|| (0..size).map(|i| 2.0 * self.factor[i * size + i].ln()).sum())
+    }
+
     #[inline(always)]
     fn run(&mut self, reading: &Reading, model: &mut Model, steps: usize, bar: f64) {
         let nuisances = model.nuisances;
@@ -264,7 +277,7 @@ impl Fitter {
         model.spots.clone_from(&self.now.spots);
         model.background = self.now.background;
         model.width = self.now.width;
-        model.deviance = deviance;
+        model.deviance = deviance - pull(&model.spots);
         // A fit of no steps only evaluates: it says nothing new about convergence.
         model.converged = converged || steps == 0 && model.converged;
     }
@@ -283,105 +296,8 @@ impl Fitter {
         let backgrounds = [&self.backgrounds[0], &self.backgrounds[1]];
         atoms.place([&self.bx, &self.by], backgrounds, reading, nuisances, &mut self.scratch);
         self.solve_amplitudes(reading, is_trial);
-        self.subtract(reading, is_trial)
-    }
-
-    /// Least-squares amplitudes at the atoms' positions; those of spots are kept above a floor by an active set.
-    #[inline(always)]
-    fn solve_amplitudes(&mut self, reading: &Reading, is_trial: bool) {
-        let atoms = if is_trial { &mut self.trial } else { &mut self.now };
-        let (mx, my) = (reading.mx, reading.my);
-        let n = atoms.spots.len();
-        let sources = atoms.sources();
-        if sources == 0 {
-            return;
-        }
-        self.small.resize(sources * sources, 0.0);
-        let gram = &mut self.small;
-        let rhs = &mut self.acceleration;
-        rhs.resize(sources.max(rhs.len()), 0.0);
-        for i in 0..sources {
-            for j in 0..=i {
-                gram[i * sources + j] = atoms.overlap(i, j, &reading.weights, &mut self.strip);
-            }
-            rhs[i] = atoms.project(i, reading.weighted(), &mut self.strip)[0];
-        }
-        for bad in &reading.bad {
-            let (ux, uy) = (&self.bx.row(bad.x)[..mx], &self.by.row(bad.y)[..my]);
-            let values = &mut self.scratch;
-            values.resize(values.len().max(sources), 0.0);
-            for i in 0..sources {
-                let [x, y] = atoms.at(i, ux, uy);
-                values[i] = x[0] * y[0];
-                rhs[i] -= values[i] * bad.value;
-            }
-            for i in 0..sources {
-                for j in 0..=i {
-                    gram[i * sources + j] -= values[i] * values[j];
-                }
-            }
-        }
-        self.active.clear();
-        self.active.resize(sources, true);
-        let factor = &mut self.factor;
-        let solution = &mut self.bend;
-        solution.resize(sources.max(solution.len()), 0.0);
-        let floor = |i: usize| AMPLITUDE_FLOOR / gram[i * sources + i].max(1e-30).sqrt();
-        loop {
-            let mut order = 0;
-            factor.resize(factor.len().max(sources * sources), 0.0);
-            let size = self.active.iter().filter(|a| **a).count();
-            for i in (0..sources).filter(|&i| self.active[i]) {
-                let mut b = rhs[i];
-                for k in (0..sources).filter(|&k| !self.active[k]) {
-                    b -= gram[i.max(k) * sources + i.min(k)] * floor(k);
-                }
-                solution[order] = b;
-                for (column, j) in (0..=i).filter(|&j| self.active[j]).enumerate() {
-                    factor[order * size + column] = gram[i * sources + j];
-                }
-                factor[order * size + order] *= 1.0 + 1e-13;
-                order += 1;
-            }
-            if size > 0 {
-                let mut ridge = 1e-12;
-                while !cholesky(&mut factor[..size * size], size) {
-                    let mut row = 0;
-                    for i in (0..sources).filter(|&i| self.active[i]) {
-                        for (column, j) in (0..=i).filter(|&j| self.active[j]).enumerate() {
-                            factor[row * size + column] = gram[i * sources + j];
-                        }
-                        factor[row * size + row] = gram[i * sources + i].max(1e-30) * (1.0 + ridge);
-                        row += 1;
-                    }
-                    ridge *= 10.0;
-                }
-                solve(factor, size, solution);
-            }
-            let mut row = 0;
-            let mut clipped = false;
-            for i in 0..sources {
-                if !self.active[i] {
-                    if i < n {
-                        atoms.spots[i].a = floor(i);
-                    }
-                    continue;
-                }
-                let a = solution[row];
-                row += 1;
-                if i >= n {
-                    atoms.background[i - n] = a;
-                } else if a < floor(i) {
-                    self.active[i] = false;
-                    clipped = true;
-                } else {
-                    atoms.spots[i].a = a;
-                }
-            }
-            if !clipped {
-                break;
-            }
-        }
+        let spots = if is_trial { &self.trial.spots } else { &self.now.spots };
+        pull(spots) + self.subtract(reading, is_trial)
     }
 
     /// Weighted residual and deviance of the present or the trial hypothesis.
@@ -468,6 +384,10 @@ impl Fitter {
             let s = atoms.project(i, &self.residual, &mut self.strip);
             if i < n {
                 (g[3 * i], g[3 * i + 1], g[3 * i + 2]) = (ai * s[1], ai * s[2], s[0]);
+                if let Some(power) = atoms.spots[i].power {
+                    h[(3 * i + 2) * p + 3 * i + 2] += power.precision;
+                    g[3 * i + 2] += power.precision * (power.mean - ai);
+                }
             } else {
                 g[2 * n + i] = s[0];
             }

@@ -9,6 +9,7 @@ use super::model::{Model, Nuisances, Spot};
 use super::network::NetworkError;
 use super::noise::Inspection;
 use super::pencil::Sampler;
+use super::power::{KnownPower, Prior};
 use super::reading::Reading;
 use super::screen::Screened;
 use super::search::Search;
@@ -32,6 +33,14 @@ enum Method {
     Greedy,
     Pencil { steps: usize },
     MaximumLikelihood,
+    MaximumPosterior,
+}
+
+impl Rung {
+    /// Whether the number of emitters is chosen by the frame's likelihood.
+    fn is_ordering(&self) -> bool {
+        matches!(self.method, Method::MaximumLikelihood | Method::MaximumPosterior)
+    }
 }
 
 /// Every rung offered, cheapest first.
@@ -65,6 +74,11 @@ pub const LADDER: &[Rung] = &[
         name: "ml",
         summary: "maximum likelihood: pencil or greedy seeds, moves, the number of emitters by a false-alarm test",
         method: Method::MaximumLikelihood,
+    },
+    Rung {
+        name: "map",
+        summary: "the same, then the most probable hypothesis where users' power is known (`[estimator.known_power]`)",
+        method: Method::MaximumPosterior,
     },
 ];
 
@@ -135,10 +149,13 @@ pub fn build(config: &Config, camera: &Camera) -> Result<Box<dyn Estimator>, Con
             found: budget,
         });
     }
+    if let Some(known) = &config.known_power {
+        known.validate()?;
+    }
     let budget = config.budget_ms.map(|ms| Duration::from_secs_f64(ms * 1e-3));
     let estimator: Box<dyn Estimator> = match Learned::ALL.into_iter().find(|l| l.name() == name) {
         Some(learned) => Box::new(LearnedEstimator::new(learned, config.network.as_deref(), camera)?),
-        None => Box::new(Analytic::new(rung(name)?, camera, budget)),
+        None => Box::new(Analytic::new(rung(name)?, camera, budget, config.known_power.as_ref())),
     };
     Ok(match &camera.pixels {
         Some(maps) => Box::new(Corrected::new(estimator, maps.clone(), camera.saturation_j)),
@@ -158,10 +175,11 @@ struct Analytic {
     search: Search,
     reading: Reading,
     weighing: Weighing,
+    prior: Option<Prior>,
 }
 
 impl Analytic {
-    fn new(rung: &'static Rung, camera: &Camera, budget: Option<Duration>) -> Self {
+    fn new(rung: &'static Rung, camera: &Camera, budget: Option<Duration>, known: Option<&KnownPower>) -> Self {
         let sigma = camera.spot_sigma_m;
         let [bx, by] = [&camera.x, &camera.y].map(|axis| Basis::new(axis, sigma));
         let window = |b: &Basis| (2.0 * REACH / b.pitch()).min(b.n as f64);
@@ -184,6 +202,9 @@ impl Analytic {
             search,
             reading: Reading::default(),
             weighing: Weighing::new(camera),
+            prior: known
+                .filter(|_| rung.method == Method::MaximumPosterior)
+                .map(|k| Prior::new(k, camera)),
         }
     }
 
@@ -191,7 +212,7 @@ impl Analytic {
     fn inspect(&mut self) -> f64 {
         let Self { search, reading, .. } = self;
         let (bx, by) = (&search.fitter.bx, &search.fitter.by);
-        if self.rung.method != Method::MaximumLikelihood {
+        if !self.rung.is_ordering() {
             reading.load(&self.frame, bx, by);
             return 1.0;
         }
@@ -240,7 +261,7 @@ impl Estimator for Analytic {
         let scale = self.inspect();
         self.search.restart(deadline);
         self.weighing.search.restart(deadline);
-        let is_ml = self.rung.method == Method::MaximumLikelihood;
+        let is_ml = self.rung.is_ordering();
         let look = if is_ml { self.first_look() } else { None };
         let Self { search, reading, .. } = self;
         let mut model = match self.rung.method {
@@ -251,7 +272,9 @@ impl Estimator for Analytic {
                 model
             }
             Method::Pencil { steps } => search.start(reading, &self.frame, Nuisances::default(), steps),
-            Method::MaximumLikelihood => search.maximum_likelihood(reading, &self.frame, look),
+            Method::MaximumLikelihood | Method::MaximumPosterior => {
+                search.maximum_likelihood(reading, &self.frame, look)
+            }
         };
         let is_exhausted = search.is_exhausted();
         let known = search
@@ -266,6 +289,13 @@ impl Estimator for Analytic {
             (search, &*reading)
         };
         let noise_j = scale * self.camera.noise_std_j;
+        if let Some(mut prior) = self.prior.take() {
+            prior.noise_j = noise_j;
+            prior.temper = reading.misfit(&model);
+            search.prior = Some(prior);
+            search.maximum_posterior(reading, &mut model);
+            self.prior = search.prior.take();
+        }
         let mut estimate = ground::locate(search, reading, &mut model, &self.frame, &self.camera, noise_j);
         estimate.rung = self.rung.name;
         if is_exhausted {
@@ -283,10 +313,10 @@ impl Search {
         let peaks = self
             .heatmap
             .peaks(&reading.z, reading.mx, reading.my, self.price.sqrt(), 1.0);
-        model.spots.extend(peaks.iter().map(|p| Spot {
-            u: if is_subpixel { p.u } else { p.grid },
-            a: p.a,
-        }));
+        let spots = peaks
+            .iter()
+            .map(|p| Spot::new(if is_subpixel { p.u } else { p.grid }, p.a));
+        model.spots.extend(spots);
         model
     }
 }

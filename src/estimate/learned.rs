@@ -91,10 +91,10 @@ impl Estimator for LearnedEstimator {
             // The energy of a lone spot with this brightest pixel.
             let share = psf::pixel_fraction(camera.x.edge(column), camera.x.edge(column + 1), x, sigma)
                 * psf::pixel_fraction(camera.y.edge(row), camera.y.edge(row + 1), y, sigma);
-            model.spots.push(Spot {
-                u: [x / sigma, y / sigma],
-                a: (self.frame.pixels[row * camera.x.n + column] / share).max(0.0),
-            });
+            model.spots.push(Spot::new(
+                [x / sigma, y / sigma],
+                (self.frame.pixels[row * camera.x.n + column] / share).max(0.0),
+            ));
         }
         if self.rung == Learned::Hybrid {
             search.fitter.fit(reading, &mut model, STEPS);

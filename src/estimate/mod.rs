@@ -1,6 +1,7 @@
 //! Floor 1: one frame → emitters with covariance. Uses `optics`, never `scene` (the simulator stays an
 //! independent judge) and never claims (an attacker writes those).
 
+mod amplitudes;
 mod atoms;
 mod basis;
 mod bound;
@@ -14,9 +15,12 @@ mod ladder;
 mod learned;
 mod linear;
 mod model;
+mod moves;
 mod network;
 mod noise;
 mod pencil;
+mod posterior;
+mod power;
 mod reading;
 mod screen;
 mod search;
@@ -29,6 +33,7 @@ pub use emitter::{Emitter, Estimate, Flags};
 pub use ladder::{ConfigError, DEFAULT, LADDER, Rung, build, rung};
 pub use learned::Learned;
 pub use network::NetworkError;
+pub use power::KnownPower;
 
 use crate::frame::Frame;
 

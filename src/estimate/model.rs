@@ -1,10 +1,20 @@
 //! A hypothesis about a frame: its emitters and what is fitted beside them.
 
+use super::power::Power;
+
 /// An emitter on the sensor: centre in σ, energy in units of the noise.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(super) struct Spot {
     pub u: [f64; 2],
     pub a: f64,
+    /// What is known of its energy where it is taken for a user's.
+    pub power: Option<Power>,
+}
+
+impl Spot {
+    pub fn new(u: [f64; 2], a: f64) -> Self {
+        Self { u, a, power: None }
+    }
 }
 
 /// What is fitted beside the emitters.
@@ -51,6 +61,8 @@ pub(super) struct Model {
     pub width: [f64; 2],
     /// Squared residual over the usable numbers, in units of the noise.
     pub deviance: f64,
+    /// What the number of emitters costs where known powers are weighed in.
+    pub occam: f64,
     pub converged: bool,
 }
 
@@ -62,11 +74,21 @@ impl Model {
             background: [0.0; 3],
             width: [1.0; 2],
             deviance: f64::INFINITY,
+            occam: 0.0,
             converged: false,
         }
+    }
+
+    /// Squared distances of the energies from what is known of them, in standard deviations.
+    pub fn pull(&self) -> f64 {
+        pull(&self.spots)
     }
 
     pub fn parameters(&self) -> usize {
         3 * self.spots.len() + self.nuisances.count()
     }
+}
+
+pub(super) fn pull(spots: &[Spot]) -> f64 {
+    spots.iter().filter_map(|s| Some(s.power?.pull(s.a))).sum()
 }

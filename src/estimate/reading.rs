@@ -167,6 +167,15 @@ impl Reading {
         model.deviance < self.mean_variance * freedom + self.lit_variance * spread
     }
 
+    /// How many times the expected deviance a model leaves; 1 where it explains the frame.
+    pub fn misfit(&self, model: &Model) -> f64 {
+        if self.is_explained(model) {
+            return 1.0;
+        }
+        let freedom = (self.numbers - model.parameters() as f64).max(1.0);
+        (model.deviance / (self.mean_variance * freedom)).max(1.0)
+    }
+
     /// Fills `out` (Ny, Nx) with what the basis holds of the frame, Uᵧ Z Uₓᵀ.
     pub fn expand(&self, bx: &Basis, by: &Basis, out: &mut Vec<f64>) {
         self.expand_matrix(&self.z, bx, by, out);

@@ -8,32 +8,28 @@ use super::heatmap::Heatmap;
 use super::model::{Model, Nuisances, Spot, Width};
 use super::noise::Growth;
 use super::pencil::{Pencil, Sampler};
+use super::power::Prior;
 use super::reading::Reading;
 use super::screen::Screened;
 
 /// Emitters a frame may hold at most.
-const MOST: usize = 80;
-/// Two greedy peaks of one round stand at least this far apart, σ.
-const SEPARATION: f64 = 2.5;
-/// Steps that a candidate may take before it is judged, and a chosen model before it is reported.
-const TRIAL_STEPS: usize = 30;
-const FINAL_STEPS: usize = 200;
+pub(super) const MOST: usize = 80;
+/// Steps that a candidate may take before it is judged.
+pub(super) const TRIAL_STEPS: usize = 30;
 /// Fewer steps than this are asked for by rungs that only polish seeds.
 const MINIMAL_POLISH: usize = 10;
 /// So many further emitters that explain a frame are not asked for another explanation.
 const FEW: usize = 2;
 /// Rounds of moves.
 const ROUNDS: usize = 8;
-/// Spots nearer than this, σ, may be one.
-const MERGE: f64 = 2.5;
-/// A split puts its halves this far to either side, σ.
-const SPLIT: f64 = 0.4;
 /// Emitters of this many prices' significance are beyond doubt, whatever the misfit around them.
 const GHOST: f64 = 100.0;
 /// Misfit counts as around an emitter within this many σ.
 const AROUND: f64 = 2.0;
+/// Emitters of a candidate may be this much cheaper, together, than those of the present hypothesis are on average.
+const CHEAPER: f64 = 30.0;
 /// Least drop of the deviance that a nuisance parameter must bring.
-const NUISANCE_PRICE: f64 = 5.0;
+pub(super) const NUISANCE_PRICE: f64 = 5.0;
 
 /// The search with its settings that follow from the camera.
 pub(super) struct Search {
@@ -47,7 +43,9 @@ pub(super) struct Search {
     pub factor: f64,
     /// How the noise seems to grow, where that explains a frame better than more emitters do.
     pub suspected: Option<Growth>,
-    residual: Vec<f64>,
+    /// What is known of powers, where that is to be weighed in.
+    pub prior: Option<Prior>,
+    pub(super) residual: Vec<f64>,
 }
 
 impl Search {
@@ -67,6 +65,7 @@ impl Search {
             price,
             factor: 1.0,
             suspected: None,
+            prior: None,
             residual: Vec::new(),
         }
     }
@@ -84,16 +83,26 @@ impl Search {
     }
 
     /// Deviance that `next` must get below to score better than `best`.
-    fn bar(&self, best: &Model, next: &Model) -> f64 {
-        self.score(best) - self.penalty(next)
+    pub(super) fn bar(&self, best: &Model, next: &Model) -> f64 {
+        let penalty = match &self.prior {
+            None => self.penalty(next),
+            // What emitters cost is known only once they are fitted: let them be cheaper than those there are.
+            Some(_) if best.spots.is_empty() => return f64::INFINITY,
+            Some(_) => best.occam * next.spots.len() as f64 / best.spots.len() as f64 - CHEAPER,
+        };
+        self.score(best) - penalty
     }
 
-    /// What is held against each other: −2 ln likelihood plus the price of the emitters and nuisances.
+    /// What is held against each other: −2 ln likelihood plus the price of the emitters and nuisances; with powers
+    /// weighed in, −2 ln of the posterior probability.
     pub fn score(&self, model: &Model) -> f64 {
-        model.deviance + self.penalty(model)
+        model.deviance + model.pull() + self.penalty(model)
     }
 
     fn penalty(&self, model: &Model) -> f64 {
+        if self.prior.is_some() {
+            return self.factor * model.occam;
+        }
         let nuisances = NUISANCE_PRICE * model.nuisances.count() as f64;
         self.factor * (self.price * model.spots.len() as f64 + nuisances)
     }
@@ -222,7 +231,7 @@ impl Search {
         let peaks = self.residual_peaks(reading, &mut model);
         let least = peaks.first().map_or(0.0, |p| 0.1 * p.significance);
         let spots = peaks.iter().take_while(|p| p.significance >= least).take(MOST);
-        model.spots = spots.map(|p| Spot { u: p.u, a: p.a }).collect();
+        model.spots = spots.map(|p| Spot::new(p.u, p.a)).collect();
         self.fitter.fit(reading, &mut model, TRIAL_STEPS);
         Some(model)
     }
@@ -279,7 +288,7 @@ impl Search {
             let peaks = self.residual_peaks(reading, &mut model);
             let least = peaks.first().map_or(0.0, |p| 0.1 * p.significance);
             let strong = peaks.iter().take_while(|p| p.significance >= least).take(room);
-            next.spots.extend(strong.map(|p| Spot { u: p.u, a: p.a }));
+            next.spots.extend(strong.map(|p| Spot::new(p.u, p.a)));
             if next.spots.len() == model.spots.len() {
                 break;
             }
@@ -356,7 +365,7 @@ impl Search {
             }
             let Some(seeds) = pencil.seeds(count) else { break };
             let mut model = Model::empty(nuisances);
-            model.spots.extend(seeds.into_iter().map(|u| Spot { u, a: 0.0 }));
+            model.spots.extend(seeds.into_iter().map(|u| Spot::new(u, 0.0)));
             self.fitter.fit(reading, &mut model, polish);
             if self.score(&model) < self.score(best) {
                 *best = model;
@@ -405,186 +414,5 @@ impl Search {
             .sum();
         let score = self.score(model) - model.deviance + cost + Growth::PRICE;
         (score < self.score(rival)).then_some(growth)
-    }
-
-    /// The number of emitters of least score: moves from `model` until none helps, then a fit to convergence.
-    pub fn refine(&mut self, reading: &Reading, model: &mut Model, rounds: usize) {
-        for _ in 0..rounds {
-            let before = self.score(model);
-            if !reading.is_explained(model) {
-                self.finish(reading, model);
-            }
-            self.grow(reading, model);
-            self.shrink(reading, model);
-            if before - self.score(model) < 0.1 || self.is_exhausted() {
-                break;
-            }
-        }
-        self.finish(reading, model);
-    }
-
-    fn finish(&mut self, reading: &Reading, model: &mut Model) {
-        if !model.converged {
-            self.fitter.fit(reading, model, FINAL_STEPS);
-        }
-    }
-
-    /// Tries `next` and keeps it where it is better.
-    fn consider(&mut self, reading: &Reading, model: &mut Model, mut next: Model) -> bool {
-        if next.spots.len() > MOST || self.is_exhausted() {
-            return false;
-        }
-        let bar = self.bar(model, &next);
-        self.fitter.fit_below(reading, &mut next, TRIAL_STEPS, bar);
-        let is_better = self.score(&next) < self.score(model) - 1e-6;
-        if is_better {
-            *model = next;
-        }
-        is_better
-    }
-
-    fn residual_peaks(&mut self, reading: &Reading, model: &mut Model) -> &[super::heatmap::Peak] {
-        self.residual.clear();
-        self.residual.extend_from_slice(self.fitter.residual_of(reading, model));
-        self.fitter.clean(reading, &mut self.residual);
-        let (mx, my) = (reading.mx, reading.my);
-        // A peak's share that other spots have absorbed comes back in the joint fit: look a little lower.
-        let threshold = 0.7 * (self.factor * self.price).sqrt();
-        self.heatmap.peaks(&self.residual, mx, my, threshold, SEPARATION)
-    }
-
-    /// Adds, splits and relocates.
-    fn grow(&mut self, reading: &Reading, model: &mut Model) {
-        let peaks: Vec<_> = self.residual_peaks(reading, model).iter().take(2).copied().collect();
-        for peak in &peaks {
-            let mut next = model.clone();
-            next.spots.push(Spot { u: peak.u, a: peak.a });
-            if self.consider(reading, model, next) {
-                break;
-            }
-        }
-        if reading.is_explained(model) {
-            return;
-        }
-        for (index, direction) in self.splits(reading, model).into_iter().take(3) {
-            let mut next = model.clone();
-            let spot = next.spots[index];
-            let half = |sign: f64| Spot {
-                u: [0, 1].map(|k| spot.u[k] + sign * SPLIT * direction[k]),
-                a: 0.5 * spot.a,
-            };
-            next.spots[index] = half(1.0);
-            next.spots.push(half(-1.0));
-            if self.consider(reading, model, next) {
-                return;
-            }
-        }
-        if reading.is_explained(model) {
-            return;
-        }
-        let Some(peak) = peaks.first() else { return };
-        let mut weakest: Vec<usize> = (0..model.spots.len()).collect();
-        weakest.sort_by(|&i, &j| model.spots[i].a.total_cmp(&model.spots[j].a));
-        for index in weakest.into_iter().take(3) {
-            let mut next = model.clone();
-            next.spots[index] = Spot { u: peak.u, a: peak.a };
-            if self.consider(reading, model, next) {
-                return;
-            }
-        }
-    }
-
-    /// Merges and drops.
-    pub fn shrink(&mut self, reading: &Reading, model: &mut Model) {
-        loop {
-            let n = model.spots.len();
-            let mut pairs: Vec<(f64, usize, usize)> = (0..n)
-                .flat_map(|i| (0..i).map(move |j| (i, j)))
-                .map(|(i, j)| {
-                    let d = [0, 1].map(|k| model.spots[i].u[k] - model.spots[j].u[k]);
-                    (d[0].hypot(d[1]), i, j)
-                })
-                .filter(|p| p.0 < MERGE)
-                .collect();
-            pairs.sort_by(|a, b| a.0.total_cmp(&b.0));
-            let mut has_shrunk = false;
-            for (_, i, j) in pairs.into_iter().take(3) {
-                let (p, q) = (model.spots[i], model.spots[j]);
-                if self.separation(reading, model, i, j) > 8.0 * self.factor * self.price {
-                    continue;
-                }
-                let mut next = model.clone();
-                let total = p.a + q.a;
-                next.spots[j] = Spot {
-                    u: [0, 1].map(|k| (p.a * p.u[k] + q.a * q.u[k]) / total),
-                    a: total,
-                };
-                next.spots.remove(i);
-                if self.consider(reading, model, next) {
-                    has_shrunk = true;
-                    break;
-                }
-            }
-            if !has_shrunk && n > 0 {
-                let significance = self.significance(reading, model);
-                let weakest = (0..n)
-                    .min_by(|&i, &j| significance[i].total_cmp(&significance[j]))
-                    .expect("not empty");
-                if significance[weakest] < 4.0 * self.factor * self.price {
-                    let mut next = model.clone();
-                    next.spots.remove(weakest);
-                    has_shrunk = self.consider(reading, model, next);
-                }
-            }
-            if !has_shrunk {
-                break;
-            }
-        }
-    }
-
-    /// Squared amplitude over its variance, for each spot (Wald's test).
-    fn significance(&mut self, reading: &Reading, model: &mut Model) -> Vec<f64> {
-        let (p, n) = (model.parameters(), model.spots.len());
-        self.fitter.information(reading, model);
-        let mut cov = Vec::new();
-        if !self.fitter.covariance(p, n, 1e-9, &mut cov) {
-            return vec![0.0; n];
-        }
-        (0..n)
-            .map(|i| model.spots[i].a.powi(2) / cov[(3 * i + 2) * p + 3 * i + 2].max(1e-300))
-            .collect()
-    }
-
-    /// Rise of the deviance, to second order, when spots i and j become one.
-    fn separation(&mut self, reading: &Reading, model: &mut Model, i: usize, j: usize) -> f64 {
-        let (p, n) = (model.parameters(), model.spots.len());
-        self.fitter.information(reading, model);
-        let mut cov = Vec::new();
-        if !self.fitter.covariance(p, n, 1e-9, &mut cov) {
-            return 0.0;
-        }
-        let at = |a: usize, r: usize, b: usize, c: usize| cov[(3 * a + r) * p + 3 * b + c];
-        let d = [0, 1].map(|k| model.spots[i].u[k] - model.spots[j].u[k]);
-        let s = [0, 1].map(|r| [0, 1].map(|c| at(i, r, i, c) + at(j, r, j, c) - at(i, r, j, c) - at(j, r, i, c)));
-        let det = s[0][0] * s[1][1] - s[0][1] * s[1][0];
-        (d[0] * d[0] * s[1][1] - 2.0 * d[0] * d[1] * s[0][1] + d[1] * d[1] * s[0][0]) / det.max(1e-300)
-    }
-
-    /// Spots whose residual is bent as that of two, with the direction they lie in; the most bent first.
-    fn splits(&mut self, reading: &Reading, model: &mut Model) -> Vec<(usize, [f64; 2])> {
-        let mut bent: Vec<(f64, usize, [f64; 2])> = self
-            .fitter
-            .curvatures(reading, model)
-            .into_iter()
-            .enumerate()
-            .filter_map(|(i, [xx, xy, yy])| {
-                let (mean, half) = (0.5 * (xx + yy), 0.5 * (xx - yy));
-                let largest = mean + half.hypot(xy);
-                let angle = 0.5 * xy.atan2(half);
-                (largest > 0.0).then(|| (largest, i, [angle.cos(), angle.sin()]))
-            })
-            .collect();
-        bent.sort_by(|a, b| b.0.total_cmp(&a.0));
-        bent.into_iter().map(|(_, i, d)| (i, d)).collect()
     }
 }

@@ -4,7 +4,7 @@ use rand_distr::{Distribution, Gamma, Normal};
 use serde::{Deserialize, Serialize};
 
 use super::Error;
-use crate::estimate::position_bound;
+use crate::estimate::{KnownPower, position_bound};
 use crate::frame::Frame;
 use crate::optics::{self, Camera, psf, radiometry};
 
@@ -90,6 +90,21 @@ impl Cell {
             cell: self.name(),
             source,
         })
+    }
+
+    /// What the network knows of its users here: the mean and scatter of `energy` straight below.
+    pub(super) fn known_power(&self, camera: &Camera) -> KnownPower {
+        // exp(−2r²/w²) over a pointing offset of σ_s an axis has mean 1/(1 + q) and mean square 1/(1 + 2q).
+        let q = 4.0 * (POINTING_STD_M / BEAM_RADIUS_M).powi(2);
+        let axial = radiometry::flat_aperture_fraction(camera.lens_radius_m, BEAM_RADIUS_M, 0.0);
+        let transmission = radiometry::path_transmission(ATTENUATION_PER_M, camera.altitude_m);
+        let square = FADING.iter().map(|shape| 1.0 + 1.0 / shape).product::<f64>() / (1.0 + 2.0 * q);
+        KnownPower {
+            energies_j: vec![POWER_W * COLLECTED * transmission * axial / (1.0 + q)],
+            relative_std: ((square * (1.0 + q).powi(2) - 1.0) / COHERENCE_TIMES as f64).sqrt(),
+            share: 0.95,
+            attenuation_per_m: ATTENUATION_PER_M,
+        }
     }
 
     /// Draws frames from the paper's scene.

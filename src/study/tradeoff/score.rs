@@ -46,11 +46,13 @@ pub struct Row {
 const TRIMMED_EXPONENTIAL: f64 = 0.842_329_8;
 
 pub(super) fn measure(cell: &Cell, rung: &Rung, scenes: &[Scene], seed: u64) -> Result<Row, Error> {
+    let camera = cell.camera()?;
     let config = estimate::Config {
         name: Some(rung.name.to_owned()),
+        known_power: Some(cell.known_power(&camera)),
         ..Default::default()
     };
-    let mut estimator = estimate::build(&config, &cell.camera()?)?;
+    let mut estimator = estimate::build(&config, &camera)?;
     let (mut squared, mut ratios, mut bounds, mut latencies) = (vec![], vec![], vec![], vec![]);
     let (mut total_ospa, mut missed, mut invented) = (0.0, 0, 0);
     let (mut right, mut clear, mut clear_right, mut resolvable) = (0, 0, 0, 0);

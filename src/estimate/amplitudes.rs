@@ -1,0 +1,112 @@
+//! The linear part of the joint fit: energies at given positions.
+
+use super::fit::Fitter;
+use super::linear::{cholesky, solve};
+use super::reading::Reading;
+
+/// Amplitudes stay above this many standard deviations of noise, so that a position keeps its gradient.
+const AMPLITUDE_FLOOR: f64 = 0.05;
+
+impl Fitter {
+    /// Least-squares amplitudes at the atoms' positions; those of spots are kept above a floor by an active set.
+    #[inline(always)]
+    pub(super) fn solve_amplitudes(&mut self, reading: &Reading, is_trial: bool) {
+        let atoms = if is_trial { &mut self.trial } else { &mut self.now };
+        let (mx, my) = (reading.mx, reading.my);
+        let n = atoms.spots.len();
+        let sources = atoms.sources();
+        if sources == 0 {
+            return;
+        }
+        self.small.resize(sources * sources, 0.0);
+        let gram = &mut self.small;
+        let rhs = &mut self.acceleration;
+        rhs.resize(sources.max(rhs.len()), 0.0);
+        for i in 0..sources {
+            for j in 0..=i {
+                gram[i * sources + j] = atoms.overlap(i, j, &reading.weights, &mut self.strip);
+            }
+            rhs[i] = atoms.project(i, reading.weighted(), &mut self.strip)[0];
+            if let Some(power) = atoms.spots.get(i).and_then(|s| s.power) {
+                gram[i * sources + i] += power.precision;
+                rhs[i] += power.precision * power.mean;
+            }
+        }
+        for bad in &reading.bad {
+            let (ux, uy) = (&self.bx.row(bad.x)[..mx], &self.by.row(bad.y)[..my]);
+            let values = &mut self.scratch;
+            values.resize(values.len().max(sources), 0.0);
+            for i in 0..sources {
+                let [x, y] = atoms.at(i, ux, uy);
+                values[i] = x[0] * y[0];
+                rhs[i] -= values[i] * bad.value;
+            }
+            for i in 0..sources {
+                for j in 0..=i {
+                    gram[i * sources + j] -= values[i] * values[j];
+                }
+            }
+        }
+        self.active.clear();
+        self.active.resize(sources, true);
+        let factor = &mut self.factor;
+        let solution = &mut self.bend;
+        solution.resize(sources.max(solution.len()), 0.0);
+        let floor = |i: usize| AMPLITUDE_FLOOR / gram[i * sources + i].max(1e-30).sqrt();
+        loop {
+            let mut order = 0;
+            factor.resize(factor.len().max(sources * sources), 0.0);
+            let size = self.active.iter().filter(|a| **a).count();
+            for i in (0..sources).filter(|&i| self.active[i]) {
+                let mut b = rhs[i];
+                for k in (0..sources).filter(|&k| !self.active[k]) {
+                    b -= gram[i.max(k) * sources + i.min(k)] * floor(k);
+                }
+                solution[order] = b;
+                for (column, j) in (0..=i).filter(|&j| self.active[j]).enumerate() {
+                    factor[order * size + column] = gram[i * sources + j];
+                }
+                factor[order * size + order] *= 1.0 + 1e-13;
+                order += 1;
+            }
+            if size > 0 {
+                let mut ridge = 1e-12;
+                while !cholesky(&mut factor[..size * size], size) {
+                    let mut row = 0;
+                    for i in (0..sources).filter(|&i| self.active[i]) {
+                        for (column, j) in (0..=i).filter(|&j| self.active[j]).enumerate() {
+                            factor[row * size + column] = gram[i * sources + j];
+                        }
+                        factor[row * size + row] = gram[i * sources + i].max(1e-30) * (1.0 + ridge);
+                        row += 1;
+                    }
+                    ridge *= 10.0;
+                }
+                solve(factor, size, solution);
+            }
+            let mut row = 0;
+            let mut clipped = false;
+            for i in 0..sources {
+                if !self.active[i] {
+                    if i < n {
+                        atoms.spots[i].a = floor(i);
+                    }
+                    continue;
+                }
+                let a = solution[row];
+                row += 1;
+                if i >= n {
+                    atoms.background[i - n] = a;
+                } else if a < floor(i) {
+                    self.active[i] = false;
+                    clipped = true;
+                } else {
+                    atoms.spots[i].a = a;
+                }
+            }
+            if !clipped {
+                break;
+            }
+        }
+    }
+}

@@ -1,0 +1,119 @@
+//! Maximum a posteriori: the number of emitters and their places by the evidence of the frame and of known powers.
+
+use super::model::{Model, Spot};
+use super::power::Prior;
+use super::reading::Reading;
+use super::search::{NUISANCE_PRICE, Search, TRIAL_STEPS};
+
+/// Rounds of moves.
+const ROUNDS: usize = 6;
+/// A spot is taken for a user's, to begin with, where its energy speaks against that no more than this.
+const LENIENCY: f64 = 60.0;
+/// A spot of this many times a known power may be two.
+const TWOFOLD: f64 = 1.4;
+/// Parts of a divided spot stand this far apart, σ.
+const SPACING: f64 = 0.8;
+/// Spots looked at in a round.
+const BRIGHTEST: usize = 4;
+
+impl Search {
+    /// From a model that explains the frame to the most probable one. `self.prior` must be set; does nothing without.
+    pub fn maximum_posterior(&mut self, reading: &Reading, model: &mut Model) {
+        if self.prior.is_none() {
+            return;
+        }
+        self.weigh_up(reading, model, f64::INFINITY, 0.0);
+        let known = model.clone();
+        self.attempt(reading, model, known);
+        for _ in 0..ROUNDS {
+            let before = self.score(model);
+            self.divide(reading, model);
+            self.shrink(reading, model);
+            self.grow(reading, model);
+            if before - self.score(model) < 0.1 || self.is_exhausted() {
+                break;
+            }
+        }
+        self.finish(reading, model);
+    }
+
+    /// Fits `model` under the prior, every spot labelled with `leniency` first and by its energy after, and sets what
+    /// its number of emitters costs.
+    pub(super) fn weigh_up(&mut self, reading: &Reading, model: &mut Model, bar: f64, leniency: f64) {
+        let Some(prior) = self.prior.take() else { return };
+        prior.label(model, leniency);
+        self.fitter.fit_below(reading, model, TRIAL_STEPS, bar);
+        if prior.label(model, 0.0) {
+            self.fitter.fit(reading, model, TRIAL_STEPS);
+        }
+        model.occam = self.occam(reading, model, &prior);
+        self.prior = Some(prior);
+    }
+
+    /// −2 ln of what integrating over positions and energies leaves of the likelihood's peak (Laplace; MacKay, 2003,
+    /// eq. 28.10) times the prior: even over the sensor in position, and blind to the emitters' order.
+    fn occam(&mut self, reading: &Reading, model: &mut Model, prior: &Prior) -> f64 {
+        let n = model.spots.len();
+        let (bx, by) = (&self.fitter.bx, &self.fitter.by);
+        let side = |b: &super::basis::Basis| b.highest() - b.lowest();
+        let area = side(bx) * side(by);
+        // A position is never known better by the Hessian than a spot and a pixel allow it to be unknown.
+        let least = |b: &super::basis::Basis| 1.0 / (0.25 + b.pitch() * b.pitch() / 12.0);
+        let floor = [least(bx), least(by)];
+        let p = model.parameters();
+        self.fitter.information(reading, model);
+        let log_det = self.fitter.log_det(p, 3 * n, floor).unwrap_or(f64::INFINITY);
+        let orders: f64 = (2..=n).map(|k| 2.0 * (k as f64).ln()).sum();
+        let volume = n as f64 * (2.0 * area.ln() - 3.0 * std::f64::consts::TAU.ln());
+        let nuisances = NUISANCE_PRICE * model.nuisances.count() as f64;
+        prior.temper * (log_det + volume - orders + nuisances) + prior.total_cost(model)
+    }
+
+    /// Tries `next` with every doubt about a spot's label in favour of a user.
+    pub(super) fn attempt(&mut self, reading: &Reading, model: &mut Model, mut next: Model) -> bool {
+        if self.is_exhausted() {
+            return false;
+        }
+        let bar = self.bar(model, &next);
+        self.weigh_up(reading, &mut next, bar, LENIENCY);
+        let is_better = self.score(&next) < self.score(model) - 1e-6;
+        if is_better {
+            *model = next;
+        }
+        is_better
+    }
+
+    /// Puts two or more emitters where one shows the light of several.
+    fn divide(&mut self, reading: &Reading, model: &mut Model) {
+        let Some(prior) = &self.prior else { return };
+        let mut bright: Vec<(f64, usize)> = model
+            .spots
+            .iter()
+            .enumerate()
+            .map(|(i, s)| (prior.multiple(s), i))
+            .filter(|(m, _)| *m > TWOFOLD)
+            .collect();
+        bright.sort_by(|p, q| q.0.total_cmp(&p.0));
+        if bright.is_empty() {
+            return;
+        }
+        let directions = self.splits(reading, model);
+        for (multiple, index) in bright.into_iter().take(BRIGHTEST) {
+            let spot = model.spots[index];
+            let along = directions.iter().find(|(i, _)| *i == index).map_or([1.0, 0.0], |d| d.1);
+            let parts = (multiple.round() as usize).clamp(2, 4);
+            for direction in [along, [-along[1], along[0]]] {
+                let mut next = model.clone();
+                next.spots.remove(index);
+                next.spots.extend((0..parts).map(|k| {
+                    let shift = SPACING * (k as f64 - 0.5 * (parts - 1) as f64);
+                    let u = [0, 1].map(|axis| spot.u[axis] + shift * direction[axis]);
+                    Spot::new(u, spot.a / parts as f64)
+                }));
+                if self.attempt(reading, model, next) {
+                    return;
+                }
+            }
+        }
+    }
+}
