@@ -105,25 +105,12 @@ impl Search {
     pub fn shrink(&mut self, reading: &Reading, model: &mut Model) {
         loop {
             let n = model.spots.len();
-            let mut pairs: Vec<(f64, usize, usize)> = (0..n)
-                .flat_map(|i| (0..i).map(move |j| (i, j)))
-                .map(|(i, j)| {
-                    let d = [0, 1].map(|k| model.spots[i].u[k] - model.spots[j].u[k]);
-                    (d[0].hypot(d[1]), i, j)
-                })
-                .filter(|p| p.0 < MERGE)
-                .collect();
-            pairs.sort_by(|a, b| a.0.total_cmp(&b.0));
             let mut has_shrunk = false;
-            for (_, i, j) in pairs.into_iter().take(3) {
-                let (p, q) = (model.spots[i], model.spots[j]);
+            for (_, i, j) in pairs(model, MERGE).into_iter().take(3) {
                 if self.separation(reading, model, i, j) > 8.0 * self.factor * self.price {
                     continue;
                 }
-                let mut next = model.clone();
-                let total = p.a + q.a;
-                next.spots[j] = Spot::new([0, 1].map(|k| (p.a * p.u[k] + q.a * q.u[k]) / total), total);
-                next.spots.remove(i);
+                let next = merged(model, i, j);
                 if self.consider(reading, model, next) {
                     has_shrunk = true;
                     break;
@@ -191,4 +178,29 @@ impl Search {
         bent.sort_by(|a, b| b.0.total_cmp(&a.0));
         bent.into_iter().map(|(_, i, d)| (i, d)).collect()
     }
+}
+
+/// Pairs of spots nearer than `limit`, σ, with their distance; the nearest first.
+pub(super) fn pairs(model: &Model, limit: f64) -> Vec<(f64, usize, usize)> {
+    let n = model.spots.len();
+    let mut pairs: Vec<(f64, usize, usize)> = (0..n)
+        .flat_map(|i| (0..i).map(move |j| (i, j)))
+        .map(|(i, j)| {
+            let d = [0, 1].map(|k| model.spots[i].u[k] - model.spots[j].u[k]);
+            (d[0].hypot(d[1]), i, j)
+        })
+        .filter(|p| p.0 < limit)
+        .collect();
+    pairs.sort_by(|a, b| a.0.total_cmp(&b.0));
+    pairs
+}
+
+/// `model` with spot j < i where the light of both is centred, and without i.
+pub(super) fn merged(model: &Model, i: usize, j: usize) -> Model {
+    let (p, q) = (model.spots[i], model.spots[j]);
+    let total = p.a + q.a;
+    let mut next = model.clone();
+    next.spots[j] = Spot::new([0, 1].map(|k| (p.a * p.u[k] + q.a * q.u[k]) / total), total);
+    next.spots.remove(i);
+    next
 }

@@ -1,6 +1,7 @@
 //! Maximum a posteriori: the number of emitters and their places by the evidence of the frame and of known powers.
 
 use super::model::{Model, Spot};
+use super::moves::{merged, pairs};
 use super::power::Prior;
 use super::reading::Reading;
 use super::search::{NUISANCE_PRICE, Search, TRIAL_STEPS};
@@ -13,8 +14,13 @@ const LENIENCY: f64 = 60.0;
 const TWOFOLD: f64 = 1.4;
 /// Parts of a divided spot stand this far apart, σ.
 const SPACING: f64 = 0.8;
-/// Spots looked at in a round.
-const BRIGHTEST: usize = 4;
+const MOST_PARTS: usize = 4;
+/// All the light may be this much more or less, in emitters, than that of as many users as there are spots.
+const SURPLUS: f64 = 0.4;
+/// Spots and pairs looked at in a round, and how near the two of a pair stand, σ.
+const BRIGHTEST: usize = 6;
+const PAIRS: usize = 6;
+const NEIGHBOURS: f64 = 4.0;
 
 impl Search {
     /// From a model that explains the frame to the most probable one. `self.prior` must be set; does nothing without.
@@ -28,6 +34,8 @@ impl Search {
         for _ in 0..ROUNDS {
             let before = self.score(model);
             self.divide(reading, model);
+            self.balance(reading, model);
+            self.unite(reading, model);
             self.shrink(reading, model);
             self.grow(reading, model);
             if before - self.score(model) < 0.1 || self.is_exhausted() {
@@ -83,37 +91,84 @@ impl Search {
         is_better
     }
 
-    /// Puts two or more emitters where one shows the light of several.
+    /// Emitters by which the light is more than that of as many users as there are spots.
+    fn surplus(&self, model: &Model) -> f64 {
+        let Some(prior) = &self.prior else { return 0.0 };
+        model.spots.iter().map(|s| prior.multiple(s) - 1.0).sum()
+    }
+
+    /// Puts two or more emitters where one shows the light of several, and where several show that of one more.
     fn divide(&mut self, reading: &Reading, model: &mut Model) {
         let Some(prior) = &self.prior else { return };
-        let mut bright: Vec<(f64, usize)> = model
-            .spots
-            .iter()
-            .enumerate()
-            .map(|(i, s)| (prior.multiple(s), i))
-            .filter(|(m, _)| *m > TWOFOLD)
-            .collect();
+        let mut bright: Vec<(f64, usize)> = model.spots.iter().map(|s| prior.multiple(s)).zip(0..).collect();
         bright.sort_by(|p, q| q.0.total_cmp(&p.0));
+        let least = if self.surplus(model) > SURPLUS { 0.0 } else { TWOFOLD };
+        bright.retain(|b| b.0 > least);
+        bright.truncate(BRIGHTEST);
         if bright.is_empty() {
             return;
         }
         let directions = self.splits(reading, model);
-        for (multiple, index) in bright.into_iter().take(BRIGHTEST) {
+        for (multiple, index) in bright {
             let spot = model.spots[index];
             let along = directions.iter().find(|(i, _)| *i == index).map_or([1.0, 0.0], |d| d.1);
-            let parts = (multiple.round() as usize).clamp(2, 4);
+            let parts = (multiple.round() as usize).max(2);
             for direction in [along, [-along[1], along[0]]] {
                 let mut next = model.clone();
                 next.spots.remove(index);
-                next.spots.extend((0..parts).map(|k| {
-                    let shift = SPACING * (k as f64 - 0.5 * (parts - 1) as f64);
-                    let u = [0, 1].map(|axis| spot.u[axis] + shift * direction[axis]);
-                    Spot::new(u, spot.a / parts as f64)
-                }));
+                next.spots.extend(divided(spot, parts, direction));
                 if self.attempt(reading, model, next) {
                     return;
                 }
             }
         }
     }
+
+    /// Shares the light of two spots evenly, among as many as it is of, where one of them shows no known power.
+    fn balance(&mut self, reading: &Reading, model: &mut Model) {
+        let Some(prior) = &self.prior else { return };
+        let is_odd = |p: &&(f64, usize, usize)| model.spots[p.1].power.is_none() || model.spots[p.2].power.is_none();
+        let near = pairs(model, NEIGHBOURS);
+        let odd: Vec<(usize, usize, f64)> = near
+            .iter()
+            .filter(is_odd)
+            .take(PAIRS)
+            .map(|&(_, i, j)| (i, j, prior.multiple(&merged(model, i, j).spots[j])))
+            .collect();
+        for (i, j, multiple) in odd {
+            let [p, q] = [i, j].map(|k| model.spots[k].u);
+            let d = [0, 1].map(|k| p[k] - q[k]);
+            let length = d[0].hypot(d[1]).max(1e-6);
+            let mut next = merged(model, i, j);
+            let spot = next.spots.remove(j);
+            let parts = (multiple.round() as usize).max(1);
+            next.spots.extend(divided(spot, parts, d.map(|v| v / length)));
+            if self.attempt(reading, model, next) {
+                return;
+            }
+        }
+    }
+
+    /// Makes one emitter of two where there are more spots than the light is of.
+    fn unite(&mut self, reading: &Reading, model: &mut Model) {
+        if self.surplus(model) > -SURPLUS {
+            return;
+        }
+        for (_, i, j) in pairs(model, NEIGHBOURS).into_iter().take(PAIRS) {
+            let next = merged(model, i, j);
+            if self.attempt(reading, model, next) {
+                return;
+            }
+        }
+    }
+}
+
+/// A spot's light in equal parts on a line.
+fn divided(spot: Spot, parts: usize, direction: [f64; 2]) -> impl Iterator<Item = Spot> {
+    let parts = parts.min(MOST_PARTS);
+    (0..parts).map(move |k| {
+        let shift = SPACING * (k as f64 - 0.5 * (parts - 1) as f64);
+        let u = [0, 1].map(|axis| spot.u[axis] + shift * direction[axis]);
+        Spot::new(u, spot.a / parts as f64)
+    })
 }

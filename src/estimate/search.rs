@@ -86,9 +86,9 @@ impl Search {
     pub(super) fn bar(&self, best: &Model, next: &Model) -> f64 {
         let penalty = match &self.prior {
             None => self.penalty(next),
-            // What emitters cost is known only once they are fitted: let them be cheaper than those there are.
+            // What emitters cost is known only once they are fitted: one more, of a known power, may cost less than none.
             Some(_) if best.spots.is_empty() => return f64::INFINITY,
-            Some(_) => best.occam * next.spots.len() as f64 / best.spots.len() as f64 - CHEAPER,
+            Some(_) => best.occam * (next.spots.len() as f64 / best.spots.len() as f64).min(1.0) - CHEAPER,
         };
         self.score(best) - penalty
     }
