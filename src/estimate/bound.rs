@@ -2,64 +2,48 @@
 
 use faer::{Mat, Side};
 
-use crate::optics::{Axis, Camera, psf};
+use crate::optics::psf::PixelResponse;
+use crate::optics::{Camera, psf};
+
+/// What is fitted, and what cannot be used, beside positions and energies.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Beside<'a> {
+    /// A width common to all spots.
+    pub width: bool,
+    /// A constant and two slopes.
+    pub background: bool,
+    /// Pixels (Ny × Nx, row-major) that tell nothing.
+    pub unusable: Option<&'a [bool]>,
+}
+
+const DARK: PixelResponse = PixelResponse {
+    fraction: 0.0,
+    d_centre: 0.0,
+    d_sigma: 0.0,
+};
 
 /// Bound on the squared error of each emitter's ground position, both axes summed, m², with all positions and energies
 /// unknown: the position blocks of (JᵀJ/σ_n²)⁻¹ (Kay, 1993, eq. 3.31). `positions` on the ground, m; `energies` J.
 /// Emitters that the frame cannot tell apart get a finite but enormous bound.
 pub fn position_bound(camera: &Camera, positions: &[[f64; 2]], energies: &[f64]) -> Vec<f64> {
+    position_bound_beside(camera, positions, energies, Beside::default())
+}
+
+/// [`position_bound`] where more is unknown than positions and energies, and where pixels are missing.
+pub fn position_bound_beside(camera: &Camera, positions: &[[f64; 2]], energies: &[f64], beside: Beside) -> Vec<f64> {
     let n = positions.len().min(energies.len());
+    let jacobian = jacobian(camera, &positions[..n], energies, beside);
+    let p = jacobian.ncols();
     let sigma = camera.spot_sigma_m;
-    let profile = |axis: &Axis, centre: f64| -> [Vec<f64>; 2] {
-        let density = |edge: f64| {
-            let t = (edge - centre) / sigma;
-            (-0.5 * t * t).exp() / (2.0 * std::f64::consts::PI).sqrt()
-        };
-        let mut value = vec![0.0; axis.n];
-        psf::profile(axis, centre, sigma, &mut value);
-        let slope = (0..axis.n)
-            .map(|k| density(axis.edge(k)) - density(axis.edge(k + 1)))
-            .collect();
-        [value, slope]
-    };
-    let atoms: Vec<_> = positions
-        .iter()
-        .map(|&p| {
-            let s = camera.to_sensor(p);
-            (profile(&camera.x, s[0]), profile(&camera.y, s[1]))
-        })
-        .collect();
-    let inner = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(x, y)| x * y).sum::<f64>();
-    // Which of x and y is differentiated, for each of (x, y, energy).
-    const DERIVATIVES: [[usize; 2]; 3] = [[1, 0], [0, 1], [0, 0]];
-    let mut information = Mat::<f64>::zeros(3 * n, 3 * n);
-    for i in 0..n {
-        for j in 0..n {
-            for (r, d) in DERIVATIVES.iter().enumerate() {
-                for (c, e) in DERIVATIVES.iter().enumerate() {
-                    let scale = |k: usize, spot: usize| {
-                        if k < 2 {
-                            energies[spot] / camera.noise_std_j
-                        } else {
-                            1.0
-                        }
-                    };
-                    information[(3 * i + r, 3 * j + c)] = scale(r, i)
-                        * scale(c, j)
-                        * inner(&atoms[i].0[d[0]], &atoms[j].0[e[0]])
-                        * inner(&atoms[i].1[d[1]], &atoms[j].1[e[1]]);
-                }
-            }
-        }
-    }
-    let scales: Vec<f64> = (0..3 * n).map(|k| information[(k, k)].max(1e-300).sqrt()).collect();
-    let scaled = Mat::from_fn(3 * n, 3 * n, |r, c| information[(r, c)] / (scales[r] * scales[c]));
+    let information = jacobian.transpose() * &jacobian;
+    let scales: Vec<f64> = (0..p).map(|k| information[(k, k)].max(1e-300).sqrt()).collect();
+    let scaled = Mat::from_fn(p, p, |r, c| information[(r, c)] / (scales[r] * scales[c]));
     let Ok(eigen) = scaled.self_adjoint_eigen(Side::Lower) else {
         return vec![f64::INFINITY; n];
     };
     let (u, values) = (eigen.U(), eigen.S());
     let variance = |k: usize| {
-        let sum: f64 = (0..3 * n).map(|m| u[(k, m)].powi(2) / values[m].max(1e-16)).sum();
+        let sum: f64 = (0..p).map(|m| u[(k, m)].powi(2) / values[m].max(1e-16)).sum();
         sum / scales[k].powi(2)
     };
     (0..n)
@@ -69,6 +53,48 @@ pub fn position_bound(camera: &Camera, positions: &[[f64; 2]], energies: &[f64])
             cov[0][0] + cov[1][1]
         })
         .collect()
+}
+
+/// Derivatives of every pixel over the noise, (pixels, parameters): x and y (in σ) and energy of each emitter, then what
+/// is fitted beside.
+fn jacobian(camera: &Camera, positions: &[[f64; 2]], energies: &[f64], beside: Beside) -> Mat<f64> {
+    let n = positions.len();
+    let sigma = camera.spot_sigma_m;
+    let width = usize::from(beside.width);
+    let background = if beside.background { 3 } else { 0 };
+    let mut jacobian = Mat::<f64>::zeros(camera.x.n * camera.y.n, 3 * n + width + background);
+    let (mut row, mut column) = (vec![DARK; camera.x.n], vec![DARK; camera.y.n]);
+    let is_usable = |pixel: usize| beside.unusable.is_none_or(|bad| !bad[pixel]);
+    for (i, &p) in positions.iter().enumerate() {
+        let [x, y] = camera.to_sensor(p);
+        psf::profile_response(&camera.x, x, sigma, &mut row);
+        psf::profile_response(&camera.y, y, sigma, &mut column);
+        let signal = energies[i] / camera.noise_std_j;
+        for (b, fy) in column.iter().enumerate() {
+            for (a, fx) in row.iter().enumerate() {
+                let pixel = b * camera.x.n + a;
+                if !is_usable(pixel) {
+                    continue;
+                }
+                jacobian[(pixel, 3 * i)] = signal * sigma * fx.d_centre * fy.fraction;
+                jacobian[(pixel, 3 * i + 1)] = signal * sigma * fx.fraction * fy.d_centre;
+                jacobian[(pixel, 3 * i + 2)] = fx.fraction * fy.fraction;
+                if beside.width {
+                    let broadening = fx.d_sigma * fy.fraction + fx.fraction * fy.d_sigma;
+                    jacobian[(pixel, 3 * n)] += signal * sigma * broadening;
+                }
+            }
+        }
+    }
+    if beside.background {
+        for pixel in (0..jacobian.nrows()).filter(|&k| is_usable(k)) {
+            let (a, b) = (pixel % camera.x.n, pixel / camera.x.n);
+            jacobian[(pixel, 3 * n + width)] = 1.0;
+            jacobian[(pixel, 3 * n + width + 1)] = camera.x.centre(a) / camera.x.half_width();
+            jacobian[(pixel, 3 * n + width + 2)] = camera.y.centre(b) / camera.y.half_width();
+        }
+    }
+    jacobian
 }
 
 #[cfg(test)]

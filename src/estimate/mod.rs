@@ -27,7 +27,7 @@ mod search;
 mod spot;
 mod weigh;
 
-pub use bound::position_bound;
+pub use bound::{Beside, position_bound, position_bound_beside};
 pub use config::Config;
 pub use emitter::{Emitter, Estimate, Flags};
 pub use ladder::{ConfigError, DEFAULT, LADDER, Rung, build, rung};

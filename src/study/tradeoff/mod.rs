@@ -1,5 +1,6 @@
 //! What accuracy costs in time: every rung of the ladder on the same frames, against the Cramér–Rao bound.
 
+mod condition;
 mod picture;
 mod report;
 mod scene;
@@ -11,6 +12,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::estimate::{LADDER, Rung};
 
+pub use condition::Condition;
 pub use scene::{Cell, Noise};
 pub use score::Row;
 
@@ -71,6 +73,14 @@ impl Plan {
         }
         for emitters in [1, 5, 9, 20, 40] {
             cells.push(Cell::new(Noise::Energy, 1.0, 100).holding(emitters));
+        }
+        for condition in Condition::ALL {
+            let cells_of = [
+                Cell::new(Noise::Energy, 2.0, 64),
+                Cell::new(Noise::Energy, 4.0, 20),
+                Cell::new(Noise::Paper, 8.0, 60),
+            ];
+            cells.extend(cells_of.map(|c| c.under(condition)));
         }
         Self {
             cells,

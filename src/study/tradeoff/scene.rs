@@ -3,8 +3,8 @@ use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, Gamma, Normal};
 use serde::{Deserialize, Serialize};
 
-use super::Error;
-use crate::estimate::{KnownPower, position_bound};
+use super::{Condition, Error};
+use crate::estimate::KnownPower;
 use crate::frame::Frame;
 use crate::optics::{self, Camera, psf, radiometry};
 
@@ -27,6 +27,9 @@ pub struct Cell {
     pub pixels: usize,
     /// Emitters a frame; 5 to 9 when left out.
     pub emitters: Option<usize>,
+    /// What the estimator is not told of.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub condition: Option<Condition>,
 }
 
 /// A frame with its truth.
@@ -54,6 +57,7 @@ impl Cell {
             sigma_mm,
             pixels,
             emitters: None,
+            condition: None,
         }
     }
 
@@ -65,16 +69,26 @@ impl Cell {
         }
     }
 
+    /// The same cell under a condition that the estimator is not told of.
+    pub fn under(self, condition: Condition) -> Self {
+        Self {
+            condition: Some(condition),
+            ..self
+        }
+    }
+
     /// Short name: reading, σ_eff in mm, pixels a side, and emitters where fixed.
     pub fn name(&self) -> String {
         let reading = match self.noise {
             Noise::Energy => 'E',
             Noise::Paper => 'P',
         };
-        let emitters = self.emitters.map_or(String::new(), |n| format!(", N = {n}"));
-        format!("{reading}{}/{}{emitters}", self.sigma_mm, self.pixels)
+        let emitters = self.emitters.map_or(String::new(), |n| format!(" N={n}"));
+        let condition = self.condition.map_or(String::new(), |c| format!(" {}", c.name()));
+        format!("{reading}{}/{}{emitters}{condition}", self.sigma_mm, self.pixels)
     }
 
+    /// The camera as the estimator knows it.
     pub fn camera(&self) -> Result<Camera, Error> {
         let sigma = 1e-3 * self.sigma_mm;
         let config = optics::Config {
@@ -86,10 +100,15 @@ impl Cell {
             },
             ..Default::default()
         };
-        config.camera().map_err(|source| Error::Optics {
+        let mut camera = config.camera().map_err(|source| Error::Optics {
             cell: self.name(),
             source,
-        })
+        })?;
+        if let Some(condition) = self.condition {
+            let energy_j = self.known_power(&camera).energies_j[0];
+            condition.configured(&mut camera, energy_j);
+        }
+        Ok(camera)
     }
 
     /// What the network knows of its users here: the mean and scatter of `energy` straight below.
@@ -128,15 +147,17 @@ impl Cell {
         let energies: Vec<f64> = positions.iter().map(|&p| energy(camera, p, rng)).collect();
         let noise = Normal::new(0.0, camera.noise_std_j).expect("a camera's noise is positive and finite");
         let mut pixels = ndarray::Array2::from_shape_simple_fn(camera.shape(), || noise.sample(rng));
+        let truth = Condition::lens(self.condition, camera);
         let (mut row, mut column) = (vec![0.0; camera.x.n], vec![0.0; camera.y.n]);
         for (&p, &e) in positions.iter().zip(&energies) {
-            let [x, y] = camera.to_sensor(p);
-            psf::profile(&camera.x, x, camera.spot_sigma_m, &mut row);
-            psf::profile(&camera.y, y, camera.spot_sigma_m, &mut column);
+            let [x, y] = truth.to_sensor(p);
+            psf::profile(&camera.x, x, truth.spot_sigma_m, &mut row);
+            psf::profile(&camera.y, y, truth.spot_sigma_m, &mut column);
             for ((b, a), pixel) in pixels.indexed_iter_mut() {
                 *pixel += e * column[b] * row[a];
             }
         }
+        let bound_m2 = Condition::apply(self.condition, &truth, &mut pixels, &positions, &energies, rng);
         Scene {
             frame: Frame {
                 index,
@@ -144,7 +165,7 @@ impl Cell {
                 pixels,
                 masked: None,
             },
-            bound_m2: position_bound(camera, &positions, &energies),
+            bound_m2,
             positions,
         }
     }

@@ -1,0 +1,119 @@
+//! What may be wrong with a camera without the estimator being told, and the bound that then holds.
+
+use ndarray::Array2;
+use rand::RngExt;
+use rand_chacha::ChaCha8Rng;
+use serde::{Deserialize, Serialize};
+
+use crate::estimate::{Beside, position_bound_beside};
+use crate::optics::{Axis, Camera, psf};
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Condition {
+    /// Spots 5 % wider than configured.
+    Width,
+    /// Even light, a fifth of a typical peak.
+    Background,
+    /// 12 bits up to twice a typical peak.
+    Quantised,
+    /// Clipped at six tenths of a typical peak; the level is configured.
+    Saturated,
+    /// One pixel in a hundred reads nothing.
+    Dead,
+}
+
+const WIDER: f64 = 1.05;
+const LIGHT: f64 = 0.2;
+const LEVELS: f64 = 4095.0;
+const HEADROOM: f64 = 2.0;
+const CLIP: f64 = 0.6;
+const DEAD: f64 = 0.01;
+
+impl Condition {
+    pub const ALL: [Self; 5] = [
+        Self::Width,
+        Self::Background,
+        Self::Quantised,
+        Self::Saturated,
+        Self::Dead,
+    ];
+
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Width => "width+5%",
+            Self::Background => "background",
+            Self::Quantised => "12-bit",
+            Self::Saturated => "saturated",
+            Self::Dead => "dead",
+        }
+    }
+
+    /// The camera as it is configured under the condition. `energy_j`: typical of an emitter.
+    pub(super) fn configured(self, camera: &mut Camera, energy_j: f64) {
+        if self == Self::Saturated {
+            camera.saturation_j = Some(CLIP * typical_peak(camera, energy_j));
+        }
+    }
+
+    /// The camera that frames are made with.
+    pub(super) fn lens(condition: Option<Self>, camera: &Camera) -> Camera {
+        let mut truth = camera.clone();
+        if condition == Some(Self::Width) {
+            truth.spot_sigma_m *= WIDER;
+        }
+        truth
+    }
+
+    /// Does to a frame what the condition does; returns each emitter's bound, m², with what is to be estimated under it.
+    pub(super) fn apply(
+        condition: Option<Self>,
+        truth: &Camera,
+        pixels: &mut Array2<f64>,
+        positions: &[[f64; 2]],
+        energies: &[f64],
+        rng: &mut ChaCha8Rng,
+    ) -> Vec<f64> {
+        let mean = energies.iter().sum::<f64>() / energies.len().max(1) as f64;
+        let peak = typical_peak(truth, mean);
+        let mut camera = truth.clone();
+        let mut beside = Beside::default();
+        let mut unusable = vec![false; pixels.len()];
+        match condition {
+            None => {}
+            Some(Self::Width) => beside.width = true,
+            Some(Self::Background) => {
+                beside.background = true;
+                *pixels += LIGHT * peak;
+            }
+            Some(Self::Quantised) => {
+                let step = HEADROOM * peak / LEVELS;
+                pixels.mapv_inplace(|p| (p / step).round() * step);
+                camera.noise_std_j = (camera.noise_std_j.powi(2) + step * step / 12.0).sqrt();
+            }
+            Some(Self::Saturated) => {
+                let level = truth.saturation_j.unwrap_or(f64::INFINITY);
+                for (pixel, bad) in pixels.iter_mut().zip(&mut unusable) {
+                    *bad = *pixel >= level;
+                    *pixel = pixel.min(level);
+                }
+            }
+            Some(Self::Dead) => {
+                for (pixel, bad) in pixels.iter_mut().zip(&mut unusable) {
+                    if rng.random_bool(DEAD) {
+                        (*pixel, *bad) = (0.0, true);
+                    }
+                }
+            }
+        }
+        beside.unusable = Some(&unusable);
+        position_bound_beside(&camera, positions, energies, beside)
+    }
+}
+
+/// The brightest pixel of a spot of that energy in the mean light of as many others as a frame typically holds.
+fn typical_peak(camera: &Camera, energy_j: f64) -> f64 {
+    const OTHERS: f64 = 6.0;
+    let half = |axis: &Axis| psf::pixel_fraction(-0.5 * axis.pitch_m, 0.5 * axis.pitch_m, 0.0, camera.spot_sigma_m);
+    energy_j * (half(&camera.x) * half(&camera.y) + OTHERS / (camera.x.n * camera.y.n) as f64)
+}
