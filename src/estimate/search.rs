@@ -16,12 +16,15 @@ use super::screen::Screened;
 pub(super) const MOST: usize = 80;
 /// Steps that a candidate may take before it is judged.
 pub(super) const TRIAL_STEPS: usize = 30;
-/// Fewer steps than this are asked for by rungs that only polish seeds.
-const MINIMAL_POLISH: usize = 10;
 /// So many further emitters that explain a frame are not asked for another explanation.
 const FEW: usize = 2;
-/// Rounds of moves.
+/// Rounds of moves, and of those before another explanation than more emitters is tried.
 const ROUNDS: usize = 8;
+const EARLY_ROUNDS: usize = 3;
+/// Overlapping spots whose energies differ by more than this factor may be none.
+const UNLIKE: f64 = 4.0;
+/// A misfit of this many standard deviations is worth another start.
+const FAR: f64 = 5.0;
 /// Emitters of this many prices' significance are beyond doubt, whatever the misfit around them.
 const GHOST: f64 = 100.0;
 /// Misfit counts as around an emitter within this many σ.
@@ -119,14 +122,18 @@ impl Search {
         if self.suspected.is_some() {
             return model;
         }
+        if !reading.is_explained(&model) && !self.is_odd(&model) {
+            self.refine(reading, &mut model, EARLY_ROUNDS);
+        }
         // A background has singular values of its own: what the first start explained with it may hold ghosts.
-        if !reading.is_explained(&model) || model.nuisances != plain {
-            for width in [Width::Known, Width::Common, Width::PerAxis] {
+        let is_far = reading.misfit(&model) > 1.0 + FAR * (2.0 / reading.numbers).sqrt();
+        if is_far || model.nuisances != plain || self.is_odd(&model) {
+            for width in [Width::Common, Width::Known, Width::PerAxis] {
                 let nuisances = Nuisances {
                     background: true,
                     width,
                 };
-                let is_settled = reading.is_explained(&model) && width != Width::Known;
+                let is_settled = reading.is_explained(&model) && width != Width::Common;
                 if is_settled || nuisances == plain || self.is_exhausted() {
                     continue;
                 }
@@ -144,6 +151,16 @@ impl Search {
         }
         self.finish(reading, &mut model);
         model
+    }
+
+    /// Whether overlapping spots are so unlike in energy that a background or another width may have been taken for some.
+    fn is_odd(&self, model: &Model) -> bool {
+        let energies = model.spots.iter().map(|s| s.a);
+        let [least, most] = [
+            energies.clone().fold(f64::INFINITY, f64::min),
+            energies.fold(0.0, f64::max),
+        ];
+        self.sampler.is_some() && most > UNLIKE * least
     }
 
     /// Drops emitters that the misfit around them explains as well: where gain scatter or a wrong spot leaves a residual
@@ -326,25 +343,19 @@ impl Search {
         let last = (likely + 2).min(pencil.most()).min(MOST);
         let mut best = Model::empty(nuisances);
         self.fitter.fit(reading, &mut best, TRIAL_STEPS);
+        // A background and another width have singular values of their own.
+        let first = match nuisances == Nuisances::default() {
+            true => sure,
+            false => sure / 3,
+        };
         self.climb(
             reading,
             &pencil,
             &mut best,
             nuisances,
-            sure.max(1)..=last.min(sure + 3),
+            first.max(1)..=last.min(sure.max(first + 3) + 3),
             polish,
         );
-        if polish > MINIMAL_POLISH && !reading.is_explained(&best) && nuisances == Nuisances::default() {
-            let wide = Nuisances {
-                background: true,
-                width: Width::Common,
-            };
-            let first = sure.saturating_sub(6).max(1);
-            self.climb(reading, &pencil, &mut best, wide, first..=last, polish);
-            if !reading.is_explained(&best) {
-                self.climb(reading, &pencil, &mut best, nuisances, sure + 4..=last, polish);
-            }
-        }
         Some(best)
     }
 
