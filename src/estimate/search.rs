@@ -17,12 +17,12 @@ pub(super) const MOST: usize = 80;
 /// Steps that a candidate may take before it is judged.
 pub(super) const TRIAL_STEPS: usize = 30;
 /// So many further emitters that explain a frame are not asked for another explanation.
-const FEW: usize = 2;
+const FEW: usize = 1;
 /// Rounds of moves, and of those before another explanation than more emitters is tried.
 const ROUNDS: usize = 8;
 const EARLY_ROUNDS: usize = 3;
 /// Overlapping spots whose energies differ by more than this factor may be none.
-const UNLIKE: f64 = 4.0;
+const UNLIKE: f64 = 3.0;
 /// A misfit of this many standard deviations is worth another start.
 const FAR: f64 = 5.0;
 /// Emitters of this many prices' significance are beyond doubt, whatever the misfit around them.
@@ -122,8 +122,12 @@ impl Search {
         if self.suspected.is_some() {
             return model;
         }
+        let first = model.clone();
         if !reading.is_explained(&model) && !self.is_odd(&model) {
             self.refine(reading, &mut model, EARLY_ROUNDS);
+        }
+        if model.spots.len() > first.spots.len() + FEW {
+            model = first;
         }
         // A background has singular values of its own: what the first start explained with it may hold ghosts.
         let is_far = reading.misfit(&model) > 1.0 + FAR * (2.0 / reading.numbers).sqrt();
