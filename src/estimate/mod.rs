@@ -18,6 +18,7 @@ mod model;
 mod moves;
 mod network;
 mod noise;
+mod otherwise;
 mod pencil;
 mod posterior;
 mod power;

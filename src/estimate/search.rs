@@ -18,17 +18,13 @@ pub(super) const MOST: usize = 80;
 pub(super) const TRIAL_STEPS: usize = 30;
 /// So many further emitters that explain a frame are not asked for another explanation.
 const FEW: usize = 1;
+/// Steps that the pencil's seeds are polished by.
+const POLISH: usize = 100;
 /// Rounds of moves, and of those before another explanation than more emitters is tried.
-const ROUNDS: usize = 8;
-const EARLY_ROUNDS: usize = 3;
-/// Overlapping spots whose energies differ by more than this factor may be none.
-const UNLIKE: f64 = 3.0;
+pub(super) const ROUNDS: usize = 8;
+pub(super) const EARLY_ROUNDS: usize = 3;
 /// A misfit of this many standard deviations is worth another start.
 const FAR: f64 = 5.0;
-/// Emitters of this many prices' significance are beyond doubt, whatever the misfit around them.
-const GHOST: f64 = 100.0;
-/// Misfit counts as around an emitter within this many σ.
-const AROUND: f64 = 2.0;
 /// Emitters of a candidate may be this much cheaper, together, than those of the present hypothesis are on average.
 const CHEAPER: f64 = 30.0;
 /// Least drop of the deviance that a nuisance parameter must bring.
@@ -39,7 +35,7 @@ pub(super) struct Search {
     pub fitter: Fitter,
     pub heatmap: Heatmap,
     /// Where spots are wide enough against the sensor for the pencil.
-    sampler: Option<Sampler>,
+    pub(super) sampler: Option<Sampler>,
     /// Least drop of the deviance that an emitter must bring.
     pub price: f64,
     /// What the noise of the frame's light multiplies prices by.
@@ -117,7 +113,7 @@ impl Search {
         let plain = look.as_ref().map_or(Nuisances::default(), |l| l.nuisances);
         let mut model = match look {
             Some(look) => self.greedy(reading, frame, look),
-            None => self.start(reading, frame, plain, 60),
+            None => self.start(reading, frame, plain, POLISH),
         };
         if self.suspected.is_some() {
             return model;
@@ -132,20 +128,7 @@ impl Search {
         // A background has singular values of its own: what the first start explained with it may hold ghosts.
         let is_far = reading.misfit(&model) > 1.0 + FAR * (2.0 / reading.numbers).sqrt();
         if is_far || model.nuisances != plain || self.is_odd(&model) {
-            for width in [Width::Common, Width::Known, Width::PerAxis] {
-                let nuisances = Nuisances {
-                    background: true,
-                    width,
-                };
-                let is_settled = reading.is_explained(&model) && width != Width::Common;
-                if is_settled || nuisances == plain || self.is_exhausted() {
-                    continue;
-                }
-                let next = self.start(reading, frame, nuisances, 60);
-                if self.score(&next) < self.score(&model) {
-                    model = next;
-                }
-            }
+            self.explain_otherwise(reading, frame, &mut model);
         }
         self.fitter.reserve(0.3);
         self.refine(reading, &mut model, ROUNDS);
@@ -155,88 +138,6 @@ impl Search {
         }
         self.finish(reading, &mut model);
         model
-    }
-
-    /// Whether overlapping spots are so unlike in energy that a background or another width may have been taken for some.
-    fn is_odd(&self, model: &Model) -> bool {
-        let energies = model.spots.iter().map(|s| s.a);
-        let [least, most] = [
-            energies.clone().fold(f64::INFINITY, f64::min),
-            energies.fold(0.0, f64::max),
-        ];
-        self.sampler.is_some() && most > UNLIKE * least
-    }
-
-    /// Drops emitters that the misfit around them explains as well: where gain scatter or a wrong spot leaves a residual
-    /// that grows with the light, an emitter must stand out of that residual and not of the noise alone.
-    fn lay_ghosts(&mut self, reading: &Reading, frame: &Screened, model: &mut Model) {
-        let mut image = Vec::new();
-        loop {
-            let significance = self.significance(reading, model);
-            let mut order: Vec<usize> = (0..model.spots.len()).collect();
-            order.sort_by(|&i, &j| significance[i].total_cmp(&significance[j]));
-            let mut has_dropped = false;
-            for index in order.into_iter().take_while(|&i| significance[i] < GHOST * self.price) {
-                let spot = model.spots[index];
-                let mut next = model.clone();
-                next.spots.remove(index);
-                self.fitter.fit(reading, &mut next, TRIAL_STEPS);
-                let residual = self.fitter.residual_of(reading, &mut next).to_vec();
-                let (bx, by) = (&self.fitter.bx, &self.fitter.by);
-                reading.expand_matrix(&residual, bx, by, &mut image);
-                let (mut sum, mut count) = (0.0, 0.0);
-                for (k, r) in image.iter().enumerate().filter(|(k, _)| !frame.is_bad[*k]) {
-                    let x = bx.edges[k % bx.n] + 0.5 * bx.pitch() - spot.u[0];
-                    let y = by.edges[k / bx.n] + 0.5 * by.pitch() - spot.u[1];
-                    if x * x + y * y < AROUND * AROUND {
-                        sum += r * r;
-                        count += 1.0;
-                    }
-                }
-                let share = reading.numbers / image.len() as f64;
-                let around = if count > 0.0 {
-                    (sum / count / share).max(1.0)
-                } else {
-                    1.0
-                };
-                if next.deviance - model.deviance < self.price * around {
-                    *model = next;
-                    has_dropped = true;
-                    break;
-                }
-            }
-            if !has_dropped {
-                return;
-            }
-        }
-    }
-
-    /// `model` with those further nuisances that explain the frame best, if any do.
-    fn widened(&mut self, reading: &Reading, model: &Model) -> Option<Model> {
-        if model.spots.is_empty() {
-            return None;
-        }
-        let mut best: Option<Model> = None;
-        for width in [Width::Known, Width::Common, Width::PerAxis] {
-            let nuisances = Nuisances {
-                background: true,
-                width,
-            };
-            if nuisances.count() <= model.nuisances.count() {
-                continue;
-            }
-            let mut next = best.clone().unwrap_or_else(|| model.clone());
-            next.nuisances = nuisances;
-            self.fitter.fit(reading, &mut next, TRIAL_STEPS);
-            if self.score(&next) < best.as_ref().map_or(self.score(model), |b| self.score(b)) {
-                let is_explained = reading.is_explained(&next);
-                best = Some(next);
-                if is_explained {
-                    break;
-                }
-            }
-        }
-        best
     }
 
     /// The emitters that stand out at once, with a background where the frame looks lit: enough to tell what in the
@@ -255,50 +156,6 @@ impl Search {
         model.spots = spots.map(|p| Spot::new(p.u, p.a)).collect();
         self.fitter.fit(reading, &mut model, TRIAL_STEPS);
         Some(model)
-    }
-
-    /// Whether the frame's dark parts are clearly lighter or darker than the noise allows. Only for spots that leave parts
-    /// dark; a fainter background shows in what the emitters leave.
-    fn looks_lit(&self, frame: &Screened) -> bool {
-        if self.sampler.is_some() {
-            return false;
-        }
-        let (mut usable, mut low) = (0.0, 0.0);
-        for (p, _) in frame.pixels.iter().zip(&frame.is_bad).filter(|(_, bad)| !**bad) {
-            usable += 1.0;
-            low += f64::from(u8::from(*p < -1.0));
-        }
-        // The share of standard normal noise below −1.
-        let expected: f64 = 0.1587 * usable;
-        low < 0.25 * expected - 5.0 || low > expected + 5.0 * expected.sqrt()
-    }
-
-    /// Takes out nuisances that the frame can do without.
-    fn simplify(&mut self, reading: &Reading, model: &mut Model) {
-        let simpler = [
-            Nuisances {
-                background: model.nuisances.background,
-                width: Width::Known,
-            },
-            Nuisances {
-                background: false,
-                width: model.nuisances.width,
-            },
-            Nuisances::default(),
-        ];
-        for nuisances in simpler {
-            if nuisances.count() < model.nuisances.count() {
-                let mut next = model.clone();
-                next.nuisances = nuisances;
-                if nuisances.width == Width::Known {
-                    next.width = [1.0; 2];
-                }
-                if !nuisances.background {
-                    next.background = [0.0; 3];
-                }
-                self.consider(reading, model, next);
-            }
-        }
     }
 
     /// Adds peaks of the residual to `model` until none is significant, refitting all emitters each time.
@@ -348,16 +205,14 @@ impl Search {
         let mut best = Model::empty(nuisances);
         self.fitter.fit(reading, &mut best, TRIAL_STEPS);
         // A background and another width have singular values of their own.
-        let first = match nuisances == Nuisances::default() {
-            true => sure,
-            false => sure / 3,
-        };
+        let is_plain = nuisances == Nuisances::default();
+        let (first, beyond) = if is_plain { (sure, 1) } else { (sure / 3, 3) };
         self.climb(
             reading,
             &pencil,
             &mut best,
             nuisances,
-            first.max(1)..=last.min(sure.max(first + 3) + 3),
+            first.max(1)..=last.min(sure.max(3) + beyond),
             polish,
         );
         Some(best)
@@ -373,9 +228,10 @@ impl Search {
         counts: std::ops::RangeInclusive<usize>,
         polish: usize,
     ) {
+        let patience = if nuisances == Nuisances::default() { 1 } else { 3 };
         let mut worse = 0;
         for count in counts {
-            if reading.is_explained(best) || worse == 3 || self.is_exhausted() {
+            if reading.is_explained(best) || worse == patience || self.is_exhausted() {
                 break;
             }
             let Some(seeds) = pencil.seeds(count) else { break };

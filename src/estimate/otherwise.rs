@@ -1,0 +1,188 @@
+//! What a frame may show instead of more emitters: a background, another width, noise that grows with the light.
+
+use super::model::{Model, Nuisances, Width};
+use super::reading::Reading;
+use super::screen::Screened;
+use super::search::{EARLY_ROUNDS, ROUNDS, Search, TRIAL_STEPS};
+
+/// Overlapping spots whose energies differ by more than this factor may be none.
+const UNLIKE: f64 = 3.0;
+/// Emitters of this many prices' significance are beyond doubt, whatever the misfit around them.
+const GHOST: f64 = 100.0;
+/// Misfit counts as around an emitter within this many σ.
+const AROUND: f64 = 2.0;
+/// Steps that the pencil's seeds are polished by where more is fitted beside.
+const LONG_POLISH: usize = 150;
+
+impl Search {
+    /// Takes another explanation of the frame than more emitters: a background, another width, or both, where one scores
+    /// better than `model`.
+    pub(super) fn explain_otherwise(&mut self, reading: &Reading, frame: &Screened, model: &mut Model) {
+        let lit = Nuisances {
+            background: true,
+            width: Width::Known,
+        };
+        let wide = Nuisances {
+            width: Width::Common,
+            ..lit
+        };
+        // A background has singular values of its own, which the pencil would take for emitters.
+        let grown = if self.sampler.is_some() {
+            let mut grown = Model::empty(lit);
+            self.fitter.fit(reading, &mut grown, TRIAL_STEPS);
+            self.refine(reading, &mut grown, ROUNDS);
+            grown
+        } else {
+            self.start(reading, frame, lit, LONG_POLISH)
+        };
+        self.take_better(model, grown);
+        if reading.is_explained(model) && !self.is_odd(model) {
+            let mut next = model.clone();
+            next.nuisances = wide;
+            self.fitter.fit(reading, &mut next, TRIAL_STEPS);
+            self.refine(reading, &mut next, EARLY_ROUNDS);
+            self.take_better(model, next);
+        }
+        if !reading.is_explained(model) || self.is_odd(model) {
+            let next = self.start(reading, frame, wide, LONG_POLISH);
+            self.take_better(model, next);
+        }
+        if !reading.is_explained(model)
+            && let Some(wider) = self.widened(reading, model)
+        {
+            *model = wider;
+        }
+    }
+
+    fn take_better(&self, model: &mut Model, next: Model) {
+        if self.score(&next) < self.score(model) {
+            *model = next;
+        }
+    }
+
+    /// `model` with those further nuisances that explain the frame best, if any do.
+    pub(super) fn widened(&mut self, reading: &Reading, model: &Model) -> Option<Model> {
+        if model.spots.is_empty() {
+            return None;
+        }
+        let mut best: Option<Model> = None;
+        for width in [Width::Known, Width::Common, Width::PerAxis] {
+            let nuisances = Nuisances {
+                background: true,
+                width,
+            };
+            if nuisances.count() <= model.nuisances.count() {
+                continue;
+            }
+            let mut next = best.clone().unwrap_or_else(|| model.clone());
+            next.nuisances = nuisances;
+            self.fitter.fit(reading, &mut next, TRIAL_STEPS);
+            if self.score(&next) < best.as_ref().map_or(self.score(model), |b| self.score(b)) {
+                let is_explained = reading.is_explained(&next);
+                best = Some(next);
+                if is_explained {
+                    break;
+                }
+            }
+        }
+        best
+    }
+
+    /// Takes out nuisances that the frame can do without.
+    pub(super) fn simplify(&mut self, reading: &Reading, model: &mut Model) {
+        let simpler = [
+            Nuisances {
+                background: model.nuisances.background,
+                width: Width::Known,
+            },
+            Nuisances {
+                background: false,
+                width: model.nuisances.width,
+            },
+            Nuisances::default(),
+        ];
+        for nuisances in simpler {
+            if nuisances.count() < model.nuisances.count() {
+                let mut next = model.clone();
+                next.nuisances = nuisances;
+                if nuisances.width == Width::Known {
+                    next.width = [1.0; 2];
+                }
+                if !nuisances.background {
+                    next.background = [0.0; 3];
+                }
+                self.consider(reading, model, next);
+            }
+        }
+    }
+
+    /// Whether overlapping spots are so unlike in energy that a background or another width may have been taken for some.
+    pub(super) fn is_odd(&self, model: &Model) -> bool {
+        let energies = model.spots.iter().map(|s| s.a);
+        let [least, most] = [
+            energies.clone().fold(f64::INFINITY, f64::min),
+            energies.fold(0.0, f64::max),
+        ];
+        self.sampler.is_some() && most > UNLIKE * least
+    }
+
+    /// Whether the frame's dark parts are clearly lighter or darker than the noise allows. Only for spots that leave parts
+    /// dark; a fainter background shows in what the emitters leave.
+    pub(super) fn looks_lit(&self, frame: &Screened) -> bool {
+        if self.sampler.is_some() {
+            return false;
+        }
+        let (mut usable, mut low) = (0.0, 0.0);
+        for (p, _) in frame.pixels.iter().zip(&frame.is_bad).filter(|(_, bad)| !**bad) {
+            usable += 1.0;
+            low += f64::from(u8::from(*p < -1.0));
+        }
+        // The share of standard normal noise below −1.
+        let expected: f64 = 0.1587 * usable;
+        low < 0.25 * expected - 5.0 || low > expected + 5.0 * expected.sqrt()
+    }
+
+    /// Drops emitters that the misfit around them explains as well: where gain scatter or a wrong spot leaves a residual
+    /// that grows with the light, an emitter must stand out of that residual and not of the noise alone.
+    pub(super) fn lay_ghosts(&mut self, reading: &Reading, frame: &Screened, model: &mut Model) {
+        let mut image = Vec::new();
+        loop {
+            let significance = self.significance(reading, model);
+            let mut order: Vec<usize> = (0..model.spots.len()).collect();
+            order.sort_by(|&i, &j| significance[i].total_cmp(&significance[j]));
+            let mut has_dropped = false;
+            for index in order.into_iter().take_while(|&i| significance[i] < GHOST * self.price) {
+                let spot = model.spots[index];
+                let mut next = model.clone();
+                next.spots.remove(index);
+                self.fitter.fit(reading, &mut next, TRIAL_STEPS);
+                let residual = self.fitter.residual_of(reading, &mut next).to_vec();
+                let (bx, by) = (&self.fitter.bx, &self.fitter.by);
+                reading.expand_matrix(&residual, bx, by, &mut image);
+                let (mut sum, mut count) = (0.0, 0.0);
+                for (k, r) in image.iter().enumerate().filter(|(k, _)| !frame.is_bad[*k]) {
+                    let x = bx.edges[k % bx.n] + 0.5 * bx.pitch() - spot.u[0];
+                    let y = by.edges[k / bx.n] + 0.5 * by.pitch() - spot.u[1];
+                    if x * x + y * y < AROUND * AROUND {
+                        sum += r * r;
+                        count += 1.0;
+                    }
+                }
+                let share = reading.numbers / image.len() as f64;
+                let around = if count > 0.0 {
+                    (sum / count / share).max(1.0)
+                } else {
+                    1.0
+                };
+                if next.deviance - model.deviance < self.price * around {
+                    *model = next;
+                    has_dropped = true;
+                    break;
+                }
+            }
+            if !has_dropped {
+                return;
+            }
+        }
+    }
+}
