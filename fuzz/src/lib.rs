@@ -1,16 +1,7 @@
-//! What the targets share: readers that take a path get the fuzzer's bytes as a file in memory.
+//! What is fuzzed. The bodies stand here, so that the main suite can run them on the seeds (`tests/fuzz`).
 
-use std::path::{Path, PathBuf};
-use std::sync::LazyLock;
-
-static FILE: LazyLock<PathBuf> = LazyLock::new(|| {
-    let memory = Path::new("/dev/shm");
-    let folder = if memory.is_dir() { memory.to_owned() } else { std::env::temp_dir() };
-    folder.join(format!("oapwatch-fuzz-{}", std::process::id()))
-});
-
-/// Runs `target` on a file that holds `bytes`.
-pub fn with_file(bytes: &[u8], target: impl FnOnce(&Path)) {
-    std::fs::write(&*FILE, bytes).expect("a place to write to");
-    target(&FILE);
-}
+#[path = "../../tests/api/fake.rs"]
+#[allow(dead_code, reason = "the API's own tests use more of it")]
+pub mod fake;
+pub mod http;
+pub mod targets;

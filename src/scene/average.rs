@@ -157,14 +157,12 @@ fn fading_nodes(alpha: f64, captured: &[(f64, f64)]) -> Option<Vec<(f64, f64)>> 
     // ln of the density of ln a, its peak at 0 taken off.
     let ln_density = |u: f64| alpha * (u - f64::exp_m1(u));
     let step = (0.6 / alpha.sqrt()).min(0.25);
-    let mut low = 0.0;
-    while ln_density(low) > -38.0 {
-        low -= step;
-    }
-    let mut high = 0.0;
-    while ln_density(high) > -38.0 {
-        high += step;
-    }
+    // The first place on either side where the density is nothing; for an absurd α there is none within reach.
+    let end = |step: f64| {
+        let mut places = (0..MOST_NODES).map(|k| k as f64 * step);
+        places.find(|u| ln_density(*u) <= -38.0)
+    };
+    let (low, high) = (end(-step)?, end(step)?);
     let logs: Vec<(f64, f64)> = captured
         .iter()
         .filter(|(_, h)| *h > 0.0)
