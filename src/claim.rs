@@ -2,13 +2,14 @@
 
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
+use utoipa::openapi::schema::{KnownFormat, ObjectBuilder, OneOfBuilder, Schema, SchemaFormat, Type};
 
 /// One line of the network's log.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct Claim {
-    #[schema(value_type = String, format = DateTime)]
+    #[schema(schema_with = time_schema)]
     pub time: Timestamp,
-    #[schema(min_length = 1, max_length = 256, pattern = r"^[^\x00-\x1f\x7f-\x9f]+$")]
+    #[schema(schema_with = user_schema)]
     pub user: String,
     #[schema(minimum = -1e7, maximum = 1e7)]
     pub x_m: f64,
@@ -19,6 +20,7 @@ pub struct Claim {
     #[schema(minimum = 0)]
     pub sigma_m: Option<f64>,
     #[serde(default)]
+    #[schema(nullable)]
     pub state: ClaimState,
 }
 
@@ -29,4 +31,31 @@ pub enum ClaimState {
     #[default]
     Active,
     Ended,
+}
+
+/// Logs have numbers for times and for names too.
+fn time_schema() -> Schema {
+    let text = ObjectBuilder::new()
+        .schema_type(Type::String)
+        .format(Some(SchemaFormat::KnownFormat(KnownFormat::DateTime)));
+    let seconds = number().description(Some("Seconds since 1970")).minimum(Some(0.0));
+    let either = OneOfBuilder::new()
+        .item(text)
+        .item(seconds.exclusive_maximum(Some(1e11)))
+        .build();
+    Schema::OneOf(either)
+}
+
+fn user_schema() -> Schema {
+    let text = ObjectBuilder::new()
+        .schema_type(Type::String)
+        .min_length(Some(1))
+        .max_length(Some(256))
+        .pattern(Some(r"^[^\x00-\x1f\x7f-\x9f]+$"));
+    let either = OneOfBuilder::new().item(text).item(number()).build();
+    Schema::OneOf(either)
+}
+
+fn number() -> ObjectBuilder {
+    ObjectBuilder::new().schema_type(Type::Number)
 }

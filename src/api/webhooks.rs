@@ -93,6 +93,12 @@ pub async fn replay(
     Path(name): Path<String>,
     Query(query): Query<ReplayQuery>,
 ) -> Result<Response, Problem> {
+    if let Some(seq) = query.seq.filter(|seq| i64::try_from(*seq).is_err()) {
+        return Err(Problem::new(
+            StatusCode::BAD_REQUEST,
+            format!("seq: expected the number of a dead letter, found {seq}"),
+        ));
+    }
     let queued = notifier(&state, &name)?.replay(&name, query.seq).await?;
     Ok(respond::json(&Replayed { queued }))
 }

@@ -131,10 +131,11 @@ fn user(name: &str, value: &Value) -> Result<String, LineError> {
 
 fn time(name: &str, value: &Value, offset_s: f64) -> Result<Timestamp, LineError> {
     let stamp = match value {
-        Value::String(s) => s.parse::<Timestamp>().ok(),
+        // RFC 3339 knows four digits of a year.
+        Value::String(s) if s.starts_with(|c: char| c.is_ascii_digit()) => s.parse::<Timestamp>().ok(),
         Value::Number(n) => n
             .as_f64()
-            .filter(|s| s.abs() < 1e11)
+            .filter(|s| (0.0..1e11).contains(s))
             .and_then(|s| Timestamp::from_nanosecond((s * 1e9).round() as i128).ok()),
         _ => None,
     };

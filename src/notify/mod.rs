@@ -15,6 +15,7 @@ mod status;
 mod worker;
 
 use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Duration;
 
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -28,6 +29,10 @@ pub use clock::Clock;
 pub use config::Config;
 pub use endpoint::{Endpoint, Error, load};
 pub use status::{EndpointState, EndpointStatus};
+
+/// How long a request of the operator waits for a busy disk, and in which steps.
+const PATIENCE: Duration = Duration::from_secs(3);
+const STEP: Duration = Duration::from_millis(100);
 
 /// Why a request of the operator cannot be met.
 #[derive(Debug, thiserror::Error)]
@@ -98,8 +103,14 @@ impl Notifier {
     /// events of their alert that were sent meanwhile: the order is then the operator's.
     pub async fn replay(&self, endpoint: &str, seq: Option<u64>) -> Result<u64, AskError> {
         let endpoint = self.index(endpoint)?;
-        if !self.journal.health().writable {
-            return Err(AskError::ReadOnly);
+        // A disk that is only busy is back within a moment.
+        let mut waited = Duration::ZERO;
+        while !self.journal.health().writable {
+            if waited >= PATIENCE {
+                return Err(AskError::ReadOnly);
+            }
+            tokio::time::sleep(STEP).await;
+            waited += STEP;
         }
         self.ask(|done| Command::Replay { endpoint, seq, done }).await
     }
