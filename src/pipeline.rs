@@ -26,6 +26,7 @@ pub enum Error {
 /// Owns everything that one frame after another goes through.
 pub struct Pipeline {
     estimator: Box<dyn Estimator>,
+    saturation_j: f64,
     pub claims: Store,
     pub monitor: Monitor,
 }
@@ -54,6 +55,7 @@ impl Pipeline {
         };
         Ok(Self {
             estimator: estimate::build(&config.estimator, camera)?,
+            saturation_j: camera.saturation_j.unwrap_or(f64::INFINITY),
             claims: Store::new(&config.claims),
             monitor: Monitor::new(&config.monitor, &config.claims, camera, source),
         })
@@ -74,7 +76,10 @@ impl Pipeline {
     pub fn step(&mut self, frame: &Frame) -> Step {
         let began = Instant::now();
         let digest = frame.digest();
-        let estimate = self.estimator.estimate(frame);
+        let estimate = match self.blinding_share(frame) {
+            Some(share) => Ok(self.blinded(share)),
+            None => self.estimator.estimate(frame),
+        };
         let estimated = Instant::now();
         let observation = Observation {
             frame: frame.index,
@@ -88,6 +93,23 @@ impl Pipeline {
             estimate,
             estimation: estimated - began,
             verdicts: estimated.elapsed(),
+        }
+    }
+
+    /// Share of the frame's pixels that are saturated, where it is too large for the frame to show anything. Whoever dazzles the
+    /// sensor must not buy time with frames that take long to make sense of.
+    fn blinding_share(&self, frame: &Frame) -> Option<f64> {
+        let saturated = frame.pixels.iter().filter(|p| **p >= self.saturation_j).count();
+        let share = saturated as f64 / frame.pixels.len().max(1) as f64;
+        (share >= monitor::BLINDING_SHARE).then_some(share)
+    }
+
+    fn blinded(&self, saturated_share: f64) -> Estimate {
+        Estimate {
+            emitters: Vec::new(),
+            rung: self.estimator.name(),
+            reduced_chi2: f64::NAN,
+            saturated_share,
         }
     }
 

@@ -20,5 +20,6 @@ mod watch;
 pub use alert::{Alert, AlertEvent, AlertEventKind, AlertKind, AlertSource, AlertState, Severity};
 pub use config::{Config, ConfigError};
 pub use report::{Observation, PositionStatus, Report, TrackedPosition, UserPosition};
+pub use sight::BLINDING_SHARE;
 pub use source::Source;
 pub use watch::Monitor;

@@ -89,3 +89,15 @@ fn a_log_that_stops_is_stale_and_hides_no_intruder() {
     });
     review(&story).expect(&[(ClaimsStale, None, 12.0, 15.0), (UnclaimedEmitter, None, 25.0, 26.0)]);
 }
+
+/// A lamp over half of the array: the alert is there in a second, and no frame takes long to say nothing.
+#[test]
+fn a_lamp_on_the_lens_is_a_lost_sensor_at_once() {
+    let mut story = Story::file(1, "config/scenes/blinding.toml");
+    story.seconds = 14.0;
+    let began = std::time::Instant::now();
+    let told = review(&story);
+    // Forty dazzled frames that were fitted took half a minute and more.
+    assert!(began.elapsed().as_secs() < 20, "{:?}", began.elapsed());
+    told.expect(&[(SensorLost, None, 10.9, 11.2)]);
+}

@@ -1,92 +1,12 @@
 //! The daemon as an operator meets it: a process, an address, signals.
 
-use std::io::{BufRead, BufReader};
-use std::net::TcpListener;
-use std::path::Path;
-use std::process::{Child, Command, Stdio};
+mod over_http;
+mod process;
+
+use std::process::Command;
 use std::time::{Duration, Instant};
 
-use serde_json::Value;
-
-/// A running `oapwatch run` on a free port; killed when dropped.
-struct Daemon {
-    child: Child,
-    url: String,
-}
-
-impl Daemon {
-    fn start(dir: &Path, config: &str) -> Self {
-        let port = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
-        let file = dir.join("oapwatch.toml");
-        std::fs::write(&file, config).unwrap();
-        let child = Command::new(env!("CARGO_BIN_EXE_oapwatch"))
-            .args(["run", "--config"])
-            .arg(&file)
-            .args(["--listen", &format!("127.0.0.1:{port}")])
-            .stderr(Stdio::piped())
-            .spawn()
-            .unwrap();
-        let url = format!("http://127.0.0.1:{port}");
-        Self { child, url }
-    }
-
-    /// Asks until `accept` takes the answer; fails after 20 s.
-    fn wait_for(&self, path: &str, what: &str, accept: impl Fn(&Value) -> bool) -> Value {
-        let end = Instant::now() + Duration::from_secs(20);
-        let mut last = String::new();
-        while Instant::now() < end {
-            if let Some(body) = get(&self.url, path) {
-                match serde_json::from_str(&body) {
-                    Ok(value) if accept(&value) => return value,
-                    _ => last = body,
-                }
-            }
-            std::thread::sleep(Duration::from_millis(50));
-        }
-        panic!("no {what} within 20 s; {path} last said {last}");
-    }
-
-    fn signal(&self, name: &str) {
-        let status = Command::new("kill").args([name, &self.child.id().to_string()]).status();
-        assert!(status.unwrap().success());
-    }
-
-    /// Waits for the end; gives the exit code and the log.
-    fn end(mut self) -> (Option<i32>, Vec<String>) {
-        let stderr = BufReader::new(self.child.stderr.take().unwrap());
-        let log = stderr.lines().map_while(Result::ok).collect();
-        (self.child.wait().unwrap().code(), log)
-    }
-}
-
-impl Drop for Daemon {
-    fn drop(&mut self) {
-        let _ = self.child.kill();
-        let _ = self.child.wait();
-    }
-}
-
-fn get(url: &str, path: &str) -> Option<String> {
-    use std::io::{Read, Write};
-    let address = url.strip_prefix("http://").unwrap();
-    let mut stream = std::net::TcpStream::connect(address).ok()?;
-    stream.set_read_timeout(Some(Duration::from_secs(5))).ok()?;
-    write!(
-        stream,
-        "GET {path} HTTP/1.0\r\nHost: {address}\r\nConnection: close\r\n\r\n"
-    )
-    .ok()?;
-    let mut answer = String::new();
-    stream.read_to_string(&mut answer).ok()?;
-    let (head, body) = answer.split_once("\r\n\r\n")?;
-    head.starts_with("HTTP/1.0 200")
-        .then(|| body.to_owned())
-        .or_else(|| head.starts_with("HTTP/1.1 200").then(|| body.to_owned()))
-}
-
-fn alerts(value: &Value) -> &[Value] {
-    value["alerts"].as_array().map_or(&[], Vec::as_slice)
-}
+use process::{Daemon, alerts};
 
 #[test]
 fn on_the_simulator_users_are_verified_and_the_eavesdropper_is_alerted() {
@@ -132,7 +52,7 @@ fn an_alert_survives_kill_9() {
     assert_eq!(code, None);
     let second = Daemon::start(dir.path(), config);
     let after = second.wait_for("/v1/alerts", "alert of the first run", |v| !alerts(v).is_empty());
-    let ids = |v: &Value| {
+    let ids = |v: &serde_json::Value| {
         alerts(v)
             .iter()
             .map(|a| a["id"].as_str().unwrap().to_owned())

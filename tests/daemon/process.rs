@@ -1,0 +1,96 @@
+//! A daemon of a test's own.
+
+use std::io::{BufRead, BufReader, Read, Write};
+use std::net::{TcpListener, TcpStream};
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
+use std::time::{Duration, Instant};
+
+use serde_json::Value;
+
+/// A running `oapwatch run` on a free port; killed when dropped.
+pub struct Daemon {
+    child: Child,
+    url: String,
+}
+
+impl Daemon {
+    pub fn start(dir: &Path, config: &str) -> Self {
+        let port = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+        let file = dir.join("oapwatch.toml");
+        std::fs::write(&file, config).unwrap();
+        let child = Command::new(env!("CARGO_BIN_EXE_oapwatch"))
+            .args(["run", "--config"])
+            .arg(&file)
+            .args(["--listen", &format!("127.0.0.1:{port}")])
+            .stderr(Stdio::piped())
+            .spawn()
+            .unwrap();
+        let url = format!("http://127.0.0.1:{port}");
+        Self { child, url }
+    }
+
+    /// Asks until `accept` takes the answer; fails after 20 s.
+    pub fn wait_for(&self, path: &str, what: &str, accept: impl Fn(&Value) -> bool) -> Value {
+        let end = Instant::now() + Duration::from_secs(20);
+        let mut last = String::new();
+        while Instant::now() < end {
+            if let Some((200, body)) = request(&self.url, "GET", path, "") {
+                match serde_json::from_str(&body) {
+                    Ok(value) if accept(&value) => return value,
+                    _ => last = body,
+                }
+            }
+            std::thread::sleep(Duration::from_millis(50));
+        }
+        panic!("no {what} within 20 s; {path} last said {last}");
+    }
+
+    pub fn get(&self, path: &str) -> (u16, String) {
+        request(&self.url, "GET", path, "").expect("an answer")
+    }
+
+    pub fn post(&self, path: &str, body: &str) -> (u16, String) {
+        request(&self.url, "POST", path, body).expect("an answer")
+    }
+
+    pub fn signal(&self, name: &str) {
+        let status = Command::new("kill").args([name, &self.child.id().to_string()]).status();
+        assert!(status.unwrap().success());
+    }
+
+    /// Waits for the end; gives the exit code and the log.
+    pub fn end(mut self) -> (Option<i32>, Vec<String>) {
+        let stderr = BufReader::new(self.child.stderr.take().unwrap());
+        let log = stderr.lines().map_while(Result::ok).collect();
+        (self.child.wait().unwrap().code(), log)
+    }
+}
+
+impl Drop for Daemon {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+/// Status and body of an answer.
+fn request(url: &str, method: &str, path: &str, body: &str) -> Option<(u16, String)> {
+    let address = url.strip_prefix("http://")?;
+    let mut stream = TcpStream::connect(address).ok()?;
+    stream.set_read_timeout(Some(Duration::from_secs(10))).ok()?;
+    let length = body.len();
+    write!(
+        stream,
+        "{method} {path} HTTP/1.0\r\nHost: {address}\r\nContent-Length: {length}\r\nConnection: close\r\n\r\n{body}"
+    )
+    .ok()?;
+    let mut answer = String::new();
+    stream.read_to_string(&mut answer).ok()?;
+    let (head, body) = answer.split_once("\r\n\r\n")?;
+    Some((head.split(' ').nth(1)?.parse().ok()?, body.to_owned()))
+}
+
+pub fn alerts(value: &Value) -> &[Value] {
+    value["alerts"].as_array().map_or(&[], Vec::as_slice)
+}
