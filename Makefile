@@ -1,6 +1,7 @@
 # `make run` and `make test` install what they need and say so.
 SHELL := /bin/bash
 SUDO := $(if $(filter 0,$(shell id -u)),,sudo)
+comma := ,
 # install PACKAGE-IF-MISSING: $(call need,test command,packages)
 need = @$(1) >/dev/null 2>&1 || { echo "Installing $(2) (Debian packages)"; $(SUDO) apt-get update -qq && $(SUDO) env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends $(2) >/dev/null; }
 
@@ -25,6 +26,10 @@ setup:
 
 setup-test:
 	$(call need,command -v chromium,chromium chromium-driver)
+	$(call need,python3 -c 'import ensurepip$(comma) venv',python3-venv)
+	@cmp -s tests/schemathesis/requirements.txt target/schemathesis/installed.txt || { echo "Installing schemathesis"; \
+		python3 -m venv --clear target/schemathesis && target/schemathesis/bin/pip install --quiet --requirement tests/schemathesis/requirements.txt \
+		&& cp tests/schemathesis/requirements.txt target/schemathesis/installed.txt; }
 	@command -v cargo-deny >/dev/null || { echo "Installing cargo-deny"; cargo install --locked --quiet cargo-deny; }
 
 .PHONY: test-licences

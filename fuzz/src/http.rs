@@ -40,7 +40,7 @@ pub fn http(bytes: &[u8]) {
         String::from_utf8_lossy(&answer)
     );
     static REQUESTS: AtomicU64 = AtomicU64::new(0);
-    if REQUESTS.fetch_add(1, Ordering::Relaxed) % 64 == 0 {
+    if REQUESTS.fetch_add(1, Ordering::Relaxed).is_multiple_of(64) {
         let health = exchange(
             fake,
             b"GET /healthz HTTP/1.1\r\nhost: localhost\r\nconnection: close\r\n\r\n",

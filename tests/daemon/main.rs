@@ -3,10 +3,12 @@
 mod over_http;
 mod process;
 
+use std::path::Path;
 use std::process::Command;
 use std::time::{Duration, Instant};
 
 use process::{Daemon, alerts};
+use serde_json::Value;
 
 #[test]
 fn on_the_simulator_users_are_verified_and_the_eavesdropper_is_alerted() {
@@ -52,7 +54,7 @@ fn an_alert_survives_kill_9() {
     assert_eq!(code, None);
     let second = Daemon::start(dir.path(), config);
     let after = second.wait_for("/v1/alerts", "alert of the first run", |v| !alerts(v).is_empty());
-    let ids = |v: &serde_json::Value| {
+    let ids = |v: &Value| {
         alerts(v)
             .iter()
             .map(|a| a["id"].as_str().unwrap().to_owned())
