@@ -15,7 +15,7 @@ pub(super) struct Witness {
 }
 
 /// A shift, and a turn about the nadir with a scale: an error in tilt, in heading, in altitude. A position p appears at
-/// p + shift + A·p, A = [[scale, −turn], [turn, scale]].
+/// `p + shift + A·p`, `A = [[scale, −turn], [turn, scale]]`.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Displacement {
     pub shift: Vector2<f64>,
