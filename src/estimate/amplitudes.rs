@@ -1,7 +1,7 @@
 //! The linear part of the joint fit: energies at given positions.
 
 use super::fit::Fitter;
-use super::linear::{cholesky, solve};
+use super::linear::{axpy, cholesky, solve};
 use super::reading::Reading;
 
 /// Amplitudes stay above this many standard deviations of noise, so that a position keeps its gradient.
@@ -12,7 +12,6 @@ impl Fitter {
     #[inline(always)]
     pub(super) fn solve_amplitudes(&mut self, reading: &Reading, is_trial: bool) {
         let atoms = if is_trial { &mut self.trial } else { &mut self.now };
-        let (mx, my) = (reading.mx, reading.my);
         let n = atoms.spots.len();
         let sources = atoms.sources();
         if sources == 0 {
@@ -33,18 +32,16 @@ impl Fitter {
             }
         }
         for bad in &reading.bad {
-            let (ux, uy) = (&self.bx.row(bad.x)[..mx], &self.by.row(bad.y)[..my]);
             let values = &mut self.scratch;
             values.resize(values.len().max(sources), 0.0);
             for i in 0..sources {
-                let [x, y] = atoms.at(i, ux, uy);
+                let [x, y] = atoms.at(i, bad.x, bad.y);
                 values[i] = x[0] * y[0];
                 rhs[i] -= values[i] * bad.value;
             }
-            for i in 0..sources {
-                for j in 0..=i {
-                    gram[i * sources + j] -= values[i] * values[j];
-                }
+            for i in (0..sources).filter(|&i| values[i] != 0.0) {
+                let s = -values[i];
+                axpy(s, &values[..i + 1], &mut gram[i * sources..i * sources + i + 1]);
             }
         }
         self.active.clear();

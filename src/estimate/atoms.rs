@@ -21,6 +21,9 @@ pub(super) struct Atoms {
     y: Vec<f64>,
     /// Columns and rows outside which a source is zero.
     spans: Vec<[[usize; 2]; 2]>,
+    /// f, f′, f″ at pixels along each axis, (sources, pixels); only at the lines of unusable pixels.
+    at: [Vec<[f64; 3]>; 2],
+    lines: [usize; 2],
 }
 
 /// Constant and sloped profiles along one axis, of about a spot's norm, so that the normal equations are well scaled.
@@ -65,14 +68,36 @@ impl Atoms {
         &self.y[start + lo..start + hi]
     }
 
-    /// Values of source `i` at a pixel along each axis: f, f′, f″ each.
+    /// Values of source `i` at an unusable pixel along each axis: f, f′, f″ each.
     #[inline(always)]
-    pub fn at(&self, i: usize, ux: &[f64], uy: &[f64]) -> [[f64; 3]; 2] {
-        let [[x0, x1], [y0, y1]] = self.spans[i];
-        [
-            [0, 1, 2].map(|d| dot(&ux[x0..x1], self.x(i, d))),
-            [0, 1, 2].map(|d| dot(&uy[y0..y1], self.y(i, d))),
-        ]
+    pub fn at(&self, i: usize, x: usize, y: usize) -> [[f64; 3]; 2] {
+        [self.at[0][i * self.lines[0] + x], self.at[1][i * self.lines[1] + y]]
+    }
+
+    #[inline(always)]
+    fn expand(&mut self, axes: [&Basis; 2], lines: &[Vec<usize>; 2]) {
+        for k in 0..2 {
+            let n = if lines[k].is_empty() { 0 } else { axes[k].n };
+            let mut at = std::mem::take(&mut self.at[k]);
+            at.clear();
+            at.resize(self.sources() * n, [0.0; 3]);
+            for i in 0..self.sources() {
+                let [lo, hi] = self.spans[i][k];
+                let profile = |d: usize| if k == 0 { self.x(i, d) } else { self.y(i, d) };
+                for &line in &lines[k] {
+                    at[i * n + line] = if !axes[k].is_pixels {
+                        let row = &axes[k].row(line)[lo..hi];
+                        [0, 1, 2].map(|d| dot(row, profile(d)))
+                    } else if (lo..hi).contains(&line) {
+                        [0, 1, 2].map(|d| profile(d)[line - lo])
+                    } else {
+                        [0.0; 3]
+                    };
+                }
+            }
+            self.at[k] = at;
+            self.lines[k] = n;
+        }
     }
 
     /// Fills the atoms for the present spots, width and kinds of background.
@@ -110,6 +135,7 @@ impl Atoms {
             y[..my].copy_from_slice(&backgrounds[1][usize::from(b == 2)][..my]);
             self.spans.push([[0, mx], [0, my]]);
         }
+        self.expand(axes, &reading.bad_lines);
     }
 
     /// Adds `scale`·f_y⁽ᵇ⁾⊗f_x⁽ᵃ⁾ of source `i` to a matrix (my, mx).

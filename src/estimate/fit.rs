@@ -13,7 +13,7 @@ use super::atoms::{self, Atoms};
 use super::basis::Basis;
 use super::linear::{axpy, cholesky, dot, invert, solve};
 use super::model::{Model, Nuisances, pull};
-use super::reading::Reading;
+use super::reading::{BadPixel, Reading};
 
 const LAMBDA_START: f64 = 1e-3;
 const LAMBDA_FLOOR: f64 = 1e-14;
@@ -163,9 +163,10 @@ impl Fitter {
     /// Takes what unusable pixels hold out of a residual.
     pub fn clean(&self, reading: &Reading, residual: &mut [f64]) {
         for bad in &reading.bad {
-            let left = self.residual_at(reading, bad.x, bad.y, bad.value, &self.now);
+            let left = residual_at(bad, &self.now);
             let ux = &self.bx.row(bad.x)[..reading.mx];
-            for (c, &u) in self.by.row(bad.y)[..reading.my].iter().enumerate() {
+            let uy = self.by.row(bad.y)[..reading.my].iter().enumerate();
+            for (c, &u) in uy.filter(|(_, u)| **u != 0.0) {
                 axpy(-left * u, ux, &mut residual[c * reading.mx..(c + 1) * reading.mx]);
             }
         }
@@ -285,8 +286,13 @@ impl Fitter {
     /// Multiplications that one step costs.
     fn step_work(&self, reading: &Reading) -> f64 {
         let sources = self.now.sources() as f64;
+        let parameters = 3.0 * sources;
+        let unusable = reading.bad.len() as f64 * (2.0 * parameters + 0.5 * parameters * parameters);
         let pairs = if reading.weights.is_empty() { 0.0 } else { 3.0 * sources };
-        (9.0 + pairs) * self.now.footprint() + 40.0 * sources * (reading.mx + reading.my) as f64 + 9.0 * sources.powi(3)
+        unusable
+            + (9.0 + pairs) * self.now.footprint()
+            + 40.0 * sources * (reading.mx + reading.my) as f64
+            + 9.0 * sources.powi(3)
     }
 
     /// Places the atoms of the present or the trial hypothesis, solves their amplitudes, and returns the deviance.
@@ -324,21 +330,9 @@ impl Fitter {
         }
         let mut deviance = dot(residual, residual);
         for bad in &reading.bad {
-            deviance -= self.residual_at(reading, bad.x, bad.y, bad.value, atoms).powi(2);
+            deviance -= residual_at(bad, atoms).powi(2);
         }
         deviance
-    }
-
-    /// What a pixel holds beyond the model.
-    #[inline(always)]
-    fn residual_at(&self, reading: &Reading, x: usize, y: usize, value: f64, atoms: &Atoms) -> f64 {
-        let (ux, uy) = (&self.bx.row(x)[..reading.mx], &self.by.row(y)[..reading.my]);
-        let mut left = value;
-        for i in 0..atoms.sources() {
-            let [x, y] = atoms.at(i, ux, uy);
-            left -= atoms.amplitude(i) * x[0] * y[0];
-        }
-        left
     }
 
     /// Gradient Jᵀr and information JᵀJ at the present hypothesis.
@@ -426,13 +420,12 @@ impl Fitter {
             g[first_width + w] = dot(&self.broadening[w], &self.residual);
         }
         for bad in &reading.bad {
-            let (ux, uy) = (&self.bx.row(bad.x)[..mx], &self.by.row(bad.y)[..my]);
             let row = &mut self.velocity;
             row.resize(p.max(row.len()), 0.0);
             row[first_width..p].fill(0.0);
             let mut left = bad.value;
             for i in 0..sources {
-                let [[x0, x1, x2], [y0, y1, y2]] = atoms.at(i, ux, uy);
+                let [[x0, x1, x2], [y0, y1, y2]] = atoms.at(i, bad.x, bad.y);
                 let a = atoms.amplitude(i);
                 left -= a * x0 * y0;
                 if i >= n {
@@ -445,7 +438,7 @@ impl Fitter {
                     row[p - 1] += a * atoms.width[1].powi(2) * x0 * y2;
                 }
             }
-            for i in 0..p {
+            for i in (0..p).filter(|&i| row[i] != 0.0) {
                 g[i] -= row[i] * left;
                 let s = -row[i];
                 axpy(s, &row[..i + 1], &mut h[i * p..i * p + i + 1]);
@@ -543,6 +536,17 @@ impl Fitter {
         }
         solve(&self.factor, p, out);
     }
+}
+
+/// What an unusable pixel holds beyond the model.
+#[inline(always)]
+fn residual_at(bad: &BadPixel, atoms: &Atoms) -> f64 {
+    let mut left = bad.value;
+    for i in 0..atoms.sources() {
+        let [x, y] = atoms.at(i, bad.x, bad.y);
+        left -= atoms.amplitude(i) * x[0] * y[0];
+    }
+    left
 }
 
 struct Job<'a> {

@@ -1,5 +1,7 @@
 //! A frame in the two bases, ready to be fitted.
 
+use std::collections::BTreeSet;
+
 use super::basis::Basis;
 use super::linear::dot;
 use super::model::Model;
@@ -20,6 +22,8 @@ pub(super) struct Reading {
     /// (my, mx) row-major.
     pub z: Vec<f64>,
     pub bad: Vec<BadPixel>,
+    /// Their columns and rows, each once.
+    pub bad_lines: [Vec<usize>; 2],
     /// Inverse variances (my, mx) where pixels differ in them, and Σ ln of the variances. Only in the pixel bases.
     pub weights: Vec<f64>,
     pub log_det: f64,
@@ -81,6 +85,11 @@ impl Reading {
             y: b.y,
             value: frame.pixels[b.y * nx + b.x],
         }));
+        self.bad_lines = [
+            self.bad.iter().map(|b| b.x).collect::<BTreeSet<_>>(),
+            self.bad.iter().map(|b| b.y).collect(),
+        ]
+        .map(|lines| lines.into_iter().collect());
         let leverage: f64 = self
             .bad
             .iter()
@@ -131,6 +140,7 @@ impl Reading {
             self.weights[k / nx * self.mx + k % nx] = 1.0 / v;
         }
         self.bad.clear();
+        self.bad_lines = Default::default();
         self.weighted.clear();
         self.weighted
             .extend(self.z.iter().zip(&self.weights).map(|(z, w)| z * w));
