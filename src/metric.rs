@@ -7,6 +7,8 @@ use metrics_exporter_prometheus::{BuildError, Matcher, PrometheusBuilder, Promet
 pub const FRAMES_CAPTURED: &str = "oapwatch_frames_captured_total";
 pub const FRAMES_DROPPED: &str = "oapwatch_frames_dropped_total";
 pub const FRAMES_UNUSABLE: &str = "oapwatch_frames_unusable_total";
+/// The estimator's budget ended before it had tried everything.
+pub const FRAMES_CUT_SHORT: &str = "oapwatch_frames_cut_short_total";
 pub const LAST_GOOD_FRAME: &str = "oapwatch_last_good_frame_timestamp_seconds";
 /// Label `stage`: one of [`STAGES`].
 pub const STAGE_SECONDS: &str = "oapwatch_stage_duration_seconds";
@@ -81,6 +83,10 @@ pub fn describe() {
     c!(
         FRAMES_UNUSABLE,
         "Frames that could not be used: wrong shape, error-flagged, no usable pixel."
+    );
+    c!(
+        FRAMES_CUT_SHORT,
+        "Frames whose best answer within the time budget was taken."
     );
     g!(
         LAST_GOOD_FRAME,

@@ -3,7 +3,7 @@
 
 use ndarray::Array2;
 use oapwatch::assign::ospa;
-use oapwatch::estimate::{Config, Error, Estimate, Estimator, Flags, LADDER, build, position_bound};
+use oapwatch::estimate::{Config, Error, Estimate, Estimator, Flags, KnownPower, LADDER, build, position_bound};
 use oapwatch::frame::Frame;
 use oapwatch::optics::{self, Camera, psf};
 use rand::{RngExt, SeedableRng};
@@ -40,15 +40,21 @@ fn frame(pixels: Array2<f64>) -> Frame {
 }
 
 fn render(camera: &Camera, positions: &[[f64; 2]], rng: &mut ChaCha8Rng) -> Array2<f64> {
+    let beams: Vec<_> = positions.iter().map(|&p| (p, ENERGY_J)).collect();
+    render_beams(camera, &beams, rng)
+}
+
+/// Positions, m, and energies, J.
+fn render_beams(camera: &Camera, beams: &[([f64; 2], f64)], rng: &mut ChaCha8Rng) -> Array2<f64> {
     let noise = Normal::new(0.0, camera.noise_std_j).unwrap();
     let mut pixels = Array2::from_shape_simple_fn(camera.shape(), || noise.sample(rng));
     let (mut row, mut column) = (vec![0.0; camera.x.n], vec![0.0; camera.y.n]);
-    for &p in positions {
+    for &(p, energy) in beams {
         let [x, y] = camera.to_sensor(p);
         psf::profile(&camera.x, x, camera.spot_sigma_m, &mut row);
         psf::profile(&camera.y, y, camera.spot_sigma_m, &mut column);
         for ((b, a), pixel) in pixels.indexed_iter_mut() {
-            *pixel += ENERGY_J * column[b] * row[a];
+            *pixel += energy * column[b] * row[a];
         }
     }
     pixels
@@ -254,4 +260,80 @@ fn an_unknown_rung_is_refused_with_the_nearest() {
     };
     let message = build(&config, &camera(1e-3, 20, 1e-6)).err().unwrap().to_string();
     assert!(message.contains("did you mean \"pencil-fit\"?"), "{message}");
+}
+
+/// A camera whose spots melt, and the `map` rung told what a user's beam brings.
+fn map(camera: &Camera) -> Box<dyn Estimator> {
+    let config = Config {
+        name: Some("map".into()),
+        known_power: Some(KnownPower {
+            energies_j: vec![ENERGY_J],
+            relative_std: 0.094,
+            share: 0.95,
+            attenuation_per_m: 0.0,
+        }),
+        ..Default::default()
+    };
+    build(&config, camera).unwrap()
+}
+
+#[test]
+fn the_light_of_two_users_in_one_spot_is_two_where_their_power_is_known() {
+    let camera = camera(4e-3, 64, 1e-6);
+    let (mut ml, mut map) = (estimator(Some("ml"), &camera), map(&camera));
+    let mut rng = ChaCha8Rng::seed_from_u64(5);
+    let (mut by_ml, mut by_map) = (0, 0);
+    for _ in 0..20 {
+        let centre: [f64; 2] = std::array::from_fn(|_| rng.random_range(-60.0..60.0));
+        // 6 m is 0.18 σ.
+        let pair = [centre, [centre[0] + 6.0, centre[1]]];
+        let frame = frame(render(&camera, &pair, &mut rng));
+        by_ml += usize::from(ml.estimate(&frame).unwrap().emitters.len() == 2);
+        by_map += usize::from(map.estimate(&frame).unwrap().emitters.len() == 2);
+    }
+    assert!(by_ml <= 4 && by_map >= 19, "{by_ml} and {by_map} of 20");
+}
+
+#[test]
+fn known_power_binds_no_stranger_and_finds_none_in_the_dark() {
+    let camera = camera(4e-3, 64, 1e-6);
+    let mut map = map(&camera);
+    let mut rng = ChaCha8Rng::seed_from_u64(6);
+    for _ in 0..20 {
+        let dark = map.estimate(&frame(render(&camera, &[], &mut rng))).unwrap();
+        assert!(dark.emitters.is_empty());
+        let stranger = ([70.0, -60.0], 0.2 * ENERGY_J);
+        let beams = [([-50.0, 40.0], ENERGY_J), stranger];
+        let found = map.estimate(&frame(render_beams(&camera, &beams, &mut rng))).unwrap();
+        assert_eq!(found.emitters.len(), 2);
+        let nearest = |e: &&oapwatch::estimate::Emitter| (e.x_m - 70.0).hypot(e.y_m + 60.0);
+        let e = found
+            .emitters
+            .iter()
+            .min_by(|a, b| nearest(a).total_cmp(&nearest(b)))
+            .unwrap();
+        // A chance of 1e-6 to fall outside.
+        let (dx, dy, [[a, b], [_, c]]) = (e.x_m - 70.0, e.y_m + 60.0, e.cov_m2);
+        let distance = (c * dx * dx - 2.0 * b * dx * dy + a * dy * dy) / (a * c - b * b);
+        assert!(distance < 27.6, "{dx} {dy}, {:?}", e.cov_m2);
+        assert!((e.energy_j - stranger.1).abs() < 4.9 * e.energy_std_j);
+    }
+}
+
+#[test]
+fn a_budget_ends_the_search_and_says_so() {
+    let camera = camera(8e-3, 60, 4e-10);
+    let mut rng = ChaCha8Rng::seed_from_u64(7);
+    let config = Config {
+        budget_ms: Some(1e-3),
+        ..Default::default()
+    };
+    let mut hurried = build(&config, &camera).unwrap();
+    let mut patient = estimator(None, &camera);
+    let frame = frame(render(&camera, &scatter(8, 20.0, &mut rng), &mut rng));
+    let (short, long) = (hurried.estimate(&frame).unwrap(), patient.estimate(&frame).unwrap());
+    assert!(short.is_cut_short && !short.emitters.is_empty());
+    assert!(short.emitters.iter().all(|e| e.flags.contains(Flags::OUT_OF_TIME)));
+    assert!(!long.is_cut_short);
+    assert_eq!(long.emitters.len(), 8);
 }

@@ -135,7 +135,8 @@ impl Compute {
         metrics::histogram!(metric::STAGE_SECONDS, "stage" => "estimate").record(estimation);
         metrics::histogram!(metric::STAGE_SECONDS, "stage" => "monitor").record(verdicts);
         match &estimate {
-            Ok(_) => {
+            Ok(estimate) => {
+                metrics::counter!(metric::FRAMES_CUT_SHORT).increment(u64::from(estimate.is_cut_short));
                 s.last_good = Some(frame.time);
                 s.fault = None;
                 s.source = SourceState::Running;

@@ -57,8 +57,10 @@ pub struct Emitter {
 #[derive(Clone, Debug, Default)]
 pub struct Estimate {
     pub emitters: Vec<Emitter>,
-    /// The rung that produced it (a budget may have ended on a lower one than configured).
+    /// The rung that produced it.
     pub rung: &'static str,
+    /// Whether a budget of time or work ended the search: its best answer until then.
+    pub is_cut_short: bool,
     /// Weighted squared residual per degree of freedom; near 1 when the model explains the frame.
     pub reduced_chi2: f64,
     /// Share of pixels at or above saturation.

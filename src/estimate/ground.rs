@@ -102,6 +102,7 @@ pub(super) fn locate(
     Estimate {
         emitters,
         rung: "",
+        is_cut_short: false,
         reduced_chi2,
         saturated_share: frame.saturated as f64 / frame.pixels.len() as f64,
     }

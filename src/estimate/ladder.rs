@@ -276,7 +276,6 @@ impl Estimator for Analytic {
                 search.maximum_likelihood(reading, &self.frame, look)
             }
         };
-        let is_exhausted = search.is_exhausted();
         let known = search
             .suspected
             .or((!reading.growth.is_flat()).then_some(reading.growth));
@@ -296,8 +295,10 @@ impl Estimator for Analytic {
             search.maximum_posterior(reading, &mut model);
             self.prior = search.prior.take();
         }
+        let is_exhausted = search.is_exhausted();
         let mut estimate = ground::locate(search, reading, &mut model, &self.frame, &self.camera, noise_j);
         estimate.rung = self.rung.name;
+        estimate.is_cut_short = is_exhausted;
         if is_exhausted {
             for emitter in &mut estimate.emitters {
                 emitter.flags |= Flags::OUT_OF_TIME;

@@ -231,7 +231,7 @@ impl Search {
         let patience = if nuisances == Nuisances::default() { 1 } else { 3 };
         let mut worse = 0;
         for count in counts {
-            if reading.is_explained(best) || worse == patience || self.is_exhausted() {
+            if reading.is_explained(best) || worse == patience || !best.spots.is_empty() && self.is_exhausted() {
                 break;
             }
             let Some(seeds) = pencil.seeds(count) else { break };
