@@ -39,7 +39,7 @@ pub fn run(args: Args) -> Outcome {
         plan.cells.retain(|c| args.cells.contains(&c.name()));
     }
     if !args.rungs.is_empty() {
-        plan.rungs.retain(|r| args.rungs.iter().any(|name| name == r.name));
+        plan.rungs.retain(|r| args.rungs.iter().any(|name| name == r));
     }
     if plan.is_empty() {
         return Err(Failure::input(anyhow::anyhow!(

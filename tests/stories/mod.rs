@@ -424,6 +424,7 @@ pub fn tell_with(story: &Story, keep: bool) -> Told {
             continue;
         }
         let mut estimate = Estimate {
+            is_cut_short: false,
             emitters: detect(story, t, &mut rng),
             rung: "story",
             reduced_chi2: 1.0,

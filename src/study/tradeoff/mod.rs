@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use crate::estimate::{LADDER, Rung};
+use crate::estimate::{LADDER, Learned};
 
 pub use condition::Condition;
 pub use scene::{Cell, Noise};
@@ -20,7 +20,8 @@ pub use score::Row;
 #[derive(Clone, Debug)]
 pub struct Plan {
     pub cells: Vec<Cell>,
-    pub rungs: Vec<&'static Rung>,
+    /// Names of rungs.
+    pub rungs: Vec<&'static str>,
     /// Frames a cell.
     pub frames: usize,
     pub seed: u64,
@@ -84,7 +85,7 @@ impl Plan {
         }
         Self {
             cells,
-            rungs: LADDER.iter().collect(),
+            rungs: rungs(),
             frames: 250,
             seed: 1,
         }
@@ -101,7 +102,7 @@ impl Plan {
         cells.extend([1, 20].map(|emitters| Cell::new(Noise::Energy, 1.0, 100).holding(emitters)));
         Self {
             cells,
-            rungs: LADDER.iter().collect(),
+            rungs: rungs(),
             frames: 12,
             seed: 1,
         }
@@ -109,12 +110,27 @@ impl Plan {
 
     /// Measurements that the plan asks for.
     pub fn len(&self) -> usize {
-        self.cells.len() * self.rungs.len()
+        self.pairs().count()
+    }
+
+    /// Every cell with the rungs that can be had there: a network only where it was trained.
+    fn pairs(&self) -> impl Iterator<Item = (Cell, &'static str)> {
+        let trained = Cell::new(Noise::Energy, 1.0, 64);
+        let is_had = move |cell: &Cell, rung: &str| *cell == trained || Learned::ALL.iter().all(|l| l.name() != rung);
+        self.cells
+            .iter()
+            .flat_map(move |cell| self.rungs.iter().map(move |rung| (*cell, *rung)))
+            .filter(move |(cell, rung)| is_had(cell, rung))
     }
 
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
+}
+
+fn rungs() -> Vec<&'static str> {
+    let learned = Learned::ALL.into_iter().map(Learned::name);
+    LADDER.iter().map(|r| r.name).chain(learned).collect()
 }
 
 /// Runs what `out` does not hold yet and writes tradeoff.json after each row, tradeoff.md and the pictures at the end.
@@ -135,32 +151,31 @@ pub fn run(plan: &Plan, out: &Path, progress: &mut dyn FnMut(&Row)) -> Result<St
         Err(e) => return Err(io(&file)(e)),
     };
     let mut kept = Vec::new();
-    for cell in &plan.cells {
-        let mut scenes = None;
-        for &rung in &plan.rungs {
-            let known = study
-                .rows
-                .iter()
-                .find(|r| r.cell == *cell && r.rung == rung.name && r.frames == plan.frames && r.seed == plan.seed);
-            let row = match known {
-                Some(row) => row.clone(),
-                None => {
-                    let scenes = match &mut scenes {
-                        Some(scenes) => scenes,
-                        none => none.insert(cell.scenes(plan.frames, plan.seed)?),
-                    };
-                    let row = score::measure(cell, rung, scenes, plan.seed)?;
-                    study.rows.push(row.clone());
-                    let bytes = serde_json::to_vec_pretty(&study).expect("rows are plain numbers and names");
-                    let partial = out.join("tradeoff.json.part");
-                    std::fs::write(&partial, bytes).map_err(io(&partial))?;
-                    std::fs::rename(&partial, &file).map_err(io(&file))?;
-                    row
-                }
-            };
-            progress(&row);
-            kept.push(row);
-        }
+    let mut drawn: Option<(Cell, Vec<scene::Scene>)> = None;
+    for (cell, rung) in plan.pairs() {
+        let known = study
+            .rows
+            .iter()
+            .find(|r| r.cell == cell && r.rung == rung && r.frames == plan.frames && r.seed == plan.seed);
+        let row = match known {
+            Some(row) => row.clone(),
+            None => {
+                let scenes = match drawn.take() {
+                    Some((of, scenes)) if of == cell => scenes,
+                    _ => cell.scenes(plan.frames, plan.seed)?,
+                };
+                let row = score::measure(&cell, rung, &scenes, plan.seed)?;
+                drawn = Some((cell, scenes));
+                study.rows.push(row.clone());
+                let bytes = serde_json::to_vec_pretty(&study).expect("rows are plain numbers and names");
+                let partial = out.join("tradeoff.json.part");
+                std::fs::write(&partial, bytes).map_err(io(&partial))?;
+                std::fs::rename(&partial, &file).map_err(io(&file))?;
+                row
+            }
+        };
+        progress(&row);
+        kept.push(row);
     }
     let study = Study { rows: kept };
     let table = out.join("tradeoff.md");

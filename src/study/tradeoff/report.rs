@@ -1,7 +1,7 @@
 use std::fmt::Write;
 
 use super::{Noise, Row, Study};
-use crate::estimate::{DEFAULT, LADDER};
+use crate::estimate::{DEFAULT, LADDER, Learned};
 
 /// Array sizes, and the mean squared errors that the paper reports there for its hybrid and its U-Net, m².
 pub(super) const PAPER: [(usize, f64, f64); 6] = [
@@ -58,6 +58,9 @@ pub(super) fn markdown(study: &Study) -> String {
     for rung in LADDER {
         let default = if rung.name == DEFAULT { " (default)" } else { "" };
         let _ = writeln!(text, "- `{}`{default}: {}", rung.name, rung.summary);
+    }
+    for learned in Learned::ALL {
+        let _ = writeln!(text, "- `{}`: {}", learned.name(), learned.summary());
     }
     for rows in cells(study) {
         let front = front(&rows);

@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 use super::Error;
 use super::scene::{Cell, Scene};
 use crate::assign::ospa;
-use crate::estimate::{self, Rung};
+use crate::estimate;
 
 /// OSPA's cutoff, m.
 const CUTOFF_M: f64 = 25.0;
@@ -45,10 +45,10 @@ pub struct Row {
 /// Mean of an exponential variate's smallest 95 %: (1 − 0.05(1 + ln 20))/0.95.
 const TRIMMED_EXPONENTIAL: f64 = 0.842_329_8;
 
-pub(super) fn measure(cell: &Cell, rung: &Rung, scenes: &[Scene], seed: u64) -> Result<Row, Error> {
+pub(super) fn measure(cell: &Cell, rung: &str, scenes: &[Scene], seed: u64) -> Result<Row, Error> {
     let camera = cell.camera()?;
     let config = estimate::Config {
-        name: Some(rung.name.to_owned()),
+        name: Some(rung.to_owned()),
         known_power: Some(cell.known_power(&camera)),
         ..Default::default()
     };
@@ -95,7 +95,7 @@ pub(super) fn measure(cell: &Cell, rung: &Rung, scenes: &[Scene], seed: u64) -> 
     let emitters = bounds.len().max(1);
     Ok(Row {
         cell: *cell,
-        rung: rung.name.to_owned(),
+        rung: rung.to_owned(),
         frames,
         seed,
         mean_m2: mean(&squared),
