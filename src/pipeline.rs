@@ -107,6 +107,7 @@ impl Pipeline {
     fn blinded(&self, saturated_share: f64) -> Estimate {
         Estimate {
             emitters: Vec::new(),
+            is_cut_short: false,
             rung: self.estimator.name(),
             reduced_chi2: f64::NAN,
             saturated_share,
