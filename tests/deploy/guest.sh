@@ -183,6 +183,14 @@ cp /tmp/good $config
 systemctl restart oapwatch
 rmmod vivid
 check "it goes back to the simulator" within 60 ready
+cd /
+before=$(within 60 ids)
+for commands in /guide/*.sh; do
+    check "as the guide says: $(head -n 1 "$commands")" bash -e "$commands"
+    within 60 ready >/dev/null 2>&1
+done
+check "the guide's backup, restored, has every alert" within 60 kept "$before"
+
 before=$(within 60 ids)
 old=$(pid)
 check "apt upgrades the package" apt-get install -qq -y --no-install-recommends -o Dpkg::Options::=--force-confold /upgrade.deb

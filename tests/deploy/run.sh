@@ -15,12 +15,14 @@ done
 [ -f "$deb" ] || { echo "tests/deploy: target/oapwatch.deb is missing; run make deb"; exit 1; }
 
 suite=$(. /etc/os-release && echo "$VERSION_CODENAME")
-if [ ! -f "$work/root.tar" ]; then
+packages=systemd-sysv,udev,kmod,curl,python3-minimal,ca-certificates,sqlite3
+base=$work/root-$(echo "$suite $packages" | cksum | cut -d' ' -f1).tar
+if [ ! -f "$base" ]; then
     echo "Making a minimal Debian $suite (about a minute)"
-    mmdebstrap --quiet --variant=minbase --include=systemd-sysv,udev,kmod,curl,python3-minimal,ca-certificates \
+    mmdebstrap --quiet --format=tar --variant=minbase --include=$packages \
         --dpkgopt='path-exclude=/usr/share/doc/*' --dpkgopt='path-exclude=/usr/share/locale/*' \
         "$suite" "$work/root.tar.part"
-    mv "$work/root.tar.part" "$work/root.tar"
+    mv "$work/root.tar.part" "$base"
 fi
 if [ ! -d "$work/kernel" ]; then
     echo "Fetching Debian's kernel"
@@ -72,7 +74,7 @@ root_image() {
     local dir=$work/root
     rm -rf "$dir"
     mkdir -p "$dir"
-    tar -C "$dir" --exclude='./dev/*' -xf "$work/root.tar"
+    tar -C "$dir" --exclude='./dev/*' -xf "$base"
     for path in $(needs vivid); do
         install -D "$path" "$dir/lib/modules/$version/${path##*/lib/modules/$version/}"
     done
@@ -81,6 +83,9 @@ root_image() {
     cp "$deb" "$dir/oapwatch.deb"
     cp "$work/upgrade.deb" "$dir/upgrade.deb"
     install -m 755 tests/deploy/guest.sh "$dir/guest.sh"
+    mkdir "$dir/guide"
+    # Each block of commands of the operator's guide, in order.
+    awk -v dir="$dir/guide" '/^```sh$/ { n++; on = 1; next } /^```$/ { on = 0 } on { print > sprintf("%s/%02d.sh", dir, n) }' docs/operator.md
     install -m 644 tests/deploy/receiver.py "$dir/receiver.py"
     cat > "$dir/etc/systemd/system/guest.service" <<'UNIT'
 [Unit]
