@@ -31,13 +31,12 @@ pid() { systemctl show -P MainPID oapwatch; }
 same() { [ "$(pid)" = "$1" ] && ready; }
 restarted() { [ "$(pid)" != 0 ] && [ "$(pid)" != "$1" ] && ready; }
 alerts() { curl -fsS -m 5 "$api/v1/alerts?limit=100"; }
-ids() { (set -o pipefail && alerts | grep -o '"id":"[^"]*"' | sort); }
+ids() { (set -o pipefail && alerts | grep -o '"id":"[^"]*"' | cut -d'"' -f4); } # of the newest hundred
 has_alert() { alerts | grep -q unclaimed_emitter; }
-kept() { # every alert of the list $1 is still there
-    local lost
+kept() { # every alert of the list $1 is still known, however many came since
     [ -n "$1" ] || { echo "no alert was known before" && return 1; }
-    lost=$(comm -23 <(echo "$1") <(ids))
-    [ -z "$lost" ] || { echo "lost: $lost" && return 1; }
+    # shellcheck disable=SC2046,SC2086
+    curl -fsS -m 60 --fail-early $(printf "$api/v1/alerts/%s " $1) >/dev/null
 }
 metric() { # metric NAME: its value
     curl -fsS -m 5 $api/metrics | sed -n "s/^$1 //p"
