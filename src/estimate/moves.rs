@@ -10,6 +10,8 @@ const FINAL_STEPS: usize = 200;
 const SEPARATION: f64 = 2.5;
 /// Spots nearer than this, σ, may be one.
 const MERGE: f64 = 2.5;
+/// A split that promises this share of an emitter's price is tried though the frame is explained without.
+const LIKELY: f64 = 0.1;
 /// A split puts its halves this far to either side, σ.
 const SPLIT: f64 = 0.4;
 
@@ -73,10 +75,10 @@ impl Search {
                 break;
             }
         }
-        if reading.is_explained(model) {
-            return;
-        }
-        for (index, direction) in self.splits(reading, model).into_iter().take(3) {
+        for (gain, index, direction) in self.splits(reading, model).into_iter().take(3) {
+            if reading.is_explained(model) && gain < LIKELY * self.factor * self.price {
+                return;
+            }
             let mut next = model.clone();
             let spot = next.spots[index];
             let half = |sign: f64| Spot::new([0, 1].map(|k| spot.u[k] + sign * SPLIT * direction[k]), 0.5 * spot.a);
@@ -161,8 +163,12 @@ impl Search {
         (d[0] * d[0] * s[1][1] - 2.0 * d[0] * d[1] * s[0][1] + d[1] * d[1] * s[0][0]) / det.max(1e-300)
     }
 
-    /// Spots whose residual is bent as that of two, with the direction they lie in; the most bent first.
-    pub(super) fn splits(&mut self, reading: &Reading, model: &mut Model) -> Vec<(usize, [f64; 2])> {
+    /// Spots whose residual is bent as that of two, with the drop of the deviance that a split may bring at least and the
+    /// direction they lie in; the most bent first.
+    pub(super) fn splits(&mut self, reading: &Reading, model: &mut Model) -> Vec<(f64, usize, [f64; 2])> {
+        let pitch = self.fitter.bx.pitch() * self.fitter.by.pitch();
+        // What amplitude and position leave of a unit spot's second derivative, squared: ½·⟨f, f⟩.
+        let norm = 0.5 * pitch / (4.0 * std::f64::consts::PI);
         let mut bent: Vec<(f64, usize, [f64; 2])> = self
             .fitter
             .curvatures(reading, model)
@@ -172,11 +178,11 @@ impl Search {
                 let (mean, half) = (0.5 * (xx + yy), 0.5 * (xx - yy));
                 let largest = mean + half.hypot(xy);
                 let angle = 0.5 * xy.atan2(half);
-                (largest > 0.0).then(|| (largest, i, [angle.cos(), angle.sin()]))
+                (largest > 0.0).then(|| (largest * largest / norm, i, [angle.cos(), angle.sin()]))
             })
             .collect();
         bent.sort_by(|a, b| b.0.total_cmp(&a.0));
-        bent.into_iter().map(|(_, i, d)| (i, d)).collect()
+        bent
     }
 }
 
