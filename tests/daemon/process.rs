@@ -46,6 +46,11 @@ impl Daemon {
         panic!("no {what} within 20 s; {path} last said {last}");
     }
 
+    /// Host and port.
+    pub fn address(&self) -> &str {
+        self.url.trim_start_matches("http://")
+    }
+
     pub fn get(&self, path: &str) -> (u16, String) {
         request(&self.url, "GET", path, "").expect("an answer")
     }
