@@ -8,27 +8,44 @@ mod http;
 #[path = "../../fuzz/src/targets.rs"]
 mod targets;
 
+use std::panic::AssertUnwindSafe;
 use std::path::Path;
+use std::time::{Duration, Instant};
 
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
+/// Tries every seed and `changes` changes of each; with `OAPWATCH_FUZZ_SECONDS` more of them, for so long.
 fn try_seeds(folder: &str, changes: usize, target: impl Fn(&[u8])) {
-    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join(folder);
-    let mut seeds: Vec<_> = std::fs::read_dir(&folder)
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join(folder);
+    let mut paths: Vec<_> = std::fs::read_dir(path)
         .expect("the folder of seeds")
         .map(|entry| entry.expect("a seed").path())
         .collect();
-    seeds.sort();
+    paths.sort();
+    let seeds: Vec<_> = paths.iter().map(|path| std::fs::read(path).expect("a seed")).collect();
     assert!(!seeds.is_empty());
     let mut rng = ChaCha8Rng::seed_from_u64(1);
-    for path in seeds {
-        let seed = std::fs::read(path).expect("a seed");
-        target(&seed);
-        for _ in 0..changes {
-            target(&changed(seed.clone(), &mut rng));
+    seeds.iter().for_each(|seed| target(seed));
+    let time = std::env::var("OAPWATCH_FUZZ_SECONDS").ok().and_then(|s| s.parse().ok());
+    let time = Duration::from_secs(time.unwrap_or(0));
+    let began = Instant::now();
+    let (mut tried, mut longest) = (0, Duration::ZERO);
+    while tried < changes * seeds.len() || began.elapsed() < time {
+        let bytes = changed(seeds[tried % seeds.len()].clone(), &mut rng);
+        let started = Instant::now();
+        let outcome = std::panic::catch_unwind(AssertUnwindSafe(|| target(&bytes)));
+        longest = longest.max(started.elapsed());
+        if let Err(panic) = outcome {
+            eprintln!("{folder}: {:?}", String::from_utf8_lossy(&bytes));
+            std::panic::resume_unwind(panic);
         }
+        tried += 1;
     }
+    println!(
+        "{folder}: {tried} inputs in {:.0?}, the slowest {longest:.0?}",
+        began.elapsed()
+    );
 }
 
 /// Up to four of: a byte set, a bit flipped, a stretch cut out, a stretch said twice, the end cut off, a number changed.
