@@ -1,7 +1,7 @@
 //! Bytes on the API's socket.
 
 use std::io::{ErrorKind, Read, Write};
-use std::net::{Shutdown, TcpStream};
+use std::net::TcpStream;
 use std::sync::LazyLock;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
@@ -33,7 +33,7 @@ static API: LazyLock<(Runtime, Fake)> = LazyLock::new(|| {
 /// A request of any bytes: an answer that is not "internal server error", or none; and the API still lives.
 pub fn http(bytes: &[u8]) {
     let (_runtime, fake) = &*API;
-    let answer = exchange(fake, bytes);
+    let answer = exchange(fake, bytes, Duration::from_millis(50));
     assert!(
         !answer.starts_with(b"HTTP/1.1 500"),
         "{}",
@@ -44,6 +44,7 @@ pub fn http(bytes: &[u8]) {
         let health = exchange(
             fake,
             b"GET /healthz HTTP/1.1\r\nhost: localhost\r\nconnection: close\r\n\r\n",
+            Duration::from_secs(20),
         );
         assert!(
             health.starts_with(b"HTTP/1.1 200"),
@@ -53,15 +54,14 @@ pub fn http(bytes: &[u8]) {
     }
 }
 
-fn exchange(fake: &Fake, request: &[u8]) -> Vec<u8> {
+/// The beginning of the answer; nothing where none comes within `patience`, as to half a request. Our side stays open: a
+/// server may take its end for the end of interest in an answer.
+fn exchange(fake: &Fake, request: &[u8], patience: Duration) -> Vec<u8> {
     let mut socket = TcpStream::connect(fake.address).expect("the API listens");
     // A reset at the end instead of a port that waits for a minute.
     let _ = socket2::SockRef::from(&socket).set_linger(Some(Duration::ZERO));
-    socket
-        .set_read_timeout(Some(Duration::from_millis(500)))
-        .expect("a time-out");
+    socket.set_read_timeout(Some(patience)).expect("a time-out");
     let _ = socket.write_all(request);
-    let _ = socket.shutdown(Shutdown::Write);
     let mut answer = vec![0; 256];
     loop {
         match socket.read(&mut answer) {
