@@ -71,3 +71,11 @@ SOAK_S ?= 600
 soak: build
 	$(call need,command -v python3,python3-minimal)
 	tests/deploy/soak.py target/release/oapwatch $(SOAK_S)
+
+.PHONY: check-aarch64
+# That it compiles for the usual computer of a UAV, C dependencies included. Not in CI: it takes every dependency once more.
+check-aarch64: setup
+	$(call need,command -v aarch64-linux-gnu-gcc,gcc-aarch64-linux-gnu libc6-dev-arm64-cross)
+	rustup target add aarch64-unknown-linux-gnu
+	BINDGEN_EXTRA_CLANG_ARGS_aarch64_unknown_linux_gnu=--sysroot=/usr/aarch64-linux-gnu \
+		cargo check --release --locked --target aarch64-unknown-linux-gnu --target-dir target/cross --bin oapwatch
