@@ -23,7 +23,7 @@ impl Monitor {
         for track in &self.tracks.all {
             if answers.contains(&Some(track.id)) {
                 self.alone.remove(&track.id);
-            } else if track.hit || track.merged {
+            } else if track.hit {
                 self.alone.entry(track.id).or_insert(now);
             }
         }
@@ -82,10 +82,12 @@ impl Monitor {
         for (cause, id) in open {
             let still = self.tracks.get(id).is_some_and(|t| t.hit || t.merged) && self.alone.contains_key(&id);
             if !still {
-                match self.swapped_with(id) {
-                    Some(other) => self
-                        .book
-                        .rename(&cause, Cause::Track(AlertKind::UnclaimedEmitter, other)),
+                match self.swapped_with(id, answers) {
+                    Some(other) => {
+                        self.alone.insert(other, now);
+                        self.book
+                            .rename(&cause, Cause::Track(AlertKind::UnclaimedEmitter, other));
+                    }
                     None => self.book.absent(&cause, now),
                 }
             }
@@ -94,13 +96,17 @@ impl Monitor {
 
     /// The beam without a claim in the spot that track `id` is in, when `id` itself answers one: where two beams melt, which
     /// is whose is a guess, and that one of them is nobody's is not.
-    fn swapped_with(&self, id: u64) -> Option<u64> {
-        let track = self.tracks.get(id).filter(|_| !self.alone.contains_key(&id))?;
+    fn swapped_with(&self, id: u64, answers: &[Option<u64>]) -> Option<u64> {
+        let track = self.tracks.get(id).filter(|_| answers.contains(&Some(id)))?;
         let here = track.motion.position();
         let reach = 2.0 * track.detection.resolution_m;
         let others = self.tracks.all.iter().filter(|t| {
             let cause = Cause::Track(AlertKind::UnclaimedEmitter, t.id);
-            t.id != id && self.alone.contains_key(&t.id) && t.confirmed && !self.book.is_open(&cause)
+            t.id != id
+                && (t.hit || t.merged)
+                && t.confirmed
+                && !answers.contains(&Some(t.id))
+                && !self.book.is_open(&cause)
         });
         let near = others.filter(|t| (t.motion.position() - here).norm() < reach);
         near.map(|t| t.id).next()
