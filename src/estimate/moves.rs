@@ -10,6 +10,8 @@ const FINAL_STEPS: usize = 200;
 const SEPARATION: f64 = 2.5;
 /// Spots nearer than this, σ, may be one.
 const MERGE: f64 = 2.5;
+/// Spots that are tried to be done without, a round.
+const FAINTEST: usize = 6;
 /// A split that promises this share of an emitter's price is tried though the frame is explained without.
 const LIKELY: f64 = 0.1;
 /// A split puts its halves this far to either side, σ.
@@ -118,15 +120,19 @@ impl Search {
                     break;
                 }
             }
-            if !has_shrunk && n > 0 {
+            if !has_shrunk {
+                // The least significant may be one of a pair that cannot be told apart, and needed.
                 let significance = self.significance(reading, model);
-                let weakest = (0..n)
-                    .min_by(|&i, &j| significance[i].total_cmp(&significance[j]))
-                    .expect("not empty");
-                if significance[weakest] < 4.0 * self.factor * self.price {
+                let mut faint: Vec<usize> = (0..n).collect();
+                faint.retain(|&i| significance[i] < 4.0 * self.factor * self.price);
+                faint.sort_by(|&i, &j| significance[i].total_cmp(&significance[j]));
+                for index in faint.into_iter().take(FAINTEST) {
                     let mut next = model.clone();
-                    next.spots.remove(weakest);
-                    has_shrunk = self.consider(reading, model, next);
+                    next.spots.remove(index);
+                    if self.consider(reading, model, next) {
+                        has_shrunk = true;
+                        break;
+                    }
                 }
             }
             if !has_shrunk {
