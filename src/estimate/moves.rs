@@ -12,8 +12,10 @@ const SEPARATION: f64 = 2.5;
 const MERGE: f64 = 2.5;
 /// Spots that are tried to be done without, a round.
 const FAINTEST: usize = 6;
-/// A split that promises this share of an emitter's price is tried though the frame is explained without.
-const LIKELY: f64 = 0.1;
+/// A split that promises this share of an emitter's price is tried though the frame is explained without: less where spots
+/// overlap, since others then hide part of what it brings.
+const LIKELY: f64 = 0.6;
+const LIKELY_IN_OVERLAP: f64 = 0.1;
 /// A split puts its halves this far to either side, σ.
 const SPLIT: f64 = 0.4;
 
@@ -77,8 +79,13 @@ impl Search {
                 break;
             }
         }
+        let share = if self.sampler.is_some() {
+            LIKELY_IN_OVERLAP
+        } else {
+            LIKELY
+        };
         for (gain, index, direction) in self.splits(reading, model).into_iter().take(3) {
-            if reading.is_explained(model) && gain < LIKELY * self.factor * self.price {
+            if reading.is_explained(model) && gain < share * self.factor * self.price {
                 return;
             }
             let mut next = model.clone();

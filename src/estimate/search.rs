@@ -17,7 +17,7 @@ pub(super) const MOST: usize = 80;
 /// Steps that a candidate may take before it is judged.
 pub(super) const TRIAL_STEPS: usize = 30;
 /// So many further emitters that explain a frame are not asked for another explanation.
-const FEW: usize = 1;
+const FEW: usize = 2;
 /// Steps that the pencil's seeds are polished by.
 const POLISH: usize = 100;
 /// Rounds of moves, and of those before another explanation than more emitters is tried.
@@ -122,7 +122,7 @@ impl Search {
         if !reading.is_explained(&model) && !self.is_odd(&model) {
             self.refine(reading, &mut model, EARLY_ROUNDS);
         }
-        if model.spots.len() > first.spots.len() + FEW {
+        if model.spots.len() > first.spots.len() + 1 {
             model = first;
         }
         // A background has singular values of its own: what the first start explained with it may hold ghosts.
