@@ -28,10 +28,12 @@ const OVERLAP: f64 = 3.0;
 const LARGEST_ACCELERATION: f64 = 0.56 / 4.0;
 /// A bar is out of reach when this many times the drop that a quadratic promises does not get there.
 const HOPE: f64 = 5.0;
-/// Multiplications a frame may cost: the same for every run, unlike a clock. About 10 ms on one core of 2021.
+/// Multiplications that a frame of a few emitters may cost: the same for every run, unlike a clock.
 const MOST_WORK: f64 = 1e8;
-/// The same with what the last fit may take beyond.
-const LAST_WORK: f64 = 1.2 * MOST_WORK;
+/// Emitters from which on a frame may cost more, with the square of their number.
+const MANY: f64 = 8.0;
+/// Share that the last fit may take beyond.
+const BEYOND: f64 = 1.2;
 
 /// The fit's scratch memory. Grows to the largest problem seen and then allocates nothing.
 pub(super) struct Fitter {
@@ -58,6 +60,8 @@ pub(super) struct Fitter {
     pub(super) active: Vec<bool>,
     /// Multiplications since the last frame, and the time it must be done by.
     work: f64,
+    /// Sources of the largest hypothesis since.
+    most_sources: f64,
     deadline: Option<Instant>,
 }
 
@@ -85,6 +89,7 @@ impl Fitter {
             small: Vec::new(),
             active: Vec::new(),
             work: 0.0,
+            most_sources: 0.0,
             deadline: None,
         }
     }
@@ -92,17 +97,22 @@ impl Fitter {
     /// Forgets the work done for the last frame.
     pub fn restart(&mut self, deadline: Option<Instant>) {
         self.work = 0.0;
+        self.most_sources = 0.0;
         self.deadline = deadline;
     }
 
     /// Leaves at least this share of a frame's work for what comes.
     pub fn reserve(&mut self, share: f64) {
-        self.work = self.work.min((1.0 - share) * MOST_WORK);
+        self.work = self.work.min((1.0 - share) * self.most_work());
+    }
+
+    fn most_work(&self) -> f64 {
+        MOST_WORK * (self.most_sources / MANY).max(1.0).powi(2)
     }
 
     /// Whether the frame has had its share of work, or of time where a budget is set.
     pub fn is_exhausted(&self) -> bool {
-        self.work > MOST_WORK || self.deadline.is_some_and(|d| Instant::now() >= d)
+        self.work > self.most_work() || self.deadline.is_some_and(|d| Instant::now() >= d)
     }
 
     /// Fits `model` from where it stands, at most `steps` steps.
@@ -229,9 +239,10 @@ impl Fitter {
                 .any(|t| (s.u[0] - t.u[0]).abs() < OVERLAP && (s.u[1] - t.u[1]).abs() < OVERLAP)
         });
         for _ in 0..steps {
-            if converged || self.work > LAST_WORK {
+            if converged || self.work > BEYOND * self.most_work() {
                 break;
             }
+            self.most_sources = self.most_sources.max(self.now.sources() as f64);
             self.work += self.step_work(reading);
             if !fresh {
                 self.linearise(reading, nuisances);
