@@ -56,7 +56,7 @@ impl Search {
         let area = |b: &Basis| b.edges[b.n] - b.edges[0];
         // The matched filter has about area/σ² independent positions; the price keeps the chance that any of
         // them exceeds it in an empty frame below 1e-3.
-        let price = (6.0 + 2.0 * (area(&fitter.bx) * area(&fitter.by)).ln()).max(13.0);
+        let price = (10.0 + 2.0 * (area(&fitter.bx) * area(&fitter.by)).ln()).max(14.0);
         Self {
             fitter,
             heatmap,
