@@ -79,3 +79,9 @@ check-aarch64: setup
 	rustup target add aarch64-unknown-linux-gnu
 	BINDGEN_EXTRA_CLANG_ARGS_aarch64_unknown_linux_gnu=--sysroot=/usr/aarch64-linux-gnu \
 		cargo check --release --locked --target aarch64-unknown-linux-gnu --target-dir target/cross --bin oapwatch
+
+.PHONY: tradeoff
+# docs/tradeoff: what accuracy costs in time. Some minutes on a machine that does nothing else.
+tradeoff: build
+	rm -f docs/tradeoff/tradeoff.json
+	target/release/oapwatch tradeoff --frames 60 --out docs/tradeoff

@@ -1,12 +1,15 @@
 use std::path::Path;
 
 use plotters::prelude::*;
+use plotters::style::text_anchor::{HPos, Pos, VPos};
 
 use super::report::{PAPER, cells, front, is_paper_cell};
 use super::{Error, PictureError, Row, Study};
 use crate::estimate::LADDER;
 
 const SIZE: (u32, u32) = (900, 600);
+/// Pixels a side that the axis goes to: beyond 100 there is room for the legend.
+const ARRAYS: f64 = 145.0;
 const FONT: (&str, i32) = ("sans-serif", 16);
 const CAPTION: (&str, i32) = ("sans-serif", 22);
 
@@ -88,18 +91,28 @@ fn accuracy_against_time(study: &Study, path: &Path) -> Drawn {
         .draw_series(LineSeries::new(line, BLUE.stroke_width(2)))?
         .label("Pareto front (time, OSPA)")
         .legend(|(x, y)| PathElement::new([(x, y), (x + 18, y)], BLUE));
+    // Labels point inwards; one just below its neighbour's mark hangs down.
+    let middle = (times.start * times.end).sqrt();
+    let mut last = (0.0, 0.0);
     for row in &rows {
         let Some(error) = row.median_m2 else { continue };
         let at = (row.latency_median_us, error);
-        chart.draw_series([Circle::new(at, 5, BLUE.filled())])?;
-        chart.draw_series([Text::new(
-            format!("  {} (OSPA {:.2} m)", row.rung, row.ospa_m),
-            at,
-            FONT.into_font(),
-        )])?;
+        let hangs = at.0 < 1.5 * last.0 && at.0 > last.0 / 1.5 && at.1 < last.1;
+        last = at;
+        let (side, dx) = if at.0 > middle {
+            (HPos::Right, -10)
+        } else {
+            (HPos::Left, 10)
+        };
+        let (height, dy) = if hangs { (VPos::Top, 4) } else { (VPos::Bottom, -4) };
+        let style = FONT.into_text_style(&area).pos(Pos::new(side, height));
+        let label = format!("{} (OSPA {:.2} m)", row.rung, row.ospa_m);
+        let mark = EmptyElement::at(at) + Circle::new((0, 0), 5, BLUE.filled()) + Text::new(label, (dx, dy), style);
+        chart.draw_series([mark])?;
     }
     chart
         .configure_series_labels()
+        .position(SeriesLabelPosition::UpperRight)
         .border_style(BLACK)
         .background_style(WHITE)
         .draw()?;
@@ -121,7 +134,7 @@ fn accuracy_against_array(study: &Study, path: &Path) -> Drawn {
         .margin(12)
         .x_label_area_size(45)
         .y_label_area_size(80)
-        .build_cartesian_2d(0.0..105.0, range(errors).log_scale())?;
+        .build_cartesian_2d(0.0..ARRAYS, range(errors).log_scale())?;
     chart
         .configure_mesh()
         .x_desc("pixels a side")
@@ -158,6 +171,7 @@ fn accuracy_against_array(study: &Study, path: &Path) -> Drawn {
     }
     chart
         .configure_series_labels()
+        .position(SeriesLabelPosition::UpperRight)
         .border_style(BLACK)
         .background_style(WHITE)
         .draw()?;
@@ -169,7 +183,7 @@ fn resolvable(study: &Study, path: &Path) -> Drawn {
     let cells: Vec<&Row> = cells(study)
         .into_iter()
         .map(|r| r[0])
-        .filter(|r| r.cell.emitters.is_none())
+        .filter(|r| r.cell.is_plain())
         .collect();
     let area = SVGBackend::new(path, SIZE).into_drawing_area();
     area.fill(&WHITE)?;
@@ -212,6 +226,7 @@ fn resolvable(study: &Study, path: &Path) -> Drawn {
     }
     chart
         .configure_series_labels()
+        .position(SeriesLabelPosition::UpperRight)
         .border_style(BLACK)
         .background_style(WHITE)
         .draw()?;

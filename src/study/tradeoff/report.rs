@@ -124,5 +124,5 @@ pub(super) fn markdown(study: &Study) -> String {
 }
 
 pub(super) fn is_paper_cell(row: &Row) -> bool {
-    row.cell.noise == Noise::Paper && row.cell.sigma_mm == 8.0 && row.cell.emitters.is_none()
+    row.cell.noise == Noise::Paper && row.cell.sigma_mm == 8.0 && row.cell.is_plain()
 }

@@ -77,6 +77,11 @@ impl Cell {
         }
     }
 
+    /// Five to nine emitters, and nothing that the estimator is not told of.
+    pub(super) fn is_plain(&self) -> bool {
+        self.emitters.is_none() && self.condition.is_none()
+    }
+
     /// Short name: reading, σ_eff in mm, pixels a side, and emitters where fixed.
     pub fn name(&self) -> String {
         let reading = match self.noise {

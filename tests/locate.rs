@@ -1,0 +1,114 @@
+//! `oapwatch locate` on files that are not as they should be: what it says, what it still gives, and its exit code.
+
+use std::path::Path;
+use std::process::{Command, Output};
+
+const SIDE: usize = 32;
+
+/// A .npy file of `frames` frames of `side` rows, dark but for what `fill` says of each frame.
+fn npy(folder: &Path, dict: &str, frames: usize, rows: usize, fill: impl Fn(usize) -> f64) -> std::path::PathBuf {
+    let mut bytes = b"\x93NUMPY\x01\x00".to_vec();
+    bytes.extend_from_slice(&(dict.len() as u16).to_le_bytes());
+    bytes.extend_from_slice(dict.as_bytes());
+    for k in 0..frames {
+        bytes.extend((0..rows * SIDE).flat_map(|_| fill(k).to_le_bytes()));
+    }
+    let path = folder.join("frames.npy");
+    std::fs::write(&path, bytes).unwrap();
+    path
+}
+
+fn dict(descr: &str, fortran: &str, shape: &str) -> String {
+    format!("{{'descr': '{descr}', 'fortran_order': {fortran}, 'shape': {shape}, }}\n")
+}
+
+fn locate(folder: &Path, frames: &Path, more: &str) -> Output {
+    let config = folder.join("oapwatch.toml");
+    std::fs::write(&config, format!("[optics]\npixels = [{SIDE}, {SIDE}]\n{more}")).unwrap();
+    Command::new(env!("CARGO_BIN_EXE_oapwatch"))
+        .args(["locate", "--config"])
+        .args([&config, frames])
+        .output()
+        .unwrap()
+}
+
+/// What a run that must be refused says.
+#[track_caller]
+fn refusal(output: &Output, code: i32) -> String {
+    assert_eq!(output.status.code(), Some(code));
+    assert!(output.stdout.is_empty());
+    String::from_utf8(output.stderr.clone()).unwrap()
+}
+
+fn lines(output: &Output) -> Vec<serde_json::Value> {
+    let text = std::str::from_utf8(&output.stdout).unwrap();
+    text.lines().map(|l| serde_json::from_str(l).unwrap()).collect()
+}
+
+#[test]
+fn files_that_hold_no_frames_are_refused_by_name() {
+    let folder = tempfile::tempdir().unwrap();
+    for (descr, fortran, shape, expected) in [
+        (
+            "<c16",
+            "False",
+            "(1, 32, 32)",
+            "expected f4, f8, u1 or u2, found \"<c16\"",
+        ),
+        ("<f8", "True", "(1, 32, 32)", "expected C order, found Fortran order"),
+        ("<f8", "False", "(0, 32, 32)", "expected at least one frame"),
+        ("<f8", "False", "(1024,)", "shape"),
+    ] {
+        let path = npy(folder.path(), &dict(descr, fortran, shape), 1, SIDE, |_| 0.0);
+        let said = refusal(&locate(folder.path(), &path, ""), 2);
+        assert!(said.contains("frames.npy") && said.contains(expected), "{said}");
+    }
+}
+
+#[test]
+fn an_unusable_frame_is_an_error_and_the_next_one_is_not() {
+    let folder = tempfile::tempdir().unwrap();
+    let header = dict("<f8", "False", "(3, 32, 32)");
+    let nan = npy(folder.path(), &header, 3, SIDE, |k| if k == 1 { f64::NAN } else { 0.0 });
+    let output = locate(folder.path(), &nan, "");
+    assert!(output.status.success());
+    let found = lines(&output);
+    assert_eq!(found.len(), 3);
+    assert!(found[1]["error"].as_str().unwrap().contains("no usable pixel"));
+    for k in [0, 2] {
+        assert_eq!(found[k]["emitters"], serde_json::json!([]));
+    }
+}
+
+#[test]
+fn frames_of_another_shape_are_each_an_error() {
+    let folder = tempfile::tempdir().unwrap();
+    let narrow = npy(folder.path(), &dict("<f8", "False", "(2, 16, 32)"), 2, 16, |_| 0.0);
+    let found = lines(&locate(folder.path(), &narrow, ""));
+    assert_eq!(found.len(), 2);
+    for line in found {
+        assert_eq!(line["error"], "frame is 32 × 16 pixels, the config says 32 × 32");
+    }
+}
+
+#[test]
+fn a_truncated_file_gives_what_is_whole_and_then_says_so() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = npy(folder.path(), &dict("<f8", "False", "(3, 32, 32)"), 2, SIDE, |_| 0.0);
+    let output = locate(folder.path(), &path, "");
+    assert_eq!(output.status.code(), Some(2));
+    assert_eq!(lines(&output).len(), 2);
+    assert!(
+        std::str::from_utf8(&output.stderr)
+            .unwrap()
+            .contains("frame 2 is truncated")
+    );
+}
+
+#[test]
+fn an_unknown_key_is_refused_with_the_nearest_known_one() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = npy(folder.path(), &dict("<f8", "False", "(1, 32, 32)"), 1, SIDE, |_| 0.0);
+    let said = refusal(&locate(folder.path(), &path, "spot_sigma = 0.001\n"), 64);
+    assert!(said.contains("spot_sigma") && said.contains("spot_sigma_m"), "{said}");
+}
