@@ -4,7 +4,7 @@ use std::time::Instant;
 use anyhow::Context;
 use serde::Serialize;
 
-use super::{Failure, Outcome};
+use super::{Failure, Outcome, progress};
 use crate::config::Config;
 use crate::estimate::{self, Emitter};
 use crate::frame::Frame;
@@ -49,6 +49,7 @@ pub fn run(args: Args) -> Outcome {
     let frames = npy::Reader::open(&args.frames, camera.joules_per_count).map_err(Failure::input)?;
     let start = config.source.start.unwrap_or(jiff::Timestamp::UNIX_EPOCH);
     let mut out = std::io::BufWriter::new(std::io::stdout().lock());
+    let bar = progress::count("frames");
     for (index, pixels) in frames.enumerate() {
         let pixels = match pixels {
             Ok(pixels) => pixels,
@@ -81,6 +82,8 @@ pub fn run(args: Args) -> Outcome {
         };
         serde_json::to_writer(&mut out, &line).map_err(|e| Failure::other(std::io::Error::from(e)))?;
         writeln!(out).map_err(Failure::other)?;
+        bar.inc(1);
     }
+    bar.finish_and_clear();
     out.flush().map_err(Failure::other)
 }

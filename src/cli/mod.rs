@@ -9,6 +9,7 @@ mod failure;
 mod locate;
 mod man;
 mod picture;
+mod progress;
 mod review;
 mod run;
 mod simulate;

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use anyhow::anyhow;
 
-use super::{Failure, Outcome};
+use super::{Failure, Outcome, progress};
 use crate::claims::{self, read_log};
 use crate::config::Config;
 use crate::frames::{self, Next, SourceKind};
@@ -39,6 +39,7 @@ pub fn run(args: Args) -> Outcome {
     })?;
     let mut upcoming = claims_of(&config.claims)?.into_iter().peekable();
     let mut out = std::io::BufWriter::new(std::io::stdout().lock());
+    let bar = progress::count("frames");
     loop {
         let next = source.next(Duration::from_secs(1));
         pipeline.monitor.recorded_in(source.file());
@@ -62,7 +63,9 @@ pub fn run(args: Args) -> Outcome {
             Next::End => break,
         };
         print(&mut out, &report.events).map_err(Failure::other)?;
+        bar.inc(1);
     }
+    bar.finish_and_clear();
     out.flush().map_err(Failure::other)
 }
 

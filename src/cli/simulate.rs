@@ -2,11 +2,10 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use indicatif::{ProgressBar, ProgressStyle};
 use jiff::Timestamp;
 
 use super::simulated_recording::Recording;
-use super::{Failure, Outcome};
+use super::{Failure, Outcome, progress};
 use crate::scene::{Plan, Scene};
 
 #[derive(Debug, clap::Args)]
@@ -39,8 +38,7 @@ pub fn run(args: Args) -> Outcome {
     let shape = plan.camera().shape();
     let mut recording = Recording::create(&args.out, shape).map_err(Failure::other)?;
 
-    let style = "{bar:40} {pos}/{len} frames, {per_sec}, {eta} left";
-    let bar = ProgressBar::new(args.frames).with_style(ProgressStyle::with_template(style).expect("a valid template"));
+    let bar = progress::bar(args.frames, "frames");
     let batch = (BATCH_PIXELS / (shape.0 * shape.1)).clamp(1, 256) as u64;
     let mut next = 0;
     while next < args.frames && !interrupted.load(Ordering::Relaxed) {

@@ -1,6 +1,6 @@
 use std::path::PathBuf;
 
-use super::{Failure, Outcome};
+use super::{Failure, Outcome, progress};
 use crate::estimate;
 use crate::study::stability::{Options, catalogue, markdown};
 
@@ -36,12 +36,14 @@ pub fn run(args: Args) -> Outcome {
     }
     let wanted = |text: &str| args.only.as_ref().is_none_or(|only| text.contains(only.as_str()));
     let mut rows = Vec::new();
-    for case in catalogue() {
-        if wanted(case.group) || wanted(&case.name) {
-            eprintln!("{}: {}", case.group, case.name);
-            rows.push(case.run(&options));
-        }
+    let mut cases = catalogue();
+    cases.retain(|case| wanted(case.group) || wanted(&case.name));
+    let bar = progress::bar(cases.len() as u64, "cases");
+    for case in cases {
+        rows.push(case.run(&options));
+        bar.inc(1);
     }
+    bar.finish_and_clear();
     let text = markdown(&rows);
     println!("{text}");
     if let Some(path) = &args.out {

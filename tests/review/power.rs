@@ -5,7 +5,7 @@ use oapwatch::monitor::AlertKind::UnclaimedEmitter;
 
 use super::stage::{Story, review};
 
-/// Alerts of `kind` within `within` seconds of the shadow's coming, of `n` stories, with its delays.
+/// Of `n` shadows: how many go unseen, how often something else is alerted first, and the delays of the rest, s, rising.
 fn delays(n: u64, beside_m: f64, power_w: f64, history_s: f64) -> (usize, usize, Vec<f64>) {
     let (mut other, mut silent, mut delays) = (0, 0, Vec::new());
     for seed in 0..n {

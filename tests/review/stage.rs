@@ -1,5 +1,8 @@
 //! Scenes rendered by the program's own simulator, pixel by pixel, through estimator, tracks and verdicts.
 
+#[path = "../stories/expected.rs"]
+mod expected;
+
 use jiff::Timestamp;
 use oapwatch::config::Config;
 use oapwatch::monitor::{AlertEvent, AlertEventKind, AlertKind, Report};
@@ -155,17 +158,11 @@ impl Reviewed {
     /// Exactly these were raised, each within its interval, s, and nothing else.
     #[track_caller]
     pub fn expect(&self, expected: &[(AlertKind, Option<&str>, f64, f64)]) {
-        let raised = self.raised();
-        let as_wished = raised.len() == expected.len()
-            && raised
-                .iter()
-                .zip(expected)
-                .all(|(r, e)| r.0 == e.0 && r.1.as_deref() == e.1 && r.2 >= e.2 - 1e-9 && r.2 <= e.3 + 1e-9);
         let log: String = self
             .events
             .iter()
             .map(|e| serde_json::to_string(e).unwrap() + "\n")
             .collect();
-        assert!(as_wished, "raised {raised:#?}\nexpected {expected:#?}\n{log}");
+        expected::expect(&self.raised(), expected, &log);
     }
 }

@@ -2,6 +2,8 @@
 //! the stated covariance), and whatever goes wrong. Nothing here knows how the monitor decides.
 #![allow(dead_code, reason = "each test file tells other stories")]
 
+mod expected;
+
 use std::collections::BTreeMap;
 
 use jiff::{SignedDuration, Timestamp};
@@ -278,17 +280,7 @@ impl Told {
     /// Exactly these were raised, each within its interval, and nothing else.
     #[track_caller]
     pub fn expect(&self, expected: &[(AlertKind, Option<&str>, f64, f64)]) {
-        let raised = self.raised();
-        let as_wished = raised.len() == expected.len()
-            && raised
-                .iter()
-                .zip(expected)
-                .all(|(r, e)| r.0 == e.0 && r.1.as_deref() == e.1 && r.2 >= e.2 - 1e-9 && r.2 <= e.3 + 1e-9);
-        assert!(
-            as_wished,
-            "raised {raised:#?}\nexpected {expected:#?}\n{}",
-            self.ndjson()
-        );
+        expected::expect(&self.raised(), expected, &self.ndjson());
     }
 }
 

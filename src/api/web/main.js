@@ -204,6 +204,7 @@ async function frame() {
     $("no-frame").hidden = true;
   } catch (e) {
     if (e.status === 503) {
+      shownFrame = latest?.frame ?? null;
       $("frame").removeAttribute("src");
       $("no-frame").hidden = false;
     }
