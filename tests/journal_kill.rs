@@ -70,6 +70,7 @@ fn webhook_in(dir: &Path) -> Vec<Endpoint> {
         kinds: None,
         allow_http: false,
         ca_file: None,
+        cool_down_s: 0.0,
         timeout_s: 20.0,
     };
     notify::load(&[config]).unwrap()

@@ -88,6 +88,7 @@ pub struct ClaimsStatus {
     pub malformed: u64,
     /// Users with an active claim.
     pub users: u64,
+    /// The time of the newest claim that stands, from whichever way it came.
     #[schema(value_type = Option<String>, format = DateTime)]
     pub last_at: Option<Timestamp>,
 }

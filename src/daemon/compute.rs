@@ -275,7 +275,7 @@ impl Compute {
                 accepted: counts.accepted,
                 malformed: s.malformed,
                 users: report.claims.iter().filter(|c| c.state == ClaimState::Active).count() as u64,
-                last_at: s.last_claim,
+                last_at: self.pipeline.claims.newest(),
             },
             journal: JournalStatus {
                 healthy: health.writable,
@@ -305,7 +305,6 @@ impl Compute {
                         if self.recorder.is_some() {
                             self.unrecorded.push(claim.clone());
                         }
-                        self.state.last_claim = Some(claim.time);
                         let reason = match self.pipeline.claims.insert(claim, now) {
                             Outcome::Full => "the store of claims is full",
                             Outcome::Conflicting => "another position was claimed for this user and time",
@@ -371,9 +370,6 @@ impl Compute {
                 self.state.malformed += count;
                 metrics::counter!(metric::CLAIMS, "outcome" => "malformed").increment(count);
                 tracing::warn!(line = first.line, error = %first.error, count, "lines of the claims log are no claims");
-            }
-            if let Some(last) = poll.claims.last() {
-                self.state.last_claim = Some(last.time);
             }
             if self.is_replay {
                 self.pipeline.claim(poll.claims, self.state.clock);

@@ -15,6 +15,7 @@ use std::time::Duration;
 
 use anyhow::{Context, Result};
 use jiff::Timestamp;
+use metrics_exporter_prometheus::PrometheusHandle;
 use tokio::sync::{mpsc, watch};
 
 use crate::claims::Follower;
@@ -34,6 +35,8 @@ use supervisor::Supervisor;
 const COMMANDS: usize = 64;
 /// How often the journal is held to its limits.
 const MAINTENANCE: Duration = Duration::from_secs(3600);
+/// How often measurements are added up: until then each one is kept, and nobody may ever ask for the metrics.
+const UPKEEP: Duration = Duration::from_secs(5);
 /// Deliveries under way when the daemon stops have this long.
 const LAST_DELIVERIES: Duration = Duration::from_millis(800);
 
@@ -110,7 +113,7 @@ impl Daemon {
         );
         let (commands, orders) = mpsc::channel(COMMANDS);
         let ready = Arc::new(AtomicBool::new(false));
-        let state = api::State::new(feed, commands, self.journal.clone(), metrics, ready.clone());
+        let state = api::State::new(feed, commands, self.journal.clone(), metrics.clone(), ready.clone());
         let state = state.with_webhooks(notifier.clone());
 
         let source = &self.config.source;
@@ -154,7 +157,7 @@ impl Daemon {
         };
         let mut compute = tokio::task::spawn_blocking(move || compute.run());
         let mut serving = tokio::spawn(self.server.serve(listener, state, stops()));
-        let upkeep = tokio::spawn(maintain(self.journal.clone()));
+        let upkeep = tokio::spawn(maintain(self.journal.clone(), metrics));
 
         let outcome = tokio::select! {
             signal = reload::until_stopped(&self.config, self.path.as_deref(), &logging) => signal,
@@ -188,10 +191,13 @@ impl Daemon {
     }
 }
 
-async fn maintain(journal: Journal) {
-    let mut interval = tokio::time::interval(MAINTENANCE);
+async fn maintain(journal: Journal, metrics: PrometheusHandle) {
+    let mut maintenance = tokio::time::interval(MAINTENANCE);
+    let mut upkeep = tokio::time::interval(UPKEEP);
     loop {
-        interval.tick().await;
-        journal.maintain(Timestamp::now());
+        tokio::select! {
+            _ = maintenance.tick() => journal.maintain(Timestamp::now()),
+            _ = upkeep.tick() => metrics.run_upkeep(),
+        }
     }
 }

@@ -47,6 +47,8 @@ pub enum Outcome {
     Dead {
         error: String,
     },
+    /// Not to be sent at all: a cool-down folded it. No request was made.
+    Withheld,
 }
 
 /// A delivery that the schedule gave up on.

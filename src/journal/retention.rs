@@ -8,7 +8,7 @@ use super::store::Store;
 const CHUNK: usize = 500;
 
 /// Alerts are kept in memory up to this size, MB.
-const MEMORY_MB: u32 = 64;
+const MEMORY_MB: u32 = 16;
 
 /// What is kept. Open alerts and deliveries that wait always are.
 #[derive(Clone, Copy, Debug)]

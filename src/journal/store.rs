@@ -156,6 +156,11 @@ fn put_event(
 fn put_attempt(tx: &Connection, attempt: &Attempt) -> Result<(), rusqlite::Error> {
     let at = attempt.at.as_microsecond();
     let (state, step, next, error) = match &attempt.outcome {
+        Outcome::Withheld => {
+            tx.prepare_cached("DELETE FROM delivery WHERE seq = ?1 AND endpoint = ?2")?
+                .execute(params![attempt.seq, attempt.endpoint])?;
+            return Ok(());
+        }
         Outcome::Sent => ("sent", None, None, None),
         Outcome::Retry { step, next_at, error } => {
             ("waiting", Some(*step), Some(next_at.as_microsecond()), Some(error))

@@ -1,6 +1,9 @@
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 
+/// Beams without a claim this near to each other, one after the other, are one cause, m.
+pub(super) const SAME_PLACE_M: f64 = 10.0;
+
 /// What an alert is about.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "snake_case")]
@@ -77,6 +80,19 @@ pub struct Alert {
     pub claimed: Option<serde_json::Value>,
     pub evidence: serde_json::Value,
     pub source: AlertSource,
+}
+
+impl Alert {
+    /// Whether the other alert is about the same thing: its user, the spot it shares, or, where it names neither, its place.
+    pub fn has_cause_of(&self, other: &Self) -> bool {
+        let spot = |alert: &Self| alert.evidence["shares_the_spot_of"].as_str().map(str::to_owned);
+        let is_near = match (self.x_m.zip(self.y_m), other.x_m.zip(other.y_m)) {
+            (Some((x, y)), Some((ox, oy))) => (x - ox).hypot(y - oy) < SAME_PLACE_M,
+            (here, there) => here == there,
+        };
+        let is_named = self.user.is_some() || spot(self).is_some();
+        self.kind == other.kind && self.user == other.user && spot(self) == spot(other) && (is_named || is_near)
+    }
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, utoipa::ToSchema)]

@@ -3,6 +3,7 @@ use std::collections::BTreeMap;
 use jiff::Timestamp;
 use serde_json::Value;
 
+use super::alert::SAME_PLACE_M;
 use super::{Alert, AlertEvent, AlertEventKind, AlertKind, AlertSource, AlertState, Severity};
 use crate::claims::seconds;
 
@@ -65,8 +66,6 @@ pub(super) struct Book {
 const CLEAR_S: f64 = 1.0;
 /// Causes remembered after they cleared.
 const MOST_CLEARED: usize = 10_000;
-/// Beams without a claim this near to each other, one after the other, are one cause, m.
-pub(super) const SAME_PLACE_M: f64 = 10.0;
 
 impl Cause {
     pub fn kind(&self) -> AlertKind {
@@ -134,6 +133,14 @@ impl Book {
 
     pub fn open(&self) -> impl Iterator<Item = (&Cause, &Alert)> {
         self.open.iter().map(|(cause, open)| (cause, &open.alert))
+    }
+
+    /// Users with an alert of this kind that is open or cleared within the cool-down.
+    pub fn users_lately(&self, kind: AlertKind, now: Timestamp) -> usize {
+        let is_of = |cause: &Cause| matches!(cause, Cause::User(of, _) if *of == kind);
+        let open = self.open.keys().filter(|cause| is_of(cause)).count();
+        let cleared = self.cleared.iter().filter(|(cause, _)| is_of(cause));
+        open + cleared.filter(|(_, c)| seconds(c.at, now) <= self.cool_down_s).count()
     }
 
     /// The cause is there: raises its alert, or brings the open one up to date (an event only when its severity changed).

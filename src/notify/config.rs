@@ -25,6 +25,10 @@ pub struct Config {
     /// Certificates (PEM) of a private authority that the receiver's certificate may come from.
     #[serde(default)]
     pub ca_file: Option<PathBuf>,
+    /// A cause that came back within this of the time it was last told of is told of again only once this is over, if it
+    /// is still there then, or at once if it has grown worse, s. 0 tells of every event.
+    #[serde(default)]
+    pub cool_down_s: f64,
     /// Longest wait for an answer, s.
     #[serde(default = "twenty")]
     pub timeout_s: f64,

@@ -15,6 +15,7 @@ pub struct Endpoint {
     pub(super) url: Url,
     pub(super) signer: Signer,
     pub(super) client: reqwest::Client,
+    pub(super) cool_down: Duration,
     subscription: Subscription,
 }
 
@@ -50,6 +51,8 @@ pub enum Error {
     },
     #[error("[[webhook]] {index}: timeout_s: expected 1 to 120, found {found}")]
     Timeout { index: usize, found: f64 },
+    #[error("[[webhook]] {index}: cool_down_s: expected 0 to 86400, found {found}")]
+    CoolDown { index: usize, found: f64 },
     #[error("[[webhook]] {index}: name: expected 1 to 64 letters, digits, '-' or '_', found `{found}`")]
     Name { index: usize, found: String },
     #[error("[[webhook]] {index}: `{name}` is taken by [[webhook]] {earlier}; give one of them another name")]
@@ -103,6 +106,12 @@ impl Endpoint {
                 found: config.timeout_s,
             });
         }
+        if !(0.0..=86_400.0).contains(&config.cool_down_s) {
+            return Err(Error::CoolDown {
+                index,
+                found: config.cool_down_s,
+            });
+        }
         if config.kinds.as_ref().is_some_and(Vec::is_empty) {
             return Err(Error::NoKinds { index });
         }
@@ -120,6 +129,7 @@ impl Endpoint {
         Ok(Self {
             signer: read_secrets(index, config)?,
             client: client::build(index, config, timeout, loopback)?,
+            cool_down: Duration::from_secs_f64(config.cool_down_s),
             subscription: Subscription {
                 endpoint: name.clone(),
                 kinds: config.kinds.clone(),

@@ -6,6 +6,7 @@
 mod client;
 mod clock;
 mod config;
+mod cooling;
 mod endpoint;
 mod payload;
 mod queue;

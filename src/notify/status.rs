@@ -11,9 +11,11 @@ pub struct EndpointStatus {
     /// `null` is all.
     pub kinds: Option<Vec<AlertKind>>,
     pub state: EndpointState,
-    /// Deliveries still to be made.
+    /// Deliveries still to be made, those that a cool-down holds back included.
     pub queued: u64,
     pub sent: u64,
+    /// Events since the start that a cool-down kept from the receiver: causes that came back and were gone again.
+    pub withheld: u64,
     /// Dead letters: given up at the end of the retry schedule, kept, sent again on request.
     pub failed: u64,
     /// When the oldest event that is still queued was recorded.
@@ -48,6 +50,7 @@ impl EndpointStatus {
             state: EndpointState::Working,
             queued: 0,
             sent: 0,
+            withheld: 0,
             failed: 0,
             oldest_queued: None,
             last_success: None,

@@ -10,10 +10,11 @@ use tokio::sync::{mpsc, oneshot};
 use tokio::task::{Id, JoinError, JoinSet};
 
 use super::client::{self, Failure, Verdict};
+use super::cooling::{CoolDown, Ruling};
 use super::queue::{Next, Queue};
 use super::status::{EndpointState, EndpointStatus};
 use super::{Clock, Endpoint, schedule};
-use crate::journal::{self, Attempt, Journal, Outcome, Waiting};
+use crate::journal::{self, Attempt, Journal, Outcome, Recorded, Waiting};
 use crate::metric;
 
 /// How long requests that are under way may still take when the daemon stops.
@@ -42,6 +43,7 @@ pub(super) enum Command {
 struct Lane {
     endpoint: Arc<Endpoint>,
     queue: Queue,
+    cool_down: CoolDown,
     /// Events up to this one are in the queue, or done with.
     read_to: u64,
     status: EndpointStatus,
@@ -70,6 +72,7 @@ impl Worker {
     ) -> Self {
         let lane = |endpoint: Arc<Endpoint>| Lane {
             status: EndpointStatus::new(&endpoint),
+            cool_down: CoolDown::new(endpoint.cool_down),
             endpoint,
             queue: Queue::default(),
             read_to: 0,
@@ -104,9 +107,14 @@ impl Worker {
                 }
             }
             let now = self.clock.uptime();
+            self.release_held(now);
             self.start(now);
             self.show(now);
-            let wakes = self.lanes.iter().filter_map(|lane| lane.queue.wake_at());
+            let wakes = self
+                .lanes
+                .iter()
+                .flat_map(|lane| [lane.queue.wake_at(), lane.cool_down.wake_at()])
+                .flatten();
             // What is due already waits for a request that is under way.
             let wake = wakes
                 .filter(|&at| at > now)
@@ -165,14 +173,63 @@ impl Worker {
         if lane.read_to == last && last > 0 {
             return Ok(());
         }
-        let (name, after) = (lane.endpoint.name().to_owned(), lane.read_to);
-        let rows = self.ask(move |journal| journal.waiting(&name, after)).await?;
-        for row in &rows {
-            self.push(k, row);
+        let (name, after, is_cooled) = (lane.endpoint.name().to_owned(), lane.read_to, !lane.cool_down.is_off());
+        let rows = self
+            .ask(move |journal| {
+                let rows = journal.waiting(&name, after)?.into_iter();
+                // What an event says matters to a cool-down only.
+                let event = |seq| is_cooled.then(|| journal.event(seq)).transpose();
+                rows.map(|row| Ok((event(row.seq)?.flatten(), row))).collect()
+            })
+            .await?;
+        let rows: Vec<(Option<Recorded>, Waiting)> = rows;
+        let read_to = rows.last().map_or(last, |(_, row)| row.seq.max(last));
+        for (event, row) in rows {
+            self.cool(k, event, row);
         }
-        let lane = &mut self.lanes[k];
-        lane.read_to = rows.last().map_or(last, |row| row.seq.max(last));
+        self.lanes[k].read_to = read_to;
         Ok(())
+    }
+
+    /// Queues a new delivery, holds it back, or keeps it from the receiver for good.
+    fn cool(&mut self, k: usize, event: Option<Recorded>, row: Waiting) {
+        let now = self.clock.uptime();
+        let ruling = match event {
+            Some(event) => self.lanes[k].cool_down.judge(row, &event.event, now),
+            None => Ruling::Send(vec![row]),
+        };
+        match ruling {
+            Ruling::Hold => {}
+            Ruling::Send(rows) => {
+                for row in &rows {
+                    self.push(k, row);
+                }
+            }
+            Ruling::Withhold(rows) => {
+                let lane = &mut self.lanes[k];
+                lane.status.withheld += rows.len() as u64;
+                let name = lane.endpoint.name();
+                counter!(metric::WEBHOOK_ATTEMPTS, "endpoint" => name.to_owned(), "outcome" => "withheld")
+                    .increment(rows.len() as u64);
+                for row in rows {
+                    self.journal.attempted(Attempt {
+                        seq: row.seq,
+                        endpoint: row.endpoint,
+                        at: self.clock.now(),
+                        outcome: Outcome::Withheld,
+                    });
+                }
+            }
+        }
+    }
+
+    /// Queues what was held back for long enough.
+    fn release_held(&mut self, now: Duration) {
+        for k in 0..self.lanes.len() {
+            for row in self.lanes[k].cool_down.due(now) {
+                self.push(k, &row);
+            }
+        }
     }
 
     fn push(&mut self, k: usize, row: &Waiting) {
@@ -313,7 +370,9 @@ impl Worker {
                         // Later events come in by `read_new`, once.
                         let read_to = self.lanes[endpoint].read_to;
                         for row in rows.iter().filter(|row| row.seq <= read_to) {
-                            self.push(endpoint, row);
+                            if !self.lanes[endpoint].cool_down.holds(row.seq) {
+                                self.push(endpoint, row);
+                            }
                         }
                     }
                     Err(error) => tracing::warn!(%error, "the webhook outbox cannot be read"),
@@ -337,7 +396,7 @@ impl Worker {
                 (false, true) => EndpointState::Failing,
                 (false, false) => EndpointState::Working,
             };
-            status.queued = lane.queue.len() as u64;
+            status.queued = (lane.queue.len() + lane.cool_down.len()) as u64;
             status.oldest_queued = lane.queue.oldest();
             status.next_attempt = lane.queue.wake_at().map(|at| {
                 let wait = SignedDuration::try_from(at.saturating_sub(now)).unwrap_or(SignedDuration::MAX);

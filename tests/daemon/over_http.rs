@@ -115,6 +115,11 @@ fn claims_are_counted_by_what_became_of_them() {
         .unwrap()
         .as_secs_f64();
     assert!((now - last).abs() < 60.0, "{last} against {now}");
+    // The same for the status: the simulator's users claim, and nobody else's claim is newer.
+    let (_, status) = daemon.get("/v1/status");
+    let status: serde_json::Value = serde_json::from_str(&status).unwrap();
+    let told: jiff::Timestamp = status["claims"]["last_at"].as_str().unwrap().parse().unwrap();
+    assert!((told.as_millisecond() as f64 * 1e-3 - last).abs() < 60.0, "{status}");
 }
 
 #[test]

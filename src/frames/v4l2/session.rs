@@ -103,7 +103,7 @@ impl Session {
         );
         let started = Moment::now();
         Ok(Self {
-            stream: node.start(BUFFERS).map_err(io("start"))?,
+            stream: Stream::start(node, BUFFERS).map_err(io("start"))?,
             layout,
             granted,
             started,

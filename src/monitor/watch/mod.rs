@@ -57,6 +57,8 @@ pub struct Monitor {
     /// Since when each track has had no claim, by track.
     alone: BTreeMap<u64, Timestamp>,
     level_unclaimed: f64,
+    /// Users of the frame who share the alert of those never seen.
+    strangers: Vec<String>,
 }
 
 impl Monitor {
@@ -81,6 +83,7 @@ impl Monitor {
             frame: 0,
             alone: BTreeMap::new(),
             level_unclaimed,
+            strangers: Vec::new(),
             thresholds,
             config: config.clone(),
         }

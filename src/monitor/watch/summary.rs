@@ -56,6 +56,7 @@ impl Monitor {
                     .is_open(&Cause::User(AlertKind::UserUnseen, a.claim.user.clone()))
             })
             .map(|a| a.claim.user.clone())
+            .chain(self.strangers.iter().cloned())
             .collect();
         Report {
             time: now,

@@ -13,6 +13,19 @@ use crate::monitor::{AlertKind, Severity};
 
 /// Frames in a row that must show a beam outside before a single claim's evidence stands.
 const OUTSIDE_FRAMES: u32 = 3;
+/// Users never seen at all that have an alert each; more of them within a cool-down have one cause, which is not theirs.
+const MOST_NEVER_SEEN: usize = 10;
+/// Names of them that the common alert gives.
+const MOST_NAMES: usize = 20;
+
+/// Users who are claimed and were never seen, too many for an alert each.
+#[derive(Debug, Default)]
+struct Strangers {
+    names: Vec<String>,
+    longest_s: f64,
+    /// Users with an alert of their own, lately. Counted only when somebody asks.
+    with_alert: Option<usize>,
+}
 
 impl Monitor {
     /// Adds the frame's and the new claims' evidence to what is known of each user.
@@ -87,10 +100,12 @@ impl Monitor {
         let each = (asserted.len() * WINDOWS.len()) as f64;
         let level = self.thresholds.level_every(self.period_s.unwrap_or(0.0), each);
         let level_unseen = self.thresholds.level(asserted.len() as f64);
+        let mut strangers = Strangers::default();
         for (a, answer) in asserted.iter().zip(answers) {
             self.decide_mismatch(a, *answer, level, now);
-            self.decide_unseen(a, level_unseen, now);
+            self.decide_unseen(a, level_unseen, &mut strangers, now);
         }
+        self.decide_strangers(strangers, now);
         let present: BTreeSet<&str> = asserted.iter().map(|a| a.claim.user.as_str()).collect();
         let orphans: Vec<Cause> = self
             .book
@@ -149,7 +164,7 @@ impl Monitor {
         self.book.report(&cause, finding, now, self.frame);
     }
 
-    fn decide_unseen(&mut self, a: &Asserted, level: f64, now: Timestamp) {
+    fn decide_unseen(&mut self, a: &Asserted, level: f64, strangers: &mut Strangers, now: Timestamp) {
         let cause = Cause::User(AlertKind::UserUnseen, a.claim.user.clone());
         let Some(user) = self.users.get(&a.claim.user) else {
             return;
@@ -169,11 +184,18 @@ impl Monitor {
             self.book.absent(&cause, now);
             return;
         }
-        let severity = if gone_s >= ESCALATE_S {
-            Severity::Critical
-        } else {
-            Severity::Warning
-        };
+        if user.last_answered.is_none() && !self.book.is_open(&cause) {
+            let with_alert = strangers
+                .with_alert
+                .get_or_insert_with(|| self.book.users_lately(AlertKind::UserUnseen, now));
+            if *with_alert >= MOST_NEVER_SEEN || self.book.is_open(&Cause::Whole(AlertKind::UserUnseen)) {
+                strangers.names.push(a.claim.user.clone());
+                strangers.longest_s = strangers.longest_s.max(gone_s);
+                return;
+            }
+            *with_alert += 1;
+        }
+        let severity = severity_after(gone_s);
         let evidence = json!({
             "unseen_s": gone_s,
             "last_seen": user.last_answered,
@@ -182,6 +204,24 @@ impl Monitor {
         });
         let mut finding = Finding::new(severity, evidence);
         finding.claimed = claimed(a);
+        self.book.report(&cause, finding, now, self.frame);
+    }
+
+    /// One alert for all who were never seen, beyond the first few: who floods the log with invented users must not bury
+    /// the alerts of others. A user who was ever seen always has their own.
+    fn decide_strangers(&mut self, strangers: Strangers, now: Timestamp) {
+        let cause = Cause::Whole(AlertKind::UserUnseen);
+        self.strangers = strangers.names;
+        if self.strangers.is_empty() {
+            self.book.absent(&cause, now);
+            return;
+        }
+        let evidence = json!({
+            "users_never_seen": self.strangers.len(),
+            "users": &self.strangers[..self.strangers.len().min(MOST_NAMES)],
+            "unseen_s": strangers.longest_s,
+        });
+        let finding = Finding::new(severity_after(strangers.longest_s), evidence);
         self.book.report(&cause, finding, now, self.frame);
     }
 
@@ -196,6 +236,14 @@ impl Monitor {
                 let coincides = seconds(gone, *since).abs() <= COINCIDENCE_S;
                 coincides && !self.book.is_open(&Cause::Track(AlertKind::UnclaimedEmitter, *id))
             })
+    }
+}
+
+fn severity_after(gone_s: f64) -> Severity {
+    if gone_s >= ESCALATE_S {
+        Severity::Critical
+    } else {
+        Severity::Warning
     }
 }
 
