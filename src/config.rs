@@ -200,4 +200,60 @@ mod tests {
             assert_eq!(located(base, Path::new(written), credentials), Path::new(expected));
         }
     }
+
+    /// The example with its commented keys and tables in force.
+    fn in_full(text: &str) -> String {
+        let stands = |line: &&str| {
+            let rest = line.strip_prefix("# ").unwrap_or(line);
+            let key = rest.split(" = ").next().unwrap_or_default();
+            let is_key = rest.contains(" = ") && key.chars().all(|c| c.is_ascii_alphanumeric() || c == '_');
+            is_key || rest.starts_with('[')
+        };
+        let lines = text.lines().filter(stands);
+        lines
+            .map(|line| line.trim_start_matches("# ").to_owned() + "\n")
+            .collect()
+    }
+
+    /// What serde would have expected in a table.
+    fn keys_of(table: &str) -> Vec<String> {
+        let error = toml::from_str::<Config>(&format!("{table}\nno_such_key = 1\n")).expect_err("an unknown key");
+        let names = error.message().split('`').skip(1).step_by(2).skip(1);
+        names.map(str::to_owned).collect()
+    }
+
+    #[test]
+    fn the_example_configs_name_every_key_and_only_such() {
+        for text in [
+            include_str!("../config/default.toml"),
+            include_str!("../deploy/oapwatch.toml"),
+        ] {
+            toml::from_str::<Config>(text).unwrap();
+            let full = in_full(text);
+            toml::from_str::<Config>(&full).unwrap_or_else(|e| panic!("{e}\n{full}"));
+            let table: toml::Table = toml::from_str(&full).unwrap();
+            let mut tables: Vec<(String, toml::Table)> = vec![(String::new(), table)];
+            while let Some((name, table)) = tables.pop() {
+                let header = match name.as_str() {
+                    "" => String::new(),
+                    "webhook" => "[[webhook]]".to_owned(),
+                    name => format!("[{name}]"),
+                };
+                for key in keys_of(&header) {
+                    assert!(table.contains_key(&key), "{header} lacks {key}");
+                }
+                for (key, value) in table {
+                    let below = format!("{name}.{key}").trim_start_matches('.').to_owned();
+                    match value {
+                        toml::Value::Table(inner) => tables.push((below, inner)),
+                        toml::Value::Array(list) => {
+                            let inner = list.into_iter().filter_map(|v| v.try_into::<toml::Table>().ok());
+                            tables.extend(inner.map(|table| (below.clone(), table)));
+                        }
+                        _ => {}
+                    }
+                }
+            }
+        }
+    }
 }
