@@ -70,15 +70,29 @@ test-deploy:
 SOAK_S ?= 600
 soak: build
 	$(call need,command -v python3,python3-minimal)
-	tests/deploy/soak.py target/release/oapwatch $(SOAK_S)
+	tests/deploy/soak.py target/release/oapwatch --seconds $(SOAK_S)
 
-.PHONY: check-aarch64
-# That it compiles for the usual computer of a UAV, C dependencies included. Not in CI: it takes every dependency once more.
-check-aarch64: setup
+.PHONY: overload
+# How old results grow under ten times the frames that the daemon can handle.
+overload: build
+	$(call need,command -v python3,python3-minimal)
+	tests/deploy/overload.py target/release/oapwatch
+
+.PHONY: aarch64 check-aarch64 test-aarch64
+aarch64: VERB := build
+check-aarch64: VERB := check
+aarch64 check-aarch64: setup
 	$(call need,command -v aarch64-linux-gnu-gcc,gcc-aarch64-linux-gnu libc6-dev-arm64-cross)
 	rustup target add aarch64-unknown-linux-gnu
 	BINDGEN_EXTRA_CLANG_ARGS_aarch64_unknown_linux_gnu=--sysroot=/usr/aarch64-linux-gnu \
-		cargo check --release --locked --target aarch64-unknown-linux-gnu --target-dir target/cross --bin oapwatch
+		CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_LINKER=aarch64-linux-gnu-gcc \
+		cargo $(VERB) --release --locked --target aarch64-unknown-linux-gnu --target-dir target/cross --bin oapwatch
+
+# The program for the usual computer of a UAV, target/cross/aarch64-unknown-linux-gnu/release/oapwatch, and the same run under
+# emulation beside the one for this machine. Not in CI: it takes every dependency once more. check-aarch64 only compiles.
+test-aarch64: aarch64 build
+	$(call need,command -v qemu-aarch64-static,qemu-user-static)
+	tests/deploy/aarch64.py target/release/oapwatch target/cross/aarch64-unknown-linux-gnu/release/oapwatch
 
 .PHONY: tradeoff
 # docs/tradeoff: what accuracy costs in time. Some minutes on a machine that does nothing else.

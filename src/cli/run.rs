@@ -15,6 +15,11 @@ pub struct Args {
     listen: Option<SocketAddr>,
 }
 
+/// Threads that serve the API, and those that wait for the journal on its behalf. A machine of many cores has no more of
+/// them: each costs memory, and the frames have threads of their own.
+const MOST_SERVING: usize = 4;
+const MOST_WAITING: usize = 32;
+
 pub fn run(args: Args) -> Outcome {
     let mut config = match &args.config {
         Some(path) => Config::load(path).map_err(Failure::config)?,
@@ -27,6 +32,8 @@ pub fn run(args: Args) -> Outcome {
     let daemon = Daemon::new(config, args.config).map_err(Failure::Config)?;
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .enable_all()
+        .worker_threads(std::thread::available_parallelism().map_or(1, |n| n.get().min(MOST_SERVING)))
+        .max_blocking_threads(MOST_WAITING)
         .thread_name("oapwatch")
         .build()
         .map_err(Failure::other)?;

@@ -11,6 +11,10 @@ const APPLICATION_ID: i64 = 0x4F41_5057;
 /// Longest wait for another process (a backup, a shell) that holds the file.
 const BUSY: Duration = Duration::from_millis(1000);
 
+/// Pages a connection keeps in memory, KiB: a writer and some readers each have their own, and the system's own cache
+/// stands behind them.
+const CACHE_KIB: i64 = 512;
+
 /// Step k takes a journal from `user_version` k to k + 1. Never edit a step that was released: add one.
 const MIGRATIONS: &[&str] = &["
     CREATE TABLE journal (
@@ -77,6 +81,7 @@ pub(super) fn open_writable(path: Option<&Path>) -> Result<Connection, Error> {
     };
     let mut db = Connection::open_with_flags(name, flags).map_err(unusable)?;
     db.busy_timeout(BUSY).map_err(unusable)?;
+    db.pragma_update(None, "cache_size", -CACHE_KIB).map_err(unusable)?;
     check(&db, name, unusable)?;
     prepare(&mut db).map_err(unusable)?;
     Ok(db)
@@ -86,6 +91,7 @@ pub(super) fn open_writable(path: Option<&Path>) -> Result<Connection, Error> {
 pub(super) fn open_readable(path: &Path) -> Result<Connection, rusqlite::Error> {
     let db = Connection::open_with_flags(path, OpenFlags::SQLITE_OPEN_READ_ONLY | OpenFlags::SQLITE_OPEN_NO_MUTEX)?;
     db.busy_timeout(BUSY)?;
+    db.pragma_update(None, "cache_size", -CACHE_KIB)?;
     Ok(db)
 }
 

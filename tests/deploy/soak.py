@@ -66,9 +66,9 @@ def sample(pid):
 
 
 class Daemon:
-    def __init__(self, program, folder, rate_hz, estimator):
+    def __init__(self, program, folder, scene, estimator):
         self.address = free_address()
-        (folder / "scene.toml").write_text(scene(rate_hz))
+        (folder / "scene.toml").write_text(scene)
         name = f'name = "{estimator}"' if estimator else ""
         (folder / "oapwatch.toml").write_text(CONFIG.format(address=self.address, estimator=name))
         self.log = folder / "log"
@@ -100,7 +100,7 @@ def main():
     parser.add_argument("--samples", type=pathlib.Path, help="where to write them, for soak_picture.py")
     asked = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        daemon = Daemon(asked.program, pathlib.Path(folder), asked.rate, asked.estimator)
+        daemon = Daemon(asked.program, pathlib.Path(folder), scene(asked.rate), asked.estimator)
         try:
             began, samples = time.monotonic(), []
             time.sleep(2)
@@ -139,4 +139,5 @@ def main():
     sys.exit(1 if failed else 0)
 
 
-main()
+if __name__ == "__main__":
+    main()

@@ -81,7 +81,7 @@ impl Session {
             [config.flip_x, config.flip_y],
             config.saturation_counts,
         )?;
-        let interval = node.set_interval(1.0 / rate_hz);
+        let granted_rate_hz = set_rate(&node, rate_hz, faults);
         let exposure = set_exposure(&node, config, faults);
         let gain = set_gain(&node, config, faults);
         tracing::info!(
@@ -94,7 +94,7 @@ impl Session {
             stride = granted.stride,
             camera_pixels_per_pixel = layout.binned(),
             asked_rate_hz = rate_hz,
-            rate_hz = interval.ok().flatten().map(f64::recip),
+            rate_hz = granted_rate_hz,
             asked_exposure_us = config.exposure_us,
             exposure_us = exposure.map(|e| e.as_secs_f64() * 1e6),
             asked_gain = config.gain,
@@ -166,6 +166,17 @@ fn negotiate(node: &Node, config: &Config) -> Result<(Format, PixelFormat), Star
                 granted: name(granted),
                 offered: names.join(", "),
             })
+        }
+    }
+}
+
+/// Asks for the frame rate and gives what the device then reports; `None` where it sets its own pace.
+fn set_rate(node: &Node, asked_hz: f64, faults: &mut Faults) -> Option<f64> {
+    match node.set_interval(1.0 / asked_hz) {
+        Ok(granted_s) => granted_s.map(f64::recip),
+        Err(error) => {
+            faults.count(Fault::ControlRefused, format_args!("rate_hz = {asked_hz}: {error}"));
+            None
         }
     }
 }
