@@ -72,6 +72,11 @@ soak: build
 	$(call need,command -v python3,python3-minimal)
 	tests/deploy/soak.py target/release/oapwatch --seconds $(SOAK_S)
 
+.PHONY: siege
+# Floods, slow and endless clients, a thousand viewers, a gigabyte of garbage: what they cost the monitor. Not in CI: minutes.
+siege: build
+	OAPWATCH_PROGRAM=$(CURDIR)/target/release/oapwatch cargo test --locked --test daemon -- --ignored --nocapture --test-threads 1 siege
+
 .PHONY: overload
 # How old results grow under ten times the frames that the daemon can handle.
 overload: build

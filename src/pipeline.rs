@@ -111,6 +111,8 @@ impl Pipeline {
             rung: self.estimator.name(),
             reduced_chi2: f64::NAN,
             saturated_share,
+            condition: 1.0,
+            steps: 0,
         }
     }
 

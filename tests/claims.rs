@@ -94,6 +94,36 @@ fn rotation_loses_nothing_of_the_old_file() {
     assert_eq!(users(&log.follower.poll().unwrap()), ["e"]);
 }
 
+/// What the old file still held comes first; the folder is an error until a file stands there again.
+#[test]
+fn a_log_replaced_by_a_folder_loses_nothing_and_is_taken_up_again() {
+    let mut log = log();
+    append(&log.path, &line("a", 0));
+    log.follower.poll().unwrap();
+    append(&log.path, &line("b", 1));
+    fs::rename(&log.path, log.path.with_extension("1")).unwrap();
+    fs::create_dir(&log.path).unwrap();
+    assert_eq!(users(&log.follower.poll().unwrap()), ["b"]);
+    for _ in 0..2 {
+        let error = log.follower.poll().unwrap_err().to_string();
+        assert!(error.contains("claims.ndjson: expected a file"), "{error}");
+    }
+    fs::remove_dir(&log.path).unwrap();
+    assert!(log.follower.poll().unwrap().claims.is_empty());
+    append(&log.path, &line("c", 2));
+    assert_eq!(users(&log.follower.poll().unwrap()), ["c"]);
+}
+
+#[test]
+fn a_log_of_garbage_is_counted_and_not_kept() {
+    let mut log = log();
+    append(&log.path, &"x\n".repeat(5000));
+    append(&log.path, &line("a", 0));
+    let poll = log.follower.poll().unwrap();
+    assert_eq!((poll.refused_count, poll.refused.len()), (5000, 100));
+    assert_eq!(users(&poll), ["a"]);
+}
+
 #[test]
 fn truncation_and_a_rewrite_in_place_start_again() {
     let mut log = log();

@@ -31,8 +31,9 @@ fn claim(k: u64) -> Claim {
     Claim {
         time: time(k as i64),
         user: format!("u-{}", k % 3),
-        x_m: k as f64 + 0.1,
-        y_m: -80.0,
+        // All 17 digits of it: a reader that rounds twice would show.
+        x_m: 100.0 * (k as f64 + 0.1).sin(),
+        y_m: -80.0 / 3.0,
         sigma_m: Some(1.0),
         state: ClaimState::Active,
     }

@@ -1,4 +1,4 @@
-use std::fs::File;
+use std::fs::{File, Metadata};
 use std::io::{self, Read, Seek, SeekFrom};
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
@@ -11,6 +11,8 @@ pub const LONGEST_LINE: usize = 64 * 1024;
 const POLL_BYTES: u64 = 4 << 20;
 /// The start of the file that tells a rewritten log from a grown one.
 const HEAD_BYTES: usize = 256;
+/// Lines that are no claims that a poll names.
+const MOST_NAMED: usize = 100;
 
 /// Follows the network's log like `tail -F`: through rotation, truncation, a rewrite in place and a file that is
 /// not there yet. A line is taken once its newline has been written. Only [`Follower::poll`] touches the disk.
@@ -35,7 +37,10 @@ struct Open {
 #[derive(Debug, Default)]
 pub struct Poll {
     pub claims: Vec<Claim>,
+    /// The first of the lines that are no claims; a log of nothing else must not fill the memory.
     pub refused: Vec<Refused>,
+    /// How many there were.
+    pub refused_count: u64,
     /// The log was replaced, truncated or rewritten since the last poll.
     pub restarted: bool,
     /// There is more to read at once.
@@ -92,10 +97,13 @@ impl Lines {
         self.overlong = false;
         match read {
             Ok(claim) => poll.claims.push(claim),
-            Err(error) => poll.refused.push(Refused {
-                line: self.number,
-                error,
-            }),
+            Err(error) => {
+                poll.refused_count += 1;
+                if poll.refused.len() < MOST_NAMED {
+                    let line = self.number;
+                    poll.refused.push(Refused { line, error });
+                }
+            }
         }
     }
 
@@ -113,13 +121,13 @@ impl Follower {
         }
     }
 
-    /// Reads what has been written since the last poll. A log that does not exist (yet) gives nothing.
+    /// Reads what has been written since the last poll. A log that does not exist (yet) gives nothing. An error says
+    /// that there is nothing else to tell: what has been read comes first.
     pub fn poll(&mut self) -> io::Result<Poll> {
         let mut poll = Poll::default();
         let on_disk = match std::fs::metadata(&self.path) {
-            Ok(meta) => Some(meta),
             Err(e) if e.kind() == io::ErrorKind::NotFound => None,
-            Err(e) => return Err(e),
+            other => Some(other),
         };
         if let Some(open) = &mut self.open {
             if open.was_rewritten()? {
@@ -127,9 +135,12 @@ impl Follower {
                 poll.restarted = true;
             }
             open.read(&self.config, &mut poll)?;
-            let replaced = on_disk
-                .as_ref()
-                .is_some_and(|meta| (meta.dev(), meta.ino()) != open.identity);
+            let replaced = match &on_disk {
+                None => false,
+                Some(Ok(meta)) => (meta.dev(), meta.ino()) != open.identity,
+                // We may not look any more; what we have open we still have.
+                Some(Err(_)) => false,
+            };
             if !replaced || poll.more {
                 return Ok(poll);
             }
@@ -140,17 +151,32 @@ impl Follower {
             self.open = None;
             poll.restarted = true;
         }
-        if on_disk.is_some() {
-            match Open::new(&self.path) {
-                Ok(mut open) => {
-                    open.read(&self.config, &mut poll)?;
-                    self.open = Some(open);
-                }
-                Err(e) if e.kind() == io::ErrorKind::NotFound => {}
-                Err(e) => return Err(e),
-            }
+        match self.begin(on_disk, &mut poll) {
+            Err(e) if !poll.restarted => Err(e),
+            // The next poll meets the error again.
+            _ => Ok(poll),
         }
-        Ok(poll)
+    }
+
+    /// Opens what stands at the log's path now.
+    fn begin(&mut self, on_disk: Option<io::Result<Metadata>>, poll: &mut Poll) -> io::Result<()> {
+        let Some(meta) = on_disk else { return Ok(()) };
+        // Opening a pipe would wait for its writer, and a folder opens but cannot be read.
+        if !meta?.is_file() {
+            return Err(io::Error::new(
+                io::ErrorKind::InvalidInput,
+                format!("{}: expected a file, found something else", self.path.display()),
+            ));
+        }
+        match Open::new(&self.path) {
+            Ok(mut open) => {
+                open.read(&self.config, poll)?;
+                self.open = Some(open);
+                Ok(())
+            }
+            Err(e) if e.kind() == io::ErrorKind::NotFound => Ok(()),
+            Err(e) => Err(e),
+        }
     }
 }
 

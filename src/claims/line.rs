@@ -185,6 +185,19 @@ mod tests {
         assert_eq!((c.sigma_m, c.state), (None, ClaimState::Active));
     }
 
+    /// What is recorded must be reviewed to the same alerts, byte for byte.
+    #[test]
+    fn numbers_survive_being_written_and_read() {
+        for k in 0..10_000u64 {
+            let x_m = 100.0 * (k as f64).sin();
+            let line = format!(r#"{{"time":"2026-11-21T08:00:00Z","user":"u","x_m":{x_m:?},"y_m":2}}"#);
+            let claim = parse(&line).unwrap();
+            assert_eq!(claim.x_m.to_bits(), x_m.to_bits(), "{x_m:?}");
+            let again: Claim = serde_json::from_str(&serde_json::to_string(&claim).unwrap()).unwrap();
+            assert_eq!(again, claim);
+        }
+    }
+
     #[test]
     fn names_the_field_that_is_wrong() {
         for (line, field) in [

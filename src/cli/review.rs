@@ -87,6 +87,13 @@ fn claims_of(config: &claims::Config) -> Result<Vec<claims::Claim>, Failure> {
             refused.error
         );
     }
+    let unnamed = log.refused_count - log.refused.len() as u64;
+    if unnamed > 0 {
+        eprintln!(
+            "oapwatch: {}: {unnamed} more lines are no claims; skipped",
+            path.display()
+        );
+    }
     Ok(log.claims)
 }
 

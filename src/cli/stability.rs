@@ -49,7 +49,7 @@ pub fn run(args: Args) -> Outcome {
     if let Some(path) = &args.out {
         std::fs::write(path, &text).map_err(|e| Failure::other(anyhow::anyhow!("{}: {e}", path.display())))?;
     }
-    let broken = rows.iter().filter(|r| !r.holds).count();
+    let broken = rows.iter().filter(|r| !r.seen.holds).count();
     if broken > 0 {
         return Err(Failure::other(anyhow::anyhow!(
             "{broken} of {} promises do not hold",

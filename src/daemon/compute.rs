@@ -8,13 +8,14 @@ use std::time::{Duration, Instant};
 use jiff::{SignedDuration, Timestamp};
 use tokio::sync::mpsc;
 
+use super::claims_log::ClaimsLog;
 use super::publish::Outlet;
 use super::status::State;
 use super::supervisor::Supervisor;
 use crate::api::{
     Acknowledged, ClaimsStatus, Command, FrameCounts, JournalStatus, Snapshot, SourceState, SourceStatus, Status,
 };
-use crate::claims::{Claim, ClaimState, Follower, Outcome};
+use crate::claims::{Claim, ClaimState, Outcome, Refused};
 use crate::frame::Frame;
 use crate::frames::record::{Recorder, Taken};
 use crate::frames::{Capture, Next};
@@ -27,8 +28,8 @@ use crate::pipeline::{Pipeline, Step};
 
 /// How long commands may wait while no frame comes.
 const PATIENCE: Duration = Duration::from_millis(50);
-/// How often the claims log is looked at.
-const FOLLOW_EVERY: Duration = Duration::from_millis(100);
+/// How often lines of the claims log that are no claims are logged.
+const COMPLAIN_EVERY: Duration = Duration::from_secs(10);
 /// Claims that wait for a recorder that takes nothing.
 const MOST_UNRECORDED: usize = 100_000;
 /// A source that gives nothing at all, not even word of a failure, for this long is taken for dead.
@@ -44,7 +45,7 @@ pub struct Compute {
     /// Claims that the recorder has not got yet.
     pub unrecorded: Vec<Claim>,
     pub commands: mpsc::Receiver<Command>,
-    pub follower: Option<Follower>,
+    pub follower: Option<ClaimsLog>,
     pub outlet: Outlet,
     pub journal: Journal,
     pub webhooks: notify::Notifier,
@@ -71,11 +72,13 @@ impl Compute {
             match captured.next {
                 Next::Frame(frame, claims) => {
                     heard = arrived;
+                    // A live frame is as old as its capture; a recording's has waited for us to ask.
+                    let since = if self.is_replay { arrived } else { captured.at };
                     self.take_claims(claims, frame.time);
                     self.obey();
                     let recorded = self.recorder.as_mut().map(|r| r.frame(&frame, &self.unrecorded));
                     self.recorded(recorded.flatten(), captured.file);
-                    self.frame(frame, arrived);
+                    self.frame(frame, since);
                 }
                 Next::Unusable {
                     index,
@@ -120,7 +123,7 @@ impl Compute {
         self.pipeline.monitor.recorded_in(file.as_deref());
     }
 
-    fn frame(&mut self, frame: Frame, arrived: Instant) {
+    fn frame(&mut self, frame: Frame, since: Instant) {
         let Step {
             report,
             estimate,
@@ -130,7 +133,7 @@ impl Compute {
         let s = &mut self.state;
         s.counts.captured += 1;
         s.clock = frame.time;
-        s.arrived(arrived);
+        s.arrived(Instant::now());
         metrics::counter!(metric::FRAMES_CAPTURED).increment(1);
         metrics::histogram!(metric::STAGE_SECONDS, "stage" => "estimate").record(estimation);
         metrics::histogram!(metric::STAGE_SECONDS, "stage" => "monitor").record(verdicts);
@@ -152,8 +155,8 @@ impl Compute {
                 s.fault = Some(error.to_string());
             }
         }
-        s.took(arrived.elapsed());
-        metrics::histogram!(metric::FRAME_SECONDS).record(arrived.elapsed());
+        s.took(since.elapsed());
+        metrics::histogram!(metric::FRAME_SECONDS).record(since.elapsed());
         self.publish(report, Some(Arc::new(frame)));
     }
 
@@ -345,13 +348,9 @@ impl Compute {
     }
 
     fn follow_log(&mut self) {
-        let due = self.state.looked.is_none_or(|t| t.elapsed() >= FOLLOW_EVERY);
-        let Some(follower) = self.follower.as_mut().filter(|_| due) else {
-            return;
-        };
-        self.state.looked = Some(Instant::now());
-        loop {
-            let poll = match follower.poll() {
+        let mut again = false;
+        while let Some(poll) = self.follower.as_mut().and_then(|log| log.next(again)) {
+            let poll = match poll {
                 Ok(poll) => poll,
                 Err(error) => {
                     if !self.state.log_broken {
@@ -366,10 +365,10 @@ impl Compute {
                 tracing::info!("the claims log was replaced; reading it from its start");
             }
             if let Some(first) = poll.refused.first() {
-                let count = poll.refused.len() as u64;
+                let count = poll.refused_count;
                 self.state.malformed += count;
                 metrics::counter!(metric::CLAIMS, "outcome" => "malformed").increment(count);
-                tracing::warn!(line = first.line, error = %first.error, count, "lines of the claims log are no claims");
+                self.complain(first, count);
             }
             if self.is_replay {
                 self.pipeline.claim(poll.claims, self.state.clock);
@@ -377,10 +376,22 @@ impl Compute {
                 self.fresh.extend(poll.claims);
             }
             // A recording's first frame waits until the whole log has been read, so that no claim comes late.
-            if !(poll.more && self.is_replay && self.state.counts.captured == 0) {
+            again = self.is_replay && self.state.counts.captured == 0;
+            if !(poll.more && again) {
                 return;
             }
         }
+    }
+
+    /// Names a line that is no claim, unless one was named a moment ago: a log of nothing else must not fill ours.
+    fn complain(&mut self, first: &Refused, count: u64) {
+        self.state.unnamed += count;
+        if self.state.complained.is_some_and(|t| t.elapsed() < COMPLAIN_EVERY) {
+            return;
+        }
+        let count = std::mem::take(&mut self.state.unnamed);
+        self.state.complained = Some(Instant::now());
+        tracing::warn!(line = first.line, error = %first.error, count, "lines of the claims log are no claims");
     }
 }
 

@@ -1,5 +1,6 @@
 //! Composes the daemon: capture thread → latest-wins slot → compute thread → journal, snapshot and events → tasks.
 
+mod claims_log;
 mod compute;
 pub mod logging;
 mod publish;
@@ -26,6 +27,7 @@ use crate::journal::Journal;
 use crate::optics::Camera;
 use crate::pipeline::Pipeline;
 use crate::{api, metric, notify};
+use claims_log::ClaimsLog;
 use compute::Compute;
 use publish::Outlet;
 use status::State;
@@ -142,7 +144,9 @@ impl Daemon {
             fresh: Vec::new(),
             unrecorded: Vec::new(),
             commands: orders,
-            follower: log.map(|l| Follower::new(l, &self.config.claims)),
+            follower: log
+                .map(|l| ClaimsLog::new(Follower::new(l, &self.config.claims), is_replay, halt.clone()))
+                .transpose()?,
             outlet,
             journal: self.journal.clone(),
             webhooks: notifier,

@@ -28,7 +28,9 @@ pub(super) struct State {
     pub arrivals: VecDeque<Instant>,
     pub open: BTreeMap<String, AlertKind>,
     pub log_broken: bool,
-    pub looked: Option<Instant>,
+    /// When a malformed line was last named, and how many have come since.
+    pub complained: Option<Instant>,
+    pub unnamed: u64,
     pub last: Option<Snapshot>,
 }
 
@@ -46,7 +48,8 @@ impl State {
             arrivals: VecDeque::with_capacity(WINDOW),
             open: open.into_iter().collect(),
             log_broken: false,
-            looked: None,
+            complained: None,
+            unnamed: 0,
             last: None,
         }
     }

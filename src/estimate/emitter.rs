@@ -19,6 +19,8 @@ bitflags::bitflags! {
         const POOR_FIT = 1 << 5;
         /// The frame-time budget ended the search early.
         const OUT_OF_TIME = 1 << 6;
+        /// Positions and energies trade against each other so nearly that rounding has a say in them.
+        const ILL_CONDITIONED = 1 << 7;
     }
 }
 
@@ -65,6 +67,10 @@ pub struct Estimate {
     pub reduced_chi2: f64,
     /// Share of pixels at or above saturation.
     pub saturated_share: f64,
+    /// Condition number (1-norm) of the information matrix scaled to a unit diagonal; 1 where nothing was found.
+    pub condition: f64,
+    /// Steps of the joint fit, over all hypotheses tried.
+    pub steps: u64,
 }
 
 impl<'de> Deserialize<'de> for Flags {

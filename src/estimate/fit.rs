@@ -30,6 +30,8 @@ const LARGEST_ACCELERATION: f64 = 0.56 / 4.0;
 const HOPE: f64 = 5.0;
 /// Multiplications that a frame of a few emitters may cost: the same for every run, unlike a clock.
 const MOST_WORK: f64 = 1e8;
+/// What the diagonal of an information matrix is raised by, so that a singular one can be factorised.
+pub(super) const RIDGE: f64 = 1e-13;
 /// Emitters from which on a frame may cost more, with the square of their number.
 const MANY: f64 = 8.0;
 /// Share that the last fit may take beyond.
@@ -62,6 +64,8 @@ pub(super) struct Fitter {
     work: f64,
     /// Sources of the largest hypothesis since.
     most_sources: f64,
+    /// Steps since.
+    pub steps: u64,
     deadline: Option<Instant>,
 }
 
@@ -90,6 +94,7 @@ impl Fitter {
             active: Vec::new(),
             work: 0.0,
             most_sources: 0.0,
+            steps: 0,
             deadline: None,
         }
     }
@@ -98,6 +103,7 @@ impl Fitter {
     pub fn restart(&mut self, deadline: Option<Instant>) {
         self.work = 0.0;
         self.most_sources = 0.0;
+        self.steps = 0;
         self.deadline = deadline;
     }
 
@@ -191,7 +197,7 @@ impl Fitter {
             self.factor[(3 * i + 1) * n + 3 * i + 1] += prior;
         }
         for i in 0..n {
-            self.factor[i * n + i] *= 1.0 + 1e-13;
+            self.factor[i * n + i] *= 1.0 + RIDGE;
         }
         if !cholesky(&mut self.factor, n) {
             return false;
@@ -202,13 +208,32 @@ impl Fitter {
         true
     }
 
+    /// Condition number (1-norm) of an information matrix of `n` parameters, scaled to a unit diagonal (van der Sluis, 1969: no
+    /// other scaling does much better), given its inverse.
+    pub fn condition(&self, n: usize, inverse: &[f64]) -> f64 {
+        let scale = |i: usize| self.hessian[i * n + i].max(1e-300).sqrt();
+        let column = |j: usize| {
+            let (mut direct, mut inverted) = (0.0, 0.0);
+            for i in 0..n {
+                let h = self.hessian[i.max(j) * n + i.min(j)];
+                direct += (h / (scale(i) * scale(j))).abs();
+                inverted += (inverse[i * n + j] * scale(i) * scale(j)).abs();
+            }
+            (direct, inverted)
+        };
+        let (direct, inverted) = (0..n)
+            .map(column)
+            .fold((0.0f64, 0.0f64), |most, c| (most.0.max(c.0), most.1.max(c.1)));
+        (direct * inverted).max(1.0)
+    }
+
     /// ln det of an information matrix of `n` parameters over its first `size`, with `floor` added to the precision of
     /// the positions in x and y.
     pub fn log_det(&mut self, n: usize, size: usize, floor: [f64; 2]) -> Option<f64> {
         self.factor.clear();
         for i in 0..size {
             self.factor.extend_from_slice(&self.hessian[i * n..i * n + size]);
-            self.factor[i * size + i] *= 1.0 + 1e-13;
+            self.factor[i * size + i] *= 1.0 + RIDGE;
             if i % 3 < 2 {
                 self.factor[i * size + i] += floor[i % 3];
             }
@@ -244,6 +269,7 @@ impl Fitter {
             }
             self.most_sources = self.most_sources.max(self.now.sources() as f64);
             self.work += self.step_work(reading);
+            self.steps += 1;
             if !fresh {
                 self.linearise(reading, nuisances);
                 fresh = true;

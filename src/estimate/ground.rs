@@ -1,16 +1,19 @@
 //! From a fitted model to positions on the ground, each with its covariance and flags.
 
+use super::fit::RIDGE;
 use super::model::Model;
 use super::reading::Reading;
 use super::screen::Screened;
 use super::search::Search;
-use super::{Emitter, Estimate, Flags};
+use super::{Emitter, Estimate, Flags, spread};
 use crate::optics::Camera;
 
 /// Unusable pixels this near, σ, are told to the reader.
 const NEAR: f64 = 3.0;
 /// From the edge, σ.
 const EDGE: f64 = 2.0;
+/// Condition number beyond which the ridge under the information matrix is no longer small against its least eigenvalue.
+const MOST_CONDITION: f64 = 0.01 / RIDGE;
 /// Two emitters this many standard deviations of their difference apart are two.
 const RESOLVED: f64 = 3.0;
 
@@ -36,9 +39,16 @@ pub(super) fn locate(
     let (bx, by) = (&search.fitter.bx, &search.fitter.by);
     let (low, high) = ([bx.edges[0], by.edges[0]], [bx.edges[bx.n], by.edges[by.n]]);
     let pitch = [bx.pitch(), by.pitch()];
-    let extent = (high[0] - low[0]).max(high[1] - low[1]);
+    // Wherever the fit may place an emitter, past the sensor's edges too.
+    let extent = (bx.highest() - bx.lowest()).max(by.highest() - by.lowest());
+    let prior = 12.0 / (extent * extent);
     let mut cov = Vec::new();
-    let is_regular = search.fitter.covariance(p, n, 12.0 / (extent * extent), &mut cov);
+    let is_regular = search.fitter.covariance(p, n, prior, &mut cov);
+    let condition = if is_regular {
+        search.fitter.condition(p, &cov)
+    } else {
+        f64::INFINITY
+    };
     let block = |i: usize, j: usize| {
         if is_regular {
             [0, 1].map(|r| [0, 1].map(|c| cov[(3 * i + r) * p + 3 * j + c]))
@@ -48,12 +58,14 @@ pub(super) fn locate(
         }
     };
     let sigma = camera.spot_sigma_m;
+    let (bx, by) = (&search.fitter.bx, &search.fitter.by);
     let emitters = (0..n)
         .map(|i| {
             let spot = model.spots[i];
             let mut flags = Flags::empty();
             flags.set(Flags::NO_CONVERGENCE, !model.converged);
             flags.set(Flags::POOR_FIT, is_poor);
+            flags.set(Flags::ILL_CONDITIONED, !(condition <= MOST_CONDITION));
             let near_edge = (0..2).any(|k| spot.u[k] < low[k] + EDGE || spot.u[k] > high[k] - EDGE);
             flags.set(Flags::NEAR_EDGE, near_edge);
             for bad in &frame.bad {
@@ -80,7 +92,19 @@ pub(super) fn locate(
                     d2 * d2 < RESOLVED * RESOLVED * inflation * along
                 });
             flags.set(Flags::UNRESOLVED, is_merged);
-            let sensor_m = spot.u.map(|u| u * sigma);
+            let (mut u, mut own) = (spot.u, own);
+            for k in 0..if is_regular { 2 } else { 0 } {
+                if let Some(s) = spread::along([bx, by], k, &spot) {
+                    u[k] += s.shift;
+                    // What neighbours and nuisances add to the information matrix's claim they add to this one.
+                    let wider = (s.variance * (s.information + prior)).sqrt();
+                    for other in 0..2 {
+                        own[k][other] *= wider;
+                        own[other][k] *= wider;
+                    }
+                }
+            }
+            let sensor_m = u.map(|u| u * sigma);
             let scale = sigma * sigma * inflation;
             let [x_m, y_m] = camera.to_ground(sensor_m);
             let energy_variance = if is_regular {
@@ -105,5 +129,7 @@ pub(super) fn locate(
         is_cut_short: false,
         reduced_chi2,
         saturated_share: frame.saturated as f64 / frame.pixels.len() as f64,
+        condition,
+        steps: search.fitter.steps,
     }
 }

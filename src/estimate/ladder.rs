@@ -299,6 +299,7 @@ impl Estimator for Analytic {
         let mut estimate = ground::locate(search, reading, &mut model, &self.frame, &self.camera, noise_j);
         estimate.rung = self.rung.name;
         estimate.is_cut_short = is_exhausted;
+        estimate.steps = self.search.fitter.steps + self.weighing.search.fitter.steps;
         if is_exhausted {
             for emitter in &mut estimate.emitters {
                 emitter.flags |= Flags::OUT_OF_TIME;

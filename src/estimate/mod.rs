@@ -7,6 +7,8 @@ mod basis;
 mod bound;
 mod config;
 mod corrected;
+#[cfg(test)]
+mod descent;
 mod emitter;
 mod fit;
 mod ground;
@@ -26,6 +28,7 @@ mod reading;
 mod screen;
 mod search;
 mod spot;
+mod spread;
 mod weigh;
 
 pub use bound::{Beside, position_bound, position_bound_beside};

@@ -4,7 +4,7 @@ use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::thread::JoinHandle;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use super::slot::{Slot, Taken};
 use super::{FrameSource, Next};
@@ -18,11 +18,17 @@ const PATIENCE: Duration = Duration::from_millis(100);
 pub struct Captured {
     pub next: Next,
     pub file: Option<Arc<Path>>,
+    /// When the source gave it.
+    pub at: Instant,
 }
 
 impl Captured {
     pub fn new(next: Next, file: Option<Arc<Path>>) -> Self {
-        Self { next, file }
+        Self {
+            next,
+            file,
+            at: Instant::now(),
+        }
     }
 }
 

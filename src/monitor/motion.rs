@@ -33,7 +33,8 @@ impl Motion {
         f[(0, 2)] = dt;
         f[(1, 3)] = dt;
         self.state = f * self.state;
-        self.cov = f * self.cov * f.transpose();
+        let moved = f * self.cov * f.transpose();
+        self.cov = 0.5 * (moved + moved.transpose());
         let (p, c, v) = (
             ACCELERATION * dt.powi(3) / 3.0,
             ACCELERATION * dt.powi(2) / 2.0,
@@ -74,9 +75,10 @@ impl Motion {
         let h = Matrix2x4::new(1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0);
         let gain = self.cov * h.transpose() * inverse;
         self.state += gain * innovation;
-        // Joseph's form stays positive whatever the rounding.
+        // Joseph's form stays positive whatever the rounding, and symmetric but for its last bits.
         let left = Matrix4::identity() - gain * h;
-        self.cov = left * self.cov * left.transpose() + gain * r * gain.transpose();
+        let joseph = left * self.cov * left.transpose() + gain * r * gain.transpose();
+        self.cov = 0.5 * (joseph + joseph.transpose());
     }
 
     pub fn position(&self) -> Vector2<f64> {

@@ -93,8 +93,11 @@ impl Detection {
             .filter(usable)
             .map(|e| {
                 let [[a, b], [_, c]] = e.cov_m2;
-                let cov = Matrix2::new(a.max(0.0), b, b, c.max(0.0)) * inflation
-                    + Matrix2::identity() * POSITION_FLOOR_M.powi(2);
+                let (a, c) = (a.max(0.0), c.max(0.0));
+                // No correlation beyond ±1, whatever a learned estimator claims.
+                let most = a.sqrt() * c.sqrt();
+                let b = b.clamp(-most, most);
+                let cov = Matrix2::new(a, b, b, c) * inflation + Matrix2::identity() * POSITION_FLOOR_M.powi(2);
                 Self {
                     position: Vector2::new(e.x_m, e.y_m),
                     cov,
@@ -143,7 +146,10 @@ fn ghost(detections: &[Detection], i: usize, camera: &Camera) -> f64 {
         .fold(f64::INFINITY, f64::min);
     if d.flags.contains(Flags::UNRESOLVED) || nearest < d.resolution_m {
         UNRESOLVED
-    } else if d.flags.intersects(Flags::NO_CONVERGENCE | Flags::POOR_FIT) {
+    } else if d
+        .flags
+        .intersects(Flags::NO_CONVERGENCE | Flags::POOR_FIT | Flags::ILL_CONDITIONED)
+    {
         POORLY_FITTED
     } else if nearest < 3.0 * camera.spot_sigma_m * camera.ground_scale() {
         NEIGHBOURED

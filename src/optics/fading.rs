@@ -81,7 +81,8 @@ impl GammaGamma {
             return self.ln_density_at_zero();
         }
         let nu = large - small;
-        let r = nu.hypot(2.0 * (large * small).sqrt() * rho.sqrt());
+        let x = 2.0 * (large * small).sqrt() * rho.sqrt();
+        let r = nu.hypot(x);
         let d = 4.0 * large * small * (1.0 - rho) / (large + small + r);
         let tilt = if nu == 0.0 {
             0.0
@@ -92,7 +93,7 @@ impl GammaGamma {
             + d
             + tilt
             + (small - 1.0) * rho.ln()
-            + scaled_bessel_integral(nu, r, 4.0 * large * small * rho).ln()
+            + scaled_bessel_integral(nu, r, x).ln()
     }
 
     /// lim ρ→0 of ln f: f ~ Γ(A − B)/(Γ(A)Γ(B))·(AB)^B·ρ^(B−1), and for A = B logarithmic in ρ besides.
@@ -109,14 +110,15 @@ impl GammaGamma {
     }
 }
 
-/// ∫ exp(−p(eˢ − 1 − s) − q(e⁻ˢ − 1 + s)) ds over the line, p = (r + ν)/2, q = (r − ν)/2, r² = ν² + x²; `x2` is x².
+/// ∫ exp(−p(eˢ − 1 − s) − q(e⁻ˢ − 1 + s)) ds over the line, p = (r + ν)/2, q = (r − ν)/2, r² = ν² + x².
 ///
 /// It is 2·K_ν(x)·exp(r − ν·asinh(ν/x)): K_ν(x) = ½∫exp(νt − x cosh t) dt (Abramowitz and Stegun, 1964, eq. 9.6.24) taken
 /// about its saddle point sinh t = ν/x. The trapezoidal rule converges exponentially (Trefethen and Weideman, 2014,
 /// theorem 5.1); the step keeps its error below exp(−36).
-fn scaled_bessel_integral(nu: f64, r: f64, x2: f64) -> f64 {
+fn scaled_bessel_integral(nu: f64, r: f64, x: f64) -> f64 {
     let p = 0.5 * (r + nu);
-    let q = 0.5 * x2 / (r + nu);
+    // Not x²: it may underflow, and the left tail without q never ends.
+    let q = (0.5 * x * (x / (r + nu))).max(f64::MIN_POSITIVE);
     let step = (0.6 / r.sqrt()).min(0.2);
     let exponent = |s: f64| p * (f64::exp_m1(s) - s) + q * (f64::exp_m1(-s) + s);
     let mut sum = 1.0;
@@ -194,6 +196,23 @@ mod tests {
         let law = GammaGamma { alpha: 1e8, beta: 1e8 };
         let expected = -0.5 * (2.0 * PI * 2e-8).ln();
         assert!((law.ln_density(1.0) - expected).abs() < 1e-7);
+    }
+
+    /// α = β and ρ so small that their product underflows: the integrand has no tail to end at but its exponential one.
+    #[test]
+    fn the_smallest_numbers_come_to_an_end() {
+        for rho in [5e-324, 1e-310, 1e-300] {
+            let f = GammaGamma {
+                alpha: 0.05,
+                beta: 0.05,
+            }
+            .ln_density(rho);
+            // f ~ (αβ)^α/Γ(α)²·ρ^(α−1)·(−ln(αβρ) − 2γ) as ρ → 0 (Abramowitz and Stegun, 1964, eq. 9.6.8).
+            let ln = f64::ln(0.0025) + f64::ln(rho);
+            let expected = 0.05 * f64::ln(0.0025) - 2.0 * libm::lgamma(0.05) - 0.95 * f64::ln(rho)
+                + (-ln - 2.0 * 0.577_215_664_901_532_9).ln();
+            assert!((f / expected - 1.0).abs() < 1e-12, "{rho}: {f} against {expected}");
+        }
     }
 
     #[test]

@@ -2,6 +2,7 @@
 
 mod over_http;
 mod process;
+mod siege;
 mod viewers;
 
 use std::path::Path;

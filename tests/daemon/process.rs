@@ -19,7 +19,9 @@ impl Daemon {
         let port = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
         let file = dir.join("oapwatch.toml");
         std::fs::write(&file, config).unwrap();
-        let child = Command::new(env!("CARGO_BIN_EXE_oapwatch"))
+        // Figures are to be of the program as it is shipped, whatever the test was built as.
+        let program = std::env::var_os("OAPWATCH_PROGRAM").unwrap_or_else(|| env!("CARGO_BIN_EXE_oapwatch").into());
+        let child = Command::new(program)
             .args(["run", "--config"])
             .arg(&file)
             .args(["--listen", &format!("127.0.0.1:{port}")])
@@ -35,7 +37,7 @@ impl Daemon {
         let end = Instant::now() + Duration::from_secs(20);
         let mut last = String::new();
         while Instant::now() < end {
-            if let Some((200, body)) = request(&self.url, "GET", path, "") {
+            if let Some((200, body)) = request(&self.url, "GET", path, "", "") {
                 match serde_json::from_str(&body) {
                     Ok(value) if accept(&value) => return value,
                     _ => last = body,
@@ -52,11 +54,24 @@ impl Daemon {
     }
 
     pub fn get(&self, path: &str) -> (u16, String) {
-        request(&self.url, "GET", path, "").expect("an answer")
+        self.get_as(path, None)
+    }
+
+    pub fn get_as(&self, path: &str, token: Option<&str>) -> (u16, String) {
+        let header = token.map_or(String::new(), |t| format!("Authorization: Bearer {t}\r\n"));
+        request(&self.url, "GET", path, &header, "").expect("an answer")
+    }
+
+    /// Resident memory.
+    pub fn resident_mib(&self) -> u64 {
+        let status = std::fs::read_to_string(format!("/proc/{}/status", self.child.id())).unwrap();
+        let line = status.lines().find_map(|l| l.strip_prefix("VmRSS:")).unwrap();
+        let kib: u64 = line.trim_end_matches("kB").trim().parse().unwrap();
+        kib / 1024
     }
 
     pub fn post(&self, path: &str, body: &str) -> (u16, String) {
-        request(&self.url, "POST", path, body).expect("an answer")
+        request(&self.url, "POST", path, "", body).expect("an answer")
     }
 
     pub fn signal(&self, name: &str) {
@@ -80,14 +95,14 @@ impl Drop for Daemon {
 }
 
 /// Status and body of an answer.
-fn request(url: &str, method: &str, path: &str, body: &str) -> Option<(u16, String)> {
+fn request(url: &str, method: &str, path: &str, header: &str, body: &str) -> Option<(u16, String)> {
     let address = url.strip_prefix("http://")?;
     let mut stream = TcpStream::connect(address).ok()?;
     stream.set_read_timeout(Some(Duration::from_secs(10))).ok()?;
     let length = body.len();
     write!(
         stream,
-        "{method} {path} HTTP/1.0\r\nHost: {address}\r\nContent-Length: {length}\r\nConnection: close\r\n\r\n{body}"
+        "{method} {path} HTTP/1.0\r\nHost: {address}\r\nContent-Length: {length}\r\n{header}Connection: close\r\n\r\n{body}"
     )
     .ok()?;
     let mut answer = String::new();

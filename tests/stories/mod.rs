@@ -421,6 +421,8 @@ pub fn tell_with(story: &Story, keep: bool) -> Told {
             rung: "story",
             reduced_chi2: 1.0,
             saturated_share: 0.0,
+            condition: 1.0,
+            steps: 0,
         };
         let mut digest = frame + 1;
         let mut error = None;

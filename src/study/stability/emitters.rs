@@ -1,7 +1,7 @@
 //! Emitters that are hard to tell apart, to see at all, or to bear in number.
 
-use super::Case;
 use super::trial::{Source, anywhere, camera, energy, expose, observe};
+use super::{Case, false_alarms_allowed};
 
 const GROUP: &str = "Emitters";
 /// Standard deviations beyond which a position without a warning counts as wrong: 1e-7 of honest ones are.
@@ -51,14 +51,18 @@ fn pair(d: f64) -> Case {
                 }
                 places
             });
-            let worst_energy = tally
+            let mut energies: Vec<f64> = tally
                 .estimates()
                 .map(|(_, e)| (e.emitters.iter().map(|e| e.energy_j).sum::<f64>() / (2.0 * each) - 1.0).abs())
-                .fold(0.0, f64::max);
+                .collect();
+            energies.sort_by(|a, b| b.total_cmp(a));
+            let allowed = false_alarms_allowed(options.frames);
+            let worst_energy = energies.get(allowed).copied().unwrap_or(0.0);
             let counted = tally.share_counted();
             // The sum is known to about 1/(2·SNR) of itself; twelve times that allows for the shape that one spot lacks.
             let speaks_out = d < 1.0 || clean * 10 >= 18 * options.frames;
-            let holds = stray == 0 && speaks_out && worst_energy < 6.0 / SNR && (!is_resolvable || counted >= 0.9);
+            let holds =
+                stray <= allowed && speaks_out && worst_energy < 6.0 / SNR && (!is_resolvable || counted >= 0.9);
             let remark = format!(
                 "both seen in {:.0} %; {stray} of {clean} clean positions astray; energy within {worst_energy:.1e}",
                 100.0 * counted
@@ -97,8 +101,9 @@ fn unequal(ratio: f64) -> Case {
                 "both seen in {:.0} %; {stray} of {clean} clean positions astray",
                 100.0 * counted
             );
+            let is_placed = stray <= false_alarms_allowed(options.frames);
             tally.observed(
-                stray == 0 && counted >= 0.9 && clean * 10 >= 18 * options.frames,
+                is_placed && counted >= 0.9 && clean * 10 >= 18 * options.frames,
                 &remark,
             )
         },
@@ -133,7 +138,8 @@ fn at_edge(past: f64) -> Case {
                 100.0 * counted
             );
             let speaks_out = past > -1.0 || clean * 10 >= 9 * options.frames;
-            tally.observed(stray == 0 && speaks_out && (!is_visible || counted >= 0.9), &remark)
+            let is_placed = stray <= false_alarms_allowed(options.frames);
+            tally.observed(is_placed && speaks_out && (!is_visible || counted >= 0.9), &remark)
         },
     )
 }
@@ -153,24 +159,20 @@ fn at_corner() -> Case {
             let tally = observe(options, &camera, |rng| (expose(&camera, &[source], rng), vec![source]));
             let (clean, stray) = tally.strays(&camera, LIMIT, |t| t.iter().map(|s| s.sensor_m).collect());
             let remark = format!("{stray} of {clean} clean positions astray");
-            tally.observed(stray == 0 && tally.share_counted() >= 0.9, &remark)
+            let is_placed = stray <= false_alarms_allowed(options.frames);
+            tally.observed(is_placed && tally.share_counted() >= 0.9, &remark)
         },
     )
 }
 
 fn nobody() -> Case {
-    Case::new(
-        GROUP,
-        "nobody",
-        "every peak is noise",
-        "none found in 99 % of frames",
-        |options| {
-            let camera = camera([64, 64], 1e-3);
-            let tally = observe(options, &camera, |rng| (expose(&camera, &[], rng), Vec::new()));
-            let alarms = options.frames - (tally.share_counted() * options.frames as f64).round() as usize;
-            tally.observed(alarms * 100 <= options.frames, &format!("{alarms} false alarms"))
-        },
-    )
+    Case::new(GROUP, "nobody", "every peak is noise", "none found", |options| {
+        let camera = camera([64, 64], 1e-3);
+        let tally = observe(options, &camera, |rng| (expose(&camera, &[], rng), Vec::new()));
+        let alarms = options.frames - (tally.share_counted() * options.frames as f64).round() as usize;
+        let allowed = false_alarms_allowed(options.frames);
+        tally.observed(alarms <= allowed, &format!("{alarms} false alarms"))
+    })
 }
 
 fn faint() -> Case {

@@ -6,7 +6,7 @@ use rand_distr::{Distribution, Uniform};
 
 use super::emitters::LIMIT;
 use super::trial::{Source, camera, energy, expose, frame, noiseless, observe};
-use super::{Case, Observed, Options};
+use super::{Case, Observed, Options, false_alarms_allowed};
 use crate::frame::Frame;
 use crate::optics::Camera;
 
@@ -195,7 +195,7 @@ fn keep(
     let holds = match promise {
         Promise::Nothing => tally.refused() == 0 && tally.counts().1 == 0,
         Promise::Refused => tally.refused() == options.frames,
-        Promise::NoneClean | Promise::AtEmitter => stray == 0,
+        Promise::NoneClean | Promise::AtEmitter => stray <= false_alarms_allowed(options.frames),
     };
     tally.observed(holds, &format!("{clean} clean positions, {stray} astray"))
 }

@@ -27,6 +27,7 @@ fn observed(bad: &[String], tried: usize) -> Observed {
             Some(first) => format!("{} of {tried} not, the first: {first}", bad.len()),
         },
         holds: bad.is_empty(),
+        fit: None,
     }
 }
 
@@ -81,6 +82,7 @@ fn narrow_pixels() -> Case {
             Observed {
                 happened: format!("off by {error:.1e}"),
                 holds: error <= 1e-13,
+                fit: None,
             }
         },
     )
@@ -221,6 +223,7 @@ fn ties() -> Case {
             Observed {
                 happened: format!("{} pairs", once().pairs.len()),
                 holds: once().pairs.len() == 40 && once() == once(),
+                fit: None,
             }
         },
     )
@@ -271,6 +274,7 @@ fn empty_sides() -> Case {
             Observed {
                 happened: "tried".to_owned(),
                 holds: alone(0, 5) && alone(5, 0) && alone(0, 0),
+                fit: None,
             }
         },
     )
@@ -290,6 +294,7 @@ fn greedy_trap() -> Case {
             Observed {
                 happened: format!("{} pairs, cost {cost}, optimum {best}", m.pairs.len()),
                 holds: m.pairs.len() == 60 && cost == best,
+                fit: None,
             }
         },
     )

@@ -1,6 +1,6 @@
 use super::Row;
 
-/// The study as Markdown tables, one a group.
+/// The study as Markdown tables, one a group; condition numbers and steps are the largest of any frame.
 pub fn markdown(rows: &[Row]) -> String {
     let mut text = String::new();
     let mut group = "";
@@ -8,13 +8,24 @@ pub fn markdown(rows: &[Row]) -> String {
         if row.group != group {
             group = row.group;
             text += &format!(
-                "\n### {group}\n\n| case | what makes it hard | promised | happened | holds |\n|---|---|---|---|---|\n"
+                "\n### {group}\n\n| case | what makes it hard | promised | happened | condition | steps | holds |\n|---|---|---|---|---|---|---|\n"
             );
         }
-        let holds = if row.holds { "yes" } else { "**no**" };
-        let cells =
-            [row.name.as_str(), row.hard, row.expected, row.happened.as_str(), holds].map(|c| c.replace('|', "\\|"));
-        text += &format!("| {} |\n", cells.join(" | "));
+        let (condition, steps) = match row.seen.fit {
+            Some(fit) => (format!("{:.0e}", fit.condition), fit.steps.to_string()),
+            None => Default::default(),
+        };
+        let holds = if row.seen.holds { "yes" } else { "**no**" };
+        let cells = [
+            row.name.as_str(),
+            row.hard,
+            row.expected,
+            row.seen.happened.as_str(),
+            &condition,
+            &steps,
+            holds,
+        ];
+        text += &format!("| {} |\n", cells.map(|c| c.replace('|', "\\|")).join(" | "));
     }
     text
 }

@@ -1,7 +1,7 @@
 //! Frames shown to the estimator, and what it said of them.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use jiff::Timestamp;
 use ndarray::Array2;
@@ -9,7 +9,7 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal, Uniform};
 
-use super::{Observed, Options};
+use super::{Observed, Options, Worst};
 use crate::estimate::{self, Error, Estimate, Flags};
 use crate::frame::Frame;
 use crate::optics::{Camera, Config, psf};
@@ -35,7 +35,7 @@ pub struct Tally {
     pub panics: usize,
     /// Malformed statements, with the frame they were made about.
     pub faults: Vec<String>,
-    pub slowest: Duration,
+    pub worst: Worst,
 }
 
 /// A camera with σ_eff 1 mm over 3 cm unless changed; noise 1e-6 J.
@@ -112,8 +112,11 @@ pub fn observe(options: &Options, camera: &Camera, make: impl Fn(&mut ChaCha8Rng
         let start = Instant::now();
         match catch_unwind(AssertUnwindSafe(|| estimator.estimate(&frame))) {
             Ok(outcome) => {
-                tally.slowest = tally.slowest.max(start.elapsed());
+                let worst = &mut tally.worst;
+                worst.time = worst.time.max(start.elapsed());
                 if let Ok(estimate) = &outcome {
+                    worst.condition = worst.condition.max(estimate.condition);
+                    worst.steps = worst.steps.max(estimate.steps);
                     tally
                         .faults
                         .extend(faults(estimate).into_iter().map(|f| format!("frame {k}: {f}")));
@@ -164,6 +167,9 @@ pub fn faults(estimate: &Estimate) -> Vec<String> {
     if !(estimate.reduced_chi2 >= 0.0 && estimate.reduced_chi2.is_finite()) {
         found.push(format!("reduced χ² is {}", estimate.reduced_chi2));
     }
+    if !(estimate.condition >= 1.0) {
+        found.push(format!("the condition number is {}", estimate.condition));
+    }
     if !(0.0..=1.0).contains(&estimate.saturated_share) {
         found.push(format!("saturated share is {}", estimate.saturated_share));
     }
@@ -174,7 +180,8 @@ pub fn faults(estimate: &Estimate) -> Vec<String> {
 pub const WARNING: Flags = Flags::UNRESOLVED
     .union(Flags::NO_CONVERGENCE)
     .union(Flags::POOR_FIT)
-    .union(Flags::OUT_OF_TIME);
+    .union(Flags::OUT_OF_TIME)
+    .union(Flags::ILL_CONDITIONED);
 
 impl Tally {
     /// Estimates without the frames that were refused.
@@ -240,7 +247,6 @@ impl Tally {
         if !remark.is_empty() {
             happened += &format!("; {remark}");
         }
-        happened += &format!("; slowest frame {:.1} ms", self.slowest.as_secs_f64() * 1e3);
         if self.panics > 0 {
             happened += &format!("; {} PANICS", self.panics);
         }
@@ -250,6 +256,7 @@ impl Tally {
         Observed {
             happened,
             holds: holds && self.panics == 0 && self.faults.is_empty(),
+            fit: Some(self.worst),
         }
     }
 }

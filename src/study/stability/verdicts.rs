@@ -1,0 +1,127 @@
+//! Covariances that are none, shown to the monitor.
+
+use jiff::{SignedDuration, Timestamp};
+
+use super::trial::camera;
+use super::{Case, Observed, Options};
+use crate::claims::{self, Claim, ClaimState, Store};
+use crate::estimate::{Emitter, Estimate, Flags};
+use crate::monitor::{self, Monitor, Observation, Source};
+
+const GROUP: &str = "Verdicts";
+const RATE_HZ: f64 = 10.0;
+const FRAMES: u64 = 200;
+
+pub(super) fn cases() -> Vec<Case> {
+    let tiny = f64::MIN_POSITIVE;
+    vec![
+        covariance("zero", "every gate is a point", [[0.0; 2]; 2]),
+        covariance("of rank one", "no inverse", [[4.0, 2.0], [2.0, 1.0]]),
+        covariance(
+            "of rank one, but for rounding",
+            "a determinant of either sign",
+            [[1.0, 1.0 - f64::EPSILON], [1.0 - f64::EPSILON, 1.0]],
+        ),
+        covariance("1e300 m²", "determinants overflow", [[1e300, 0.0], [0.0, 1e300]]),
+        covariance(
+            "of subnormal size",
+            "determinants underflow",
+            [[tiny, 0.0], [0.0, tiny]],
+        ),
+        covariance("1e12 : 1e-12", "condition 1e24", [[1e12, 0.0], [0.0, 1e-12]]),
+        covariance("indefinite", "no covariance at all", [[1.0, 2.0], [2.0, 1.0]]),
+        covariance("NaN", "no number at all", [[f64::NAN; 2]; 2]),
+    ]
+}
+
+/// A user and an eavesdropper, both said to be known as well as `cov_m2` says.
+fn covariance(name: &str, hard: &'static str, cov_m2: [[f64; 2]; 2]) -> Case {
+    let is_told = cov_m2.iter().flatten().all(|c| c.abs() < 1e6);
+    Case::new(
+        GROUP,
+        format!("covariance {name}"),
+        hard,
+        if is_told {
+            "nothing malformed; the emitter that nobody claims is alerted"
+        } else {
+            "nothing malformed"
+        },
+        move |options: &Options| {
+            let camera = camera([64, 64], 1e-3);
+            let config = claims::Config::default();
+            let source = Source {
+                kind: "replay".to_owned(),
+                file: None,
+                rate_hz: RATE_HZ,
+            };
+            let mut monitor = Monitor::new(&monitor::Config::default(), &config, &camera, source);
+            let mut store = Store::new(&config);
+            let at = |frame: u64| Timestamp::UNIX_EPOCH + SignedDuration::from_secs_f64(1e4 + frame as f64 / RATE_HZ);
+            let mut raised = Vec::new();
+            let mut malformed = 0;
+            for frame in 0..FRAMES {
+                let time = at(frame);
+                if frame % 10 == 0 {
+                    let claim = Claim {
+                        time,
+                        user: "u-1".to_owned(),
+                        x_m: 10.0,
+                        y_m: -20.0,
+                        sigma_m: Some(1.0),
+                        state: ClaimState::Active,
+                    };
+                    store.insert(claim, time);
+                }
+                // Not the same numbers twice, or the sensor would look frozen.
+                let wander = 1e-3 * ((frame + options.seed % 97) as f64).sin();
+                let emitter = |x_m: f64, y_m: f64| Emitter {
+                    x_m: x_m + wander,
+                    y_m,
+                    cov_m2,
+                    energy_j: 7e-3,
+                    energy_std_j: 1e-5,
+                    sensor_m: camera.to_sensor([x_m, y_m]),
+                    flags: Flags::empty(),
+                };
+                let estimate = Estimate {
+                    emitters: vec![emitter(10.0, -20.0), emitter(-60.0, 70.0)],
+                    rung: "study",
+                    reduced_chi2: 1.0,
+                    condition: 1.0,
+                    ..Estimate::default()
+                };
+                let seen = Observation {
+                    frame,
+                    time,
+                    result: Ok(&estimate),
+                    digest: frame + 1,
+                };
+                let report = monitor.step(seen, &mut store);
+                malformed += report
+                    .emitters
+                    .iter()
+                    .filter(|e| {
+                        let [[a, b], [c, d]] = e.cov_m2;
+                        let is_finite = [e.x_m, e.y_m, e.energy_j, a, b, c, d].iter().all(|v| v.is_finite());
+                        !(is_finite && b == c && a >= 0.0 && d >= 0.0)
+                    })
+                    .count();
+                raised.extend(report.events.iter().map(|e| e.alert.kind));
+            }
+            let is_alerted = raised.contains(&monitor::AlertKind::UnclaimedEmitter);
+            let words: Vec<String> = raised.iter().map(|k| format!("{k:?}")).collect();
+            Observed {
+                happened: format!(
+                    "{malformed} malformed positions in {FRAMES} frames; alerts: {}",
+                    if words.is_empty() {
+                        "none".to_owned()
+                    } else {
+                        words.join(", ")
+                    }
+                ),
+                holds: malformed == 0 && (is_alerted || !is_told),
+                fit: None,
+            }
+        },
+    )
+}
