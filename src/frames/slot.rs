@@ -25,6 +25,7 @@ struct State {
 
 /// What waiting on the slot ended with.
 #[derive(Debug)]
+#[allow(clippy::large_enum_variant, reason = "taken apart where it is given")]
 pub enum Taken {
     /// The oldest thing that is still of interest, and the number of frames dropped since the last one.
     Captured(Captured, u64),

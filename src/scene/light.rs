@@ -1,12 +1,10 @@
 //! From a beam to the spots that it leaves on the sensor during one exposure.
 
-use rand::RngExt;
-use rand_distr::Distribution;
-
-use super::average::{MeanLaw, WORTH_FROM};
+use super::average::Average;
 use super::config::Scene;
-use super::effects::{Capture, Fades, Pointing, Pose, Shaker, Turbulence, Wander, attitude};
-use super::error::{Error, Field};
+use super::effects::{Pose, attitude};
+use super::error::Error;
+use super::exposure::Exposure;
 use super::population::{Beam, Population};
 use super::render::Spot;
 use super::report::{Decisions, Status};
@@ -28,32 +26,6 @@ pub(super) struct Light {
     exposure: Exposure,
 }
 
-/// How the spot moves while the shutter is open.
-#[derive(Debug)]
-struct Exposure {
-    /// Number of sub-frames; 1 when nothing moves.
-    steps: usize,
-    time_s: f64,
-    motion_blur: bool,
-    shaker: Option<Shaker>,
-    wander: Option<Wander>,
-}
-
-/// The mean over the exposure of what fading and pointing leave of a beam.
-#[derive(Debug)]
-enum Average {
-    Constant(f64),
-    /// One draw from the mean's own law, from the stream of this effect.
-    OneDraw(Effect, MeanLaw),
-    /// Every value by itself.
-    Drawn {
-        turbulence: Option<Turbulence>,
-        pointing: Option<Pointing>,
-        capture: Capture,
-        count: usize,
-    },
-}
-
 /// What the beams of one frame share, and room to work in.
 #[derive(Debug, Default)]
 pub(super) struct Shot {
@@ -73,8 +45,6 @@ pub(super) struct Moment<'a> {
     pub ledger: &'a Ledger,
 }
 
-/// More sub-frames than this are refused.
-const MOST_STEPS: f64 = 1024.0;
 /// The steepest slope of a unit Gaussian, exp(−1/2).
 const STEEPEST: f64 = 0.606_530_659_712_633_4;
 
@@ -248,204 +218,5 @@ impl Light {
             });
         }
         total
-    }
-}
-
-impl Exposure {
-    fn new(
-        scene: &Scene,
-        population: &Population,
-        streams: Streams,
-        decisions: &mut Decisions,
-        moved: impl Fn(f64) -> f64,
-        z: f64,
-    ) -> Result<Self, Error> {
-        let effects = &scene.effects;
-        let time_s = scene.link.integration_time_s;
-        let field = Field::new("effects");
-        // Eight sub-frames a period, or a correlation time, follow the motion; 1,024 are the most.
-        let needed = |times: f64, field: Field, found: f64| {
-            let steps = (8.0 * times).ceil();
-            if steps <= MOST_STEPS {
-                Ok((steps as usize).max(16))
-            } else {
-                Err(field.refuse(
-                    "motion slow enough for 1024 sub-frames an exposure (T_int at most 128 of its times)",
-                    found,
-                ))
-            }
-        };
-        let mut steps = 1;
-
-        let vibration = decisions.weigh(Effect::Vibration, &effects.vibration, |all| {
-            all.iter()
-                .map(|v| moved(z * v.amplitude_rad[0].hypot(v.amplitude_rad[1])))
-                .sum()
-        });
-        for (k, v) in vibration.into_iter().flatten().enumerate() {
-            let field = field.item("vibration", k).at("frequency_hz");
-            steps = steps.max(needed(time_s * v.frequency_hz, field, v.frequency_hz)?);
-        }
-        let wander = decisions
-            .weigh(Effect::Wander, &effects.wander, |w| moved(z * 3.0 * w.std_rad))
-            .cloned();
-        if let Some(w) = &wander {
-            steps = steps.max(needed(time_s / w.time_s, field.at("wander").at("time_s"), w.time_s)?);
-        }
-        let scale = scene.optics.plane_distance_m / scene.optics.altitude_m;
-        let path = population.top_speed() * time_s * scale;
-        let blur = decisions.weigh(Effect::MotionBlur, &effects.motion_blur, |_| moved(0.5 * path));
-        if blur.is_some() {
-            steps = steps.max(16);
-        }
-        for (effect, on) in [
-            (Effect::Vibration, vibration.is_some()),
-            (Effect::Wander, wander.is_some()),
-            (Effect::MotionBlur, blur.is_some()),
-        ] {
-            if on {
-                decisions.note(
-                    effect,
-                    Status::On,
-                    format!("the spot moves: {steps} sub-frames an exposure"),
-                );
-            }
-        }
-        Ok(Self {
-            steps,
-            time_s,
-            motion_blur: blur.is_some(),
-            shaker: vibration.map(|v| Shaker::new(v, streams, &Ledger::default())),
-            wander,
-        })
-    }
-
-    /// Middle of sub-frame `s` of an exposure centred on `t`, s.
-    fn middle(&self, t: f64, s: usize) -> f64 {
-        t + self.time_s * ((s as f64 + 0.5) / self.steps as f64 - 0.5)
-    }
-}
-
-impl Average {
-    fn new(scene: &Scene, camera: &Camera, steps: usize, peak: f64, decisions: &mut Decisions) -> Result<Self, Error> {
-        let effects = &scene.effects;
-        let w = scene.link.beam_radius_m;
-        let fading = decisions.weigh(Effect::Fading, &effects.fading, |_| f64::INFINITY);
-        let turbulence = match fading {
-            Some(fading) => Some(fading.turbulence(&Field::new("effects.fading"))?),
-            None => None,
-        };
-        let pointing = decisions.weigh(Effect::Pointing, &effects.pointing, |p| {
-            let reach = |i: usize| 3.0 * p.jitter_m + p.boresight_m[i].abs();
-            peak * 2.0 * (reach(0).powi(2) + reach(1).powi(2)) / (w * w)
-        });
-        let ratio = camera.lens_radius_m / w;
-        let exact = decisions.weigh(Effect::ExactAperture, &effects.exact_aperture, |_| peak * ratio * ratio);
-        let capture = match exact {
-            Some(_) => {
-                let reach = pointing.map_or(0.0, |p| p.boresight_m[0].hypot(p.boresight_m[1]) + 9.0 * p.jitter_m);
-                let reason = format!(
-                    "tabulated once over the miss; the flat form errs by about {:.1e}",
-                    ratio * ratio
-                );
-                decisions.note(Effect::ExactAperture, Status::Folded, reason);
-                Capture::exact(camera.lens_radius_m, w, reach)
-            }
-            None => Capture::Flat { beam_radius_m: w },
-        };
-        let count = scene.link.coherence_times();
-        if turbulence.is_none() && pointing.is_none_or(|p| p.jitter_m == 0.0) {
-            let miss = pointing.map_or(0.0, |p| p.boresight_m[0].powi(2) + p.boresight_m[1].powi(2));
-            if pointing.is_some() {
-                decisions.note(Effect::Pointing, Status::Folded, "a steady miss is one constant factor");
-            }
-            return Ok(Self::Constant(capture.at(miss)));
-        }
-        let fixed = match turbulence {
-            Some(Turbulence::FromPath { .. }) => None,
-            Some(Turbulence::Given(law)) => Some(Some(law)),
-            None => Some(None),
-        };
-        let law = fixed
-            .filter(|_| steps == 1 && count >= WORTH_FROM)
-            .and_then(|law| MeanLaw::new(law, pointing.map(|p| (p, &capture)), count));
-        let on = [
-            (Effect::Fading, fading.is_some()),
-            (Effect::Pointing, pointing.is_some()),
-        ];
-        let on = on.into_iter().filter(|o| o.1).map(|o| o.0);
-        if let Some(law) = law {
-            let from = if fading.is_some() {
-                Effect::Fading
-            } else {
-                Effect::Pointing
-            };
-            for effect in on {
-                let reason =
-                    format!("the mean of T_int/T_coh = {count} values is one draw from its own law, tabulated once");
-                decisions.note(effect, Status::Folded, reason);
-            }
-            return Ok(Self::OneDraw(from, law));
-        }
-        for effect in on {
-            let why = match (steps, fixed.is_none()) {
-                (2.., _) => "the spot moves meanwhile",
-                (_, true) => "their law depends on each emitter's range",
-                _ => "too few for a table to pay",
-            };
-            let reason = format!("T_int/T_coh = {count} values an emitter, averaged: {why}");
-            decisions.note(effect, Status::On, reason);
-        }
-        Ok(Self::Drawn {
-            turbulence,
-            pointing: pointing.cloned(),
-            capture,
-            count: count as usize,
-        })
-    }
-
-    /// Pushes the mean factor of each of `steps` sub-frames.
-    fn draw(&self, entity: u64, length_m: f64, steps: usize, at: Moment<'_>, out: &mut Vec<f64>) {
-        let open = |effect| at.streams.open(effect, entity, at.k, at.ledger);
-        match self {
-            Self::Constant(factor) => out.resize(steps, *factor),
-            Self::OneDraw(effect, law) => out.resize(steps, law.quantile(open(*effect).random())),
-            Self::Drawn {
-                turbulence,
-                pointing,
-                capture,
-                count,
-            } => {
-                let mut fading = turbulence.map(|t| (Fades::new(t.law(length_m)), open(Effect::Fading)));
-                let mut pointing = pointing.as_ref().map(|p| (p, open(Effect::Pointing)));
-                let still = capture.at(0.0);
-                let mut value = || {
-                    let rho = fading
-                        .as_mut()
-                        .map_or(1.0, |(fades, stream)| fades.sample(&mut **stream));
-                    let h = pointing
-                        .as_mut()
-                        .map_or(still, |(p, stream)| capture.at(p.squared_miss(&mut **stream)));
-                    rho * h
-                };
-                // Value i holds for the share of the exposure from i/count to (i + 1)/count.
-                let (mut drawn, mut current) = (0, 0.0);
-                for s in 0..steps {
-                    if *count >= steps {
-                        let end = (s + 1) * count / steps;
-                        let sum: f64 = (drawn..end).map(|_| value()).sum();
-                        // Weighted so that the mean over the sub-frames is the mean of all values.
-                        out.push(sum * steps as f64 / *count as f64);
-                        drawn = end;
-                    } else {
-                        while drawn <= s * count / steps {
-                            current = value();
-                            drawn += 1;
-                        }
-                        out.push(current);
-                    }
-                }
-            }
-        }
     }
 }

@@ -6,6 +6,7 @@ mod config;
 mod detector;
 mod effects;
 mod error;
+mod exposure;
 mod light;
 mod motion;
 mod network;

@@ -239,3 +239,61 @@ async fn an_answer_without_end_is_not_read() {
     assert!(started.elapsed() < Duration::from_secs(10));
     daemon.stop().await;
 }
+
+/// What is no HTTP, breaks off, or contradicts itself is no receipt; a 2xx is one, whatever its body does.
+#[tokio::test]
+async fn a_receiver_that_lies_is_asked_until_it_answers_properly() {
+    use tokio::io::{AsyncReadExt, AsyncWriteExt};
+    const LIES: [&[u8]; 8] = [
+        b"",
+        b"\x00\xff\xfe garbage\r\n\r\n",
+        b"HTTP/9.9 200 OK\r\n\r\n",
+        b"HTTP/1.1 999999 OK\r\n\r\n",
+        b"HTTP/1.1 200",
+        b"HTTP/1.1 100 Continue\r\n\r\n",
+        b"HTTP/1.1 200 OK\r\ncontent-length: 3\r\ncontent-length: 99\r\n\r\n",
+        b"HTTP/1.1 500 OK\r\ncontent-length: 2\r\n\r\nOK",
+    ];
+    let dir = tempfile::tempdir().unwrap();
+    let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let url = format!("http://{}/", listener.local_addr().unwrap());
+    let asked = Arc::new(std::sync::Mutex::new(Vec::new()));
+    let receiver = tokio::spawn({
+        let asked = asked.clone();
+        async move {
+            loop {
+                let (mut stream, _) = listener.accept().await.unwrap();
+                let mut request = vec![0; 16 << 10];
+                let n = stream.read(&mut request).await.unwrap_or(0);
+                let number = {
+                    let mut asked = asked.lock().unwrap();
+                    asked.push(String::from_utf8_lossy(&request[..n]).into_owned());
+                    asked.len()
+                };
+                // A body that is shorter than announced comes with the receipt.
+                let receipt = b"HTTP/1.1 200 OK\r\ncontent-length: 1000\r\n\r\nshort".as_slice();
+                let _ = stream.write_all(LIES.get(number - 1).copied().unwrap_or(receipt)).await;
+            }
+        }
+    });
+    let clock = Clock::fast(start(), 36_000.0);
+    let daemon = Daemon::start(&on_disk(dir.path()), &[webhook(dir.path(), &url)], clock);
+    daemon.record(&[event(AlertEventKind::Raised, "a", AlertKind::UnclaimedEmitter)]);
+    until(|| daemon.status().sent == 1).await;
+    assert_eq!((daemon.status().failed, daemon.status().queued), (0, 0));
+    let asked = asked.lock().unwrap().clone();
+    let id = |request: &String| {
+        let line = request
+            .lines()
+            .find(|l| l.to_ascii_lowercase().starts_with("webhook-id:"));
+        line.map(str::to_owned)
+    };
+    assert_eq!(
+        asked.len(),
+        LIES.len() + 1,
+        "one request a lie, and the one that was confirmed"
+    );
+    assert!(id(&asked[0]).is_some() && asked.iter().all(|r| id(r) == id(&asked[0])));
+    receiver.abort();
+    daemon.stop().await;
+}

@@ -8,8 +8,8 @@
 
 use std::f64::consts::PI;
 
-use super::effects::{Capture, Pointing};
 use crate::optics::fading::GammaGamma;
+use crate::scene::effects::{Capture, Pointing};
 
 /// Cosine terms: the last frequency is 27 standard deviations' worth, where 16 or more smooth factors have died out.
 const TERMS: usize = 256;

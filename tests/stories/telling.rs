@@ -1,0 +1,250 @@
+//! A story told to the monitor, and what it said.
+
+use std::collections::BTreeMap;
+
+use oapwatch::claim::{Claim, ClaimState};
+use oapwatch::claims::{self, Store};
+use oapwatch::estimate::{Emitter, Error, Estimate, Flags};
+use oapwatch::monitor::{AlertEvent, AlertEventKind, AlertKind, AlertState, Monitor, Observation, Report, Source};
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use rand_distr::{Distribution, Normal};
+
+use super::{Sensor, Story, at, camera, expected, start};
+
+/// What the monitor said.
+pub struct Told {
+    pub events: Vec<AlertEvent>,
+    pub reports: Vec<Report>,
+    pub store: Store,
+}
+
+impl Told {
+    /// (kind, user, seconds) of every alert raised.
+    pub fn raised(&self) -> Vec<(AlertKind, Option<String>, f64)> {
+        self.of(AlertEventKind::Raised)
+    }
+
+    pub fn cleared(&self) -> Vec<(AlertKind, Option<String>, f64)> {
+        self.of(AlertEventKind::Cleared)
+    }
+
+    fn of(&self, kind: AlertEventKind) -> Vec<(AlertKind, Option<String>, f64)> {
+        self.events
+            .iter()
+            .filter(|e| e.event == kind)
+            .map(|e| {
+                let time = e.alert.cleared_at.filter(|_| kind == AlertEventKind::Cleared);
+                let time = time.unwrap_or(e.alert.raised_at);
+                (
+                    e.alert.kind,
+                    e.alert.user.clone(),
+                    time.duration_since(start()).as_secs_f64(),
+                )
+            })
+            .collect()
+    }
+
+    pub fn ndjson(&self) -> String {
+        self.events
+            .iter()
+            .map(|e| serde_json::to_string(e).unwrap() + "\n")
+            .collect()
+    }
+
+    /// Exactly these were raised, each within its interval, and nothing else.
+    #[track_caller]
+    pub fn expect(&self, expected: &[(AlertKind, Option<&str>, f64, f64)]) {
+        expected::expect(&self.raised(), expected, &self.ndjson());
+    }
+}
+
+/// Detections of one frame: beams that are too near each other melt into one.
+fn detect(story: &Story, t: f64, rng: &mut ChaCha8Rng) -> Vec<Emitter> {
+    let camera = camera();
+    let shift = (story.shift)(t);
+    let [s, a] = (story.turn)(t);
+    let mut spots: Vec<([f64; 2], f64)> = Vec::new();
+    for actor in &story.actors {
+        let Some([x, y]) = (actor.beam)(t) else { continue };
+        let p = [x + shift[0] + s * x - a * y, y + shift[1] + a * x + s * y];
+        if !camera.sees(p) || rng.random::<f64>() >= story.detected {
+            continue;
+        }
+        // Ten coherence times a frame: 29 % scintillation.
+        let fading = Normal::<f64>::new(1.0, 0.25).unwrap().sample(rng).clamp(0.3, 2.5);
+        spots.push((p, actor.energy_j * fading));
+    }
+    if rng.random::<f64>() < story.ghosts {
+        spots.push(([rng.random_range(-120.0..120.0), rng.random_range(-120.0..120.0)], 1e-3));
+    }
+    let mut merged: Vec<([f64; 2], f64)> = Vec::new();
+    'spots: for (p, energy) in spots {
+        for (q, sum) in &mut merged {
+            if (p[0] - q[0]).hypot(p[1] - q[1]) < story.resolution_m {
+                let share = energy / (*sum + energy);
+                *q = [q[0] + share * (p[0] - q[0]), q[1] + share * (p[1] - q[1])];
+                *sum += energy;
+                continue 'spots;
+            }
+        }
+        merged.push((p, energy));
+    }
+    let error = Normal::new(0.0, story.position_std_m).unwrap();
+    merged
+        .into_iter()
+        .map(|(p, energy_j)| {
+            let variance = story.position_std_m.powi(2);
+            let (x_m, y_m) = (p[0] + error.sample(rng), p[1] + error.sample(rng));
+            Emitter {
+                x_m,
+                y_m,
+                cov_m2: [[variance, 0.0], [0.0, variance]],
+                energy_j,
+                energy_std_j: 1e-5,
+                sensor_m: camera.to_sensor([x_m, y_m]),
+                flags: Flags::empty(),
+            }
+        })
+        .collect()
+}
+
+/// Every claim with the time it comes in, by that time.
+pub fn claims(story: &Story) -> Vec<(f64, Claim)> {
+    let mut rng = ChaCha8Rng::seed_from_u64(story.seed ^ 0xc1a1_4500);
+    let mut all = Vec::new();
+    for actor in &story.actors {
+        let Some(user) = &actor.user else { continue };
+        let fresh = Normal::new(0.0, actor.sigma_m * (1.0 - story.claim_wander).sqrt()).unwrap();
+        // First-order Gauss-Markov with a correlation time of one minute.
+        let keeps = (-actor.period_s / 60.0).exp();
+        let stationary = actor.sigma_m * story.claim_wander.sqrt();
+        let drift = Normal::new(0.0, stationary * (1.0 - keeps * keeps).sqrt()).unwrap();
+        let begin = Normal::new(0.0, stationary).unwrap();
+        let mut wander = [begin.sample(&mut rng), begin.sample(&mut rng)];
+        let mut t = actor.phase_s;
+        let mut over = false;
+        while t < story.seconds && !over {
+            over = actor.ended_at.is_some_and(|end| t >= end);
+            wander = wander.map(|w| keeps * w + drift.sample(&mut rng));
+            let (ex, ey) = (wander[0] + fresh.sample(&mut rng), wander[1] + fresh.sample(&mut rng));
+            if let Some([x, y]) = (actor.claim)(t)
+                && let Some(comes) = (story.delivery)(t)
+            {
+                all.push((
+                    comes,
+                    Claim {
+                        time: at(t),
+                        user: user.clone(),
+                        x_m: x + ex,
+                        y_m: y + ey,
+                        sigma_m: actor.states_sigma.then_some(actor.sigma_m),
+                        state: if over { ClaimState::Ended } else { ClaimState::Active },
+                    },
+                ));
+            }
+            t += actor.period_s;
+        }
+    }
+    all.extend(story.forged.iter().cloned());
+    all.sort_by(|a, b| a.0.total_cmp(&b.0));
+    all
+}
+
+pub fn tell(story: &Story) -> Told {
+    tell_with(story, true)
+}
+
+/// `keep` holds on to every frame's report; long runs do without.
+pub fn tell_with(story: &Story, keep: bool) -> Told {
+    let camera = camera();
+    let config = claims::Config::default();
+    let source = Source {
+        kind: "replay".into(),
+        file: None,
+        rate_hz: story.rate_hz,
+    };
+    let mut monitor = Monitor::new(&story.monitor, &config, &camera, source.clone());
+    let mut store = Store::new(&config);
+    let mut rng = ChaCha8Rng::seed_from_u64(story.seed);
+    let mut upcoming = claims(story).into_iter().peekable();
+    let (mut events, mut reports) = (Vec::<AlertEvent>::new(), Vec::new());
+    let mut last_digest = 0;
+    for frame in 0..(story.seconds * story.rate_hz).round() as u64 {
+        let t = frame as f64 / story.rate_hz;
+        if story.restarts_at == Some(t) {
+            // What the journal holds.
+            let mut open: BTreeMap<String, oapwatch::monitor::Alert> = BTreeMap::new();
+            for event in &events {
+                open.insert(event.alert.id.clone(), event.alert.clone());
+            }
+            open.retain(|_, alert| alert.state != AlertState::Cleared);
+            monitor = Monitor::new(&story.monitor, &config, &camera, source.clone());
+            monitor.restore(open.into_values().collect());
+        }
+        while let Some((_, claim)) = upcoming.next_if(|(comes, _)| *comes <= t + 1e-9) {
+            store.insert(claim, at(t));
+        }
+        let sensor = (story.sensor)(t);
+        if sensor == Sensor::Nothing {
+            events.extend(monitor.tick(at(t), &mut store));
+            continue;
+        }
+        let mut estimate = Estimate {
+            is_cut_short: false,
+            emitters: detect(story, t, &mut rng),
+            rung: "story",
+            reduced_chi2: 1.0,
+            saturated_share: 0.0,
+            condition: 1.0,
+            steps: 0,
+        };
+        let mut digest = frame + 1;
+        let mut error = None;
+        match sensor {
+            Sensor::Fine | Sensor::Nothing => {}
+            Sensor::Nan => {
+                digest = 1 << 40;
+                error = Some(Error::NoUsablePixel {
+                    total: 4096,
+                    nan: 4096,
+                    saturated: 0,
+                    masked: 0,
+                });
+            }
+            Sensor::Zero => {
+                digest = 1 << 41;
+                estimate.emitters.clear();
+            }
+            Sensor::Saturated => {
+                digest = 1 << 42;
+                estimate.emitters.clear();
+                estimate.saturated_share = 1.0;
+            }
+            Sensor::Frozen => digest = last_digest,
+            Sensor::LensCap => estimate.emitters.clear(),
+        }
+        last_digest = digest;
+        let seen = Observation {
+            frame,
+            time: at(t),
+            result: error.as_ref().map_or(Ok(&estimate), Err),
+            digest,
+        };
+        let report = monitor.step(seen, &mut store);
+        events.extend(report.events.iter().cloned());
+        if keep {
+            reports.push(report);
+        }
+    }
+    Told { events, reports, store }
+}
+
+/// How often each kind was raised.
+pub fn tally(events: &[AlertEvent]) -> BTreeMap<AlertKind, usize> {
+    let mut tally = BTreeMap::new();
+    for e in events.iter().filter(|e| e.event == AlertEventKind::Raised) {
+        *tally.entry(e.alert.kind).or_default() += 1;
+    }
+    tally
+}
