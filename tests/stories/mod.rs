@@ -5,6 +5,7 @@
 mod expected;
 mod telling;
 
+#[allow(unused_imports, reason = "each test file takes what it needs")]
 pub use telling::{Told, claims, tally, tell, tell_with};
 
 use jiff::{SignedDuration, Timestamp};

@@ -23,7 +23,7 @@ const MOST_NODES: usize = 4_000_000;
 
 /// The mean's distribution function, to be inverted at a uniform number.
 #[derive(Debug)]
-pub(super) struct MeanLaw {
+pub(in crate::scene) struct MeanLaw {
     from: f64,
     step: f64,
     cumulative: Vec<f64>,

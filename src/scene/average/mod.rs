@@ -4,6 +4,7 @@ mod law;
 
 use law::{MeanLaw, WORTH_FROM};
 use rand::RngExt;
+use rand_distr::Distribution;
 
 use super::Effect;
 use super::config::Scene;

@@ -81,7 +81,8 @@ fn clock_step(by_s: f64) -> Case {
                 let statuses = r.emitters.iter().filter(|e| e.user.is_some()).map(|e| e.status);
                 statuses.into_iter().any(|s| s == monitor::PositionStatus::Verified)
             });
-            let (before, after): (Vec<_>, Vec<_>) = raised.iter().partition(|(frame, _)| *frame < intrusion);
+            type Raised<'a> = Vec<&'a (u64, monitor::AlertKind)>;
+            let (before, after): (Raised, Raised) = raised.iter().partition(|(frame, _)| *frame < intrusion);
             let is_alerted = after.len() == 1 && after[0].1 == monitor::AlertKind::UnclaimedEmitter;
             let words = |list: &[&(u64, monitor::AlertKind)]| {
                 let words: Vec<_> = list

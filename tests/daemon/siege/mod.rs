@@ -399,26 +399,6 @@ fn siege_slow_loris() {
 
 #[test]
 #[ignore = "minutes; make siege"]
-fn siege_frames_at_ten_times_the_rate_that_can_be_handled() {
-    let dir = tempfile::tempdir().unwrap();
-    // The dearest rung, whose pace decides, and a scene that comes as fast as it can be made.
-    let daemon = start(dir.path(), 20_000.0, "[estimator]\nname = \"map\"\n");
-    std::thread::sleep(seconds().min(Duration::from_secs(20)));
-    let seen = status(&daemon, None);
-    let list: Value = serde_json::from_str(&daemon.get("/v1/alerts").1).unwrap();
-    let kinds: Vec<_> = alerts(&list).iter().map(|a| a["kind"].to_string()).collect();
-    println!(
-        "20,000 frames/s asked for: {} {}; alerts {kinds:?}; resident {} MiB",
-        seen["frames"],
-        seen["latency"],
-        daemon.resident_mib()
-    );
-    assert!(kinds.contains(&"\"unclaimed_emitter\"".to_owned()), "{kinds:?}");
-    assert!(number(&seen, "/frames/dropped") > number(&seen, "/frames/captured") / 4);
-}
-
-#[test]
-#[ignore = "minutes; make siege"]
 fn siege_a_gigabyte_of_garbage_in_the_log() {
     let dir = tempfile::tempdir().unwrap();
     let log = dir.path().join("claims.ndjson");
