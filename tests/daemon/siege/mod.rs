@@ -16,7 +16,7 @@ use serde_json::Value;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::runtime::Runtime;
 
-use super::process::{Daemon, alerts};
+use super::process::Daemon;
 
 const RATE_HZ: f64 = 40.0;
 /// The status tells the latency of the newest 128 frames: each sample is of frames of its own.
