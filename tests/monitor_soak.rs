@@ -125,16 +125,22 @@ fn drift(seed: u64) -> Story {
 fn the_power_of_the_tests() {
     let n = number("OAPWATCH_SOAK_STORIES", 3000);
     let seed = number("OAPWATCH_SOAK_SEED", 1000);
-    println!(
-        "intruder within 1 s: {}",
-        power(n, seed, UnclaimedEmitter, 5.0, 6.0, intrusion)
-    );
-    println!(
-        "2 m beyond within 1 s: {}",
-        power(n, seed, PositionMismatch, 5.0, 6.05, step_out)
-    );
-    println!(
-        "drift within 1 m: {}",
-        power(n / 10, seed, PositionMismatch, 55.0, 65.0, drift)
-    );
+    let shares = [
+        (
+            "intruder within 1 s",
+            power(n, seed, UnclaimedEmitter, 5.0, 6.0, intrusion),
+        ),
+        (
+            "2 m beyond within 1 s",
+            power(n, seed, PositionMismatch, 5.0, 6.05, step_out),
+        ),
+        (
+            "drift within 1 m",
+            power(n / 10, seed, PositionMismatch, 55.0, 65.0, drift),
+        ),
+    ];
+    println!("{shares:#?}");
+    for (what, share) in shares {
+        assert!(share >= 0.999, "{what}: {share}");
+    }
 }
