@@ -67,10 +67,12 @@ test-deploy:
 
 .PHONY: soak
 # Whether memory, file descriptors or threads grow, over SOAK_S seconds of 40 times the usual pace. Not in CI: it takes its time.
+# SOAK="--frames 1000000 --rate 500 --estimator network --samples FILE" and the like go on to it; soak_picture.py draws the samples.
 SOAK_S ?= 600
+SOAK ?=
 soak: build
 	$(call need,command -v python3,python3-minimal)
-	tests/deploy/soak.py target/release/oapwatch --seconds $(SOAK_S)
+	tests/deploy/soak.py target/release/oapwatch --seconds $(SOAK_S) $(SOAK)
 
 .PHONY: siege
 # Floods, slow and endless clients, a thousand viewers, a gigabyte of garbage: what they cost the monitor. Not in CI: minutes.

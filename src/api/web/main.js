@@ -181,7 +181,7 @@ function facts() {
   $("endpoints").replaceChildren(...s.webhooks.map((w) => {
     const tone = w.state === "working" ? "quiet" : "warn";
     const error = w.last_error && w.state !== "working" ? ` — ${w.last_error}` : "";
-    return el("li", {}, el("strong", {}, w.name), ` ${w.url} `, el("span", { className: tone }, `${w.state}: ${w.sent} sent, ${w.queued} queued, ${w.failed} given up${error}`));
+    return el("li", {}, el("strong", {}, w.name), ` ${w.url} `, el("span", { className: tone }, `${w.state}: ${w.sent} sent, ${w.queued} queued, ${w.withheld ? `${w.withheld} withheld, ` : ""}${w.failed} given up${error}`));
   }));
 }
 
