@@ -101,6 +101,11 @@ test-aarch64: aarch64 build
 	$(call need,command -v qemu-aarch64-static,qemu-user-static)
 	tests/deploy/aarch64.py target/release/oapwatch target/cross/aarch64-unknown-linux-gnu/release/oapwatch
 
+.PHONY: stability
+# docs/stability/cases.md: a thousand frames of every hard case. Fails where a promise does not hold.
+stability: build
+	target/release/oapwatch stability --frames 1000 --out docs/stability/cases.md
+
 .PHONY: tradeoff
 # docs/tradeoff: what accuracy costs in time. Some minutes on a machine that does nothing else.
 tradeoff: build

@@ -141,6 +141,16 @@ impl Store {
         }
     }
 
+    /// The clock was set back to `now`: what was claimed for later times no longer stands.
+    pub fn set_back(&mut self, now: Timestamp) {
+        for history in self.users.values_mut() {
+            history.claims.retain(|claim| claim.time <= now);
+            history.came = history.came.min(now);
+        }
+        self.users.retain(|_, history| !history.claims.is_empty());
+        self.newest = None;
+    }
+
     pub fn counts(&self) -> Counts {
         self.counts
     }

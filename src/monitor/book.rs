@@ -110,6 +110,16 @@ impl Book {
         }
     }
 
+    /// Lets go of all causes; gives the alerts that stand.
+    pub fn start_again(&mut self) -> Vec<Alert> {
+        self.cleared.clear();
+        self.has_caught_up = false;
+        std::mem::take(&mut self.open)
+            .into_values()
+            .map(|open| open.alert)
+            .collect()
+    }
+
     /// Until then the absence of a cause from before this run says nothing.
     pub fn catch_up(&mut self, has_caught_up: bool) {
         self.has_caught_up |= has_caught_up;

@@ -309,6 +309,12 @@ impl Tracks {
         }
     }
 
+    /// Lets go of all tracks and of the time; numbers go on.
+    pub fn forget(&mut self) {
+        self.all.clear();
+        self.time = None;
+    }
+
     /// A number that no track will have.
     pub fn reserve(&mut self) -> u64 {
         self.next_id += 1;

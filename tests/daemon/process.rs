@@ -48,6 +48,15 @@ impl Daemon {
         panic!("no {what} within 20 s; {path} last said {last}");
     }
 
+    /// Waits until it answers; fails after 20 s.
+    pub fn wait_until_up(&self) {
+        let end = Instant::now() + Duration::from_secs(20);
+        while !matches!(request(&self.url, "GET", "/readyz", "", ""), Some((200, _))) {
+            assert!(Instant::now() < end, "not ready within 20 s");
+            std::thread::sleep(Duration::from_millis(50));
+        }
+    }
+
     /// Host and port.
     pub fn address(&self) -> &str {
         self.url.trim_start_matches("http://")

@@ -24,6 +24,8 @@ use super::{Alert, AlertEvent, AlertKind, Config, Observation, Report, Source};
 use crate::claims::{Store, seconds};
 use crate::optics::Camera;
 
+/// A clock that shows less than this earlier than before has not been set back: frames and failures are stamped apart.
+const SET_BACK_S: f64 = 2.0;
 /// Systematic error of the positions that does not average out, m.
 const SYSTEMATIC_M: f64 = 0.05;
 /// A beam and an absence that began within this of each other have one cause, s.
@@ -97,6 +99,7 @@ impl Monitor {
     /// Takes one frame. Claims due by its time stand first.
     pub fn step(&mut self, seen: Observation, claims: &mut Store) -> Report {
         let now = seen.time;
+        self.mind_the_clock(now, claims);
         claims.advance(now);
         self.frame = seen.frame;
         self.first.get_or_insert(now);
@@ -130,6 +133,7 @@ impl Monitor {
 
     /// A frame that the source itself could not deliver whole.
     pub fn unusable(&mut self, frame: u64, time: Timestamp, reason: &str, claims: &mut Store) -> Report {
+        self.mind_the_clock(time, claims);
         claims.advance(time);
         self.frame = frame;
         self.first.get_or_insert(time);
@@ -142,6 +146,7 @@ impl Monitor {
 
     /// Time passes without a frame.
     pub fn tick(&mut self, now: Timestamp, claims: &mut Store) -> Vec<AlertEvent> {
+        self.mind_the_clock(now, claims);
         if self.time.is_some_and(|t| now <= t) {
             return Vec::new();
         }
@@ -151,6 +156,26 @@ impl Monitor {
         let asserted = self.assert(claims, now);
         self.watch_inputs(&asserted, claims, now);
         self.book.take_events()
+    }
+
+    /// Where the clock was set back, what is anchored in times that have not come yet would keep everything waiting for them.
+    /// The monitor starts again, and the alerts that stand go on as over a restart.
+    fn mind_the_clock(&mut self, now: Timestamp, claims: &mut Store) {
+        if !self.time.is_some_and(|t| seconds(now, t) > SET_BACK_S) {
+            return;
+        }
+        claims.set_back(now);
+        self.tracks.forget();
+        self.users.clear();
+        self.sight = Sight::default();
+        self.pose = Pose::default();
+        (self.first, self.first_claim, self.first_usable) = (None, None, None);
+        (self.period_s, self.delay_s, self.ahead_s) = (None, 0.0, 0.0);
+        self.time = None;
+        self.alone.clear();
+        self.strangers.clear();
+        let open = self.book.start_again();
+        self.restore(open);
     }
 
     /// An operator has taken note. `None` when no open alert has this id, or it is acknowledged already.

@@ -52,7 +52,7 @@ fn start(dir: &Path, rate_hz: f64, more: &str) -> Daemon {
         dir,
         &format!("[source]\nkind = \"simulator\"\nscene = \"scene.toml\"\n{more}"),
     );
-    daemon.wait_for("/healthz", "life", |_| true);
+    daemon.wait_until_up();
     daemon
 }
 
