@@ -44,13 +44,7 @@ pub fn run(args: Args) -> Outcome {
         bar.inc(1);
     }
     bar.finish_and_clear();
-    let text = format!(
-        "# Hard cases\n\n`oapwatch stability --frames {} --seed {} --estimator {}`: what it printed. Condition and steps are the largest of any frame.\n{}",
-        options.frames,
-        options.seed,
-        options.estimator.name.as_deref().unwrap_or(estimate::DEFAULT),
-        markdown(&rows)
-    );
+    let text = markdown(&rows, &options);
     println!("{text}");
     if let Some(path) = &args.out {
         std::fs::write(path, &text).map_err(|e| Failure::other(anyhow::anyhow!("{}: {e}", path.display())))?;

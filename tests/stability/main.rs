@@ -32,7 +32,7 @@ fn the_catalogue_holds() {
         .map(|c| c.run(&options(2)))
         .collect();
     let broken: Vec<_> = rows.iter().filter(|r| !r.seen.holds).cloned().collect();
-    assert!(broken.is_empty(), "{}", markdown(&broken));
+    assert!(broken.is_empty(), "{}", markdown(&broken, &options(2)));
     assert!(rows.len() > 80);
 }
 

@@ -1,14 +1,20 @@
-use super::Row;
+use super::{Options, Row};
+use crate::estimate;
 
 /// The study as Markdown tables, one a group; condition numbers and steps are the largest of any frame.
-pub fn markdown(rows: &[Row]) -> String {
+pub fn markdown(rows: &[Row], options: &Options) -> String {
+    let estimator = options.estimator.name.as_deref().unwrap_or(estimate::DEFAULT);
+    let how = format!(
+        "Estimator `{estimator}`, {} frames, seed {}.",
+        options.frames, options.seed
+    );
     let mut text = String::new();
     let mut group = "";
     for row in rows {
         if row.group != group {
             group = row.group;
             text += &format!(
-                "\n### {group}\n\n| case | what makes it hard | promised | happened | condition | steps | holds |\n|---|---|---|---|---|---|---|\n"
+                "\n### {group}\n\n{how}\n\n| case | what makes it hard | promised | happened | condition | steps | holds |\n|---|---|---|---|---|---|---|\n"
             );
         }
         let (condition, steps) = match row.seen.fit {
