@@ -1,7 +1,10 @@
-//! A whole frame of nine emitters by every rung of the ladder, at 64×64 and 100×100, separated and melted.
+//! A frame of nine emitters, at 64×64 and 100×100, separated and melted: each stage, and the whole by every rung of the ladder.
 
-use criterion::{Criterion, criterion_group, criterion_main};
+use criterion::measurement::WallTime;
+use criterion::{BenchmarkGroup, Criterion, criterion_group, criterion_main};
 use ndarray::Array2;
+use oapwatch::assign::assign;
+use oapwatch::estimate::stages::Stages;
 use oapwatch::estimate::{Config, LADDER, build};
 use oapwatch::frame::Frame;
 use oapwatch::optics::{self, psf};
@@ -9,7 +12,9 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, Normal};
 
-fn frame(camera: &optics::Camera) -> Frame {
+/// The frame and where its spots are, m on the sensor.
+fn frame(camera: &optics::Camera) -> (Frame, Vec<[f64; 2]>) {
+    let mut places = Vec::new();
     let mut rng = ChaCha8Rng::seed_from_u64(42);
     let noise = Normal::new(0.0, camera.noise_std_j).expect("positive");
     let mut pixels = Array2::from_shape_simple_fn(camera.shape(), || noise.sample(&mut rng));
@@ -18,18 +23,20 @@ fn frame(camera: &optics::Camera) -> Frame {
         // A jittered 3 × 3 lattice: nine emitters that can be told apart.
         let mut place = |i: usize| -75.0 + 75.0 * i as f64 + rng.random_range(-15.0..15.0);
         let [x, y] = camera.to_sensor([place(k % 3), place(k / 3)]);
+        places.push([x, y]);
         psf::profile(&camera.x, x, camera.spot_sigma_m, &mut row);
         psf::profile(&camera.y, y, camera.spot_sigma_m, &mut column);
         for ((b, a), pixel) in pixels.indexed_iter_mut() {
             *pixel += 7e-3 * column[b] * row[a];
         }
     }
-    Frame {
+    let frame = Frame {
         index: 0,
         time: jiff::Timestamp::UNIX_EPOCH,
         pixels,
         masked: None,
-    }
+    };
+    (frame, places)
 }
 
 fn frames(criterion: &mut Criterion) {
@@ -46,8 +53,9 @@ fn frames(criterion: &mut Criterion) {
             }
             .camera()
             .expect("a valid camera");
-            let frame = frame(&camera);
+            let (frame, places) = frame(&camera);
             let mut group = criterion.benchmark_group(format!("{spots}/{pixels}"));
+            stages(&mut group, &camera, &frame, &places);
             for rung in LADDER {
                 let config = Config {
                     name: Some(rung.name.to_owned()),
@@ -59,6 +67,25 @@ fn frames(criterion: &mut Criterion) {
             group.finish();
         }
     }
+}
+
+fn stages(group: &mut BenchmarkGroup<WallTime>, camera: &optics::Camera, frame: &Frame, places: &[[f64; 2]]) {
+    let mut stages = Stages::new(camera);
+    group.bench_function("stage: load", |b| b.iter(|| stages.load(frame)));
+    group.bench_function("stage: heatmap", |b| b.iter(|| stages.heatmap()));
+    group.bench_function("stage: suppression, sub-pixel peaks", |b| b.iter(|| stages.peaks()));
+    // A tenth of a pixel beside the truth, so that each step has something to do.
+    let starts: Vec<_> = places.iter().map(|p| p.map(|v| v + 0.1 * camera.x.pitch_m)).collect();
+    group.bench_function("stage: joint fit, five steps", |b| b.iter(|| stages.fit(&starts)));
+    group.bench_function("stage: covariance, ground", |b| b.iter(|| stages.ground()));
+    let found = stages.ground().emitters;
+    group.bench_function("stage: assignment to nine claims", |b| {
+        b.iter(|| {
+            assign(found.len(), found.len(), 1e4, |i, j| {
+                (found[i].x_m - found[j].x_m).powi(2) + (found[i].y_m - found[j].y_m).powi(2)
+            })
+        })
+    });
 }
 
 criterion_group!(benches, frames);

@@ -1,9 +1,11 @@
-//! What a frame costs: bare, with the paper's effects, with noise; and that an effect which is not called for costs nothing.
+//! What a frame costs: bare, with the paper's effects, with noise; that an effect which is not called for costs nothing; and
+//! what more threads bring in bulk.
 
 use std::hint::black_box;
 
-use criterion::{Criterion, criterion_group, criterion_main};
+use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use oapwatch::scene::{Plan, Scene};
+use rayon::ThreadPoolBuilder;
 
 /// Nine emitters that stand on a grid, 64 × 64 pixels, σ_eff 1 mm.
 fn nine(effects: &str) -> Plan {
@@ -53,5 +55,22 @@ fn frames(c: &mut Criterion) {
     group.finish();
 }
 
-criterion_group!(benches, frames);
+/// As many frames as `oapwatch simulate` holds at a time.
+const BULK: u64 = 256;
+
+fn bulk(c: &mut Criterion) {
+    let mut group = c.benchmark_group(format!("{BULK} frames, 64 × 64, N = 9, link and noise"));
+    group.throughput(Throughput::Elements(BULK));
+    let plan = nine(&format!("{LINK}thermal_noise = {{}}\n"));
+    let all = std::thread::available_parallelism().map_or(1, usize::from);
+    for threads in [1, all] {
+        let pool = ThreadPoolBuilder::new().num_threads(threads).build().expect("threads");
+        group.bench_function(format!("{threads} threads"), |b| {
+            b.iter(|| pool.install(|| black_box(plan.frames(0, BULK))))
+        });
+    }
+    group.finish();
+}
+
+criterion_group!(benches, frames, bulk);
 criterion_main!(benches);

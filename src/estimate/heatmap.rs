@@ -79,14 +79,18 @@ impl Heatmap {
     /// Peaks of `residual` (my, mx) of at least `threshold` standard deviations, no two nearer than `radius` σ,
     /// strongest first.
     pub fn peaks(&mut self, residual: &[f64], mx: usize, my: usize, threshold: f64, radius: f64) -> &[Peak] {
+        self.respond(residual, mx, my);
+        self.find(threshold, radius)
+    }
+
+    /// Fills the map with the response to `residual`.
+    pub fn respond(&mut self, residual: &[f64], mx: usize, my: usize) {
         pulp::Arch::new().dispatch(Filter {
             heatmap: self,
             residual,
             mx,
             my,
         });
-        self.find(threshold, radius);
-        &self.peaks
     }
 
     #[inline(always)]
@@ -110,7 +114,8 @@ impl Heatmap {
         }
     }
 
-    fn find(&mut self, threshold: f64, radius: f64) {
+    /// Peaks of the map as it is; see `peaks`.
+    pub fn find(&mut self, threshold: f64, radius: f64) -> &[Peak] {
         let (nx, ny) = (self.grid[0].len(), self.grid[1].len());
         self.peaks.clear();
         let at = |i: usize, j: usize| self.map[j * nx + i];
@@ -162,6 +167,7 @@ impl Heatmap {
             }
         }
         self.peaks.truncate(kept);
+        &self.peaks
     }
 }
 

@@ -163,6 +163,22 @@ pub fn build(config: &Config, camera: &Camera) -> Result<Box<dyn Estimator>, Con
     })
 }
 
+/// The bases to search in, and others that leave room for noise alone where those leave none.
+pub(super) fn bases(camera: &Camera) -> ([Basis; 2], Option<[Basis; 2]>) {
+    let sigma = camera.spot_sigma_m;
+    let [bx, by] = [&camera.x, &camera.y].map(|axis| Basis::new(axis, sigma));
+    let window = |b: &Basis| (2.0 * REACH / b.pitch()).min(b.n as f64);
+    let numbers = (bx.rank(TYPICAL) * by.rank(TYPICAL)) as f64;
+    // Where spots are small against the array, they touch fewer pixels than a basis has numbers.
+    let has_small_spots = window(&bx) * window(&by) < 2.0 * numbers && Sampler::new(&bx, &by).is_none();
+    if has_small_spots {
+        let pixels = [&camera.x, &camera.y].map(|axis| Basis::pixels(axis, sigma));
+        (pixels, Some([bx, by]))
+    } else {
+        ([bx, by], None)
+    }
+}
+
 /// A rung without a learned part.
 struct Analytic {
     rung: &'static Rung,
@@ -180,18 +196,9 @@ struct Analytic {
 
 impl Analytic {
     fn new(rung: &'static Rung, camera: &Camera, budget: Option<Duration>, known: Option<&KnownPower>) -> Self {
-        let sigma = camera.spot_sigma_m;
-        let [bx, by] = [&camera.x, &camera.y].map(|axis| Basis::new(axis, sigma));
-        let window = |b: &Basis| (2.0 * REACH / b.pitch()).min(b.n as f64);
-        let numbers = (bx.rank(TYPICAL) * by.rank(TYPICAL)) as f64;
-        // Where spots are small against the array, they touch fewer pixels than a basis has numbers.
-        let has_small_spots = window(&bx) * window(&by) < 2.0 * numbers && Sampler::new(&bx, &by).is_none();
-        let (search, compressed) = if has_small_spots {
-            let pixels = [&camera.x, &camera.y].map(|axis| Basis::pixels(axis, sigma));
-            (Search::new(pixels), Some(([bx, by], Reading::default())))
-        } else {
-            (Search::new([bx, by]), None)
-        };
+        let (bases, compressed) = bases(camera);
+        let search = Search::new(bases);
+        let compressed = compressed.map(|bases| (bases, Reading::default()));
         Self {
             rung,
             camera: camera.clone(),

@@ -29,6 +29,8 @@ mod screen;
 mod search;
 mod spot;
 mod spread;
+#[doc(hidden)]
+pub mod stages;
 mod weigh;
 
 pub use bound::{Beside, position_bound, position_bound_beside};

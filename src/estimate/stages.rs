@@ -1,0 +1,75 @@
+//! The stages of a frame one by one, so that a bench can time each; not part of the interface.
+
+use super::ground;
+use super::model::{Model, Nuisances, Spot};
+use super::reading::Reading;
+use super::screen::Screened;
+use super::search::Search;
+use super::{Error, Estimate};
+use crate::frame::Frame;
+use crate::optics::Camera;
+
+/// Steps of the joint fit that is timed.
+const STEPS: usize = 5;
+
+/// A frame's way from pixels to positions, halted between stages.
+pub struct Stages {
+    camera: Camera,
+    search: Search,
+    frame: Screened,
+    reading: Reading,
+    model: Model,
+}
+
+impl Stages {
+    pub fn new(camera: &Camera) -> Self {
+        Self {
+            search: Search::new(super::ladder::bases(camera).0),
+            camera: camera.clone(),
+            frame: Screened::default(),
+            reading: Reading::default(),
+            model: Model::empty(Nuisances::default()),
+        }
+    }
+
+    /// Validates the frame and brings it into the bases.
+    pub fn load(&mut self, frame: &Frame) -> Result<(), Error> {
+        self.frame.load(frame, &self.camera)?;
+        let fitter = &self.search.fitter;
+        self.reading.load(&self.frame, &fitter.bx, &fitter.by);
+        Ok(())
+    }
+
+    /// The matched filter of the loaded frame.
+    pub fn heatmap(&mut self) {
+        let Reading { z, mx, my, .. } = &self.reading;
+        self.search.heatmap.respond(z, *mx, *my);
+    }
+
+    /// Maxima of the heatmap, suppressed within a spot's radius and placed between grid points; how many.
+    pub fn peaks(&mut self) -> usize {
+        self.search.heatmap.find(self.search.price.sqrt(), 1.0).len()
+    }
+
+    /// Five steps of the joint fit of the spots at `places`, m on the sensor.
+    pub fn fit(&mut self, places: &[[f64; 2]]) {
+        let sigma = self.camera.spot_sigma_m;
+        self.model = Model::empty(Nuisances::default());
+        let spots = places.iter().map(|p| Spot::new(p.map(|v| v / sigma), 0.0));
+        self.model.spots.extend(spots);
+        self.search.fitter.restart(None);
+        self.search.fitter.fit(&self.reading, &mut self.model, STEPS);
+    }
+
+    /// Positions on the ground of what was fitted, with covariances and flags.
+    pub fn ground(&mut self) -> Estimate {
+        let Self {
+            camera,
+            search,
+            frame,
+            reading,
+            model,
+        } = self;
+        ground::locate(search, reading, model, frame, camera, camera.noise_std_j)
+    }
+}
