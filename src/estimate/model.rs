@@ -79,6 +79,17 @@ impl Model {
         }
     }
 
+    /// Takes out all nuisances but these.
+    pub fn confine(&mut self, nuisances: Nuisances) {
+        self.nuisances = nuisances;
+        if nuisances.width == Width::Known {
+            self.width = [1.0; 2];
+        }
+        if !nuisances.background {
+            self.background = [0.0; 3];
+        }
+    }
+
     /// Squared distances of the energies from what is known of them, in standard deviations.
     pub fn pull(&self) -> f64 {
         pull(&self.spots)

@@ -11,6 +11,13 @@ const UNLIKE: f64 = 3.0;
 const GHOST: f64 = 100.0;
 /// Misfit counts as around an emitter within this many σ.
 const AROUND: f64 = 2.0;
+/// What may stand instead of emitters.
+pub(super) const WIDE: Nuisances = Nuisances {
+    background: true,
+    width: Width::Common,
+};
+/// Emitters of less than this many prices' significance may be a background's or a width's.
+const DOUBT: f64 = 4.0;
 /// Steps that the pencil's seeds are polished by where more is fitted beside.
 const LONG_POLISH: usize = 150;
 
@@ -21,10 +28,6 @@ impl Search {
         let lit = Nuisances {
             background: true,
             width: Width::Known,
-        };
-        let wide = Nuisances {
-            width: Width::Common,
-            ..lit
         };
         // A background has singular values of its own, which the pencil would take for emitters.
         let grown = if self.sampler.is_some() {
@@ -38,13 +41,13 @@ impl Search {
         self.take_better(model, grown);
         if reading.is_explained(model) && !self.is_odd(model) {
             let mut next = model.clone();
-            next.nuisances = wide;
+            next.nuisances = WIDE;
             self.fitter.fit(reading, &mut next, TRIAL_STEPS);
             self.refine(reading, &mut next, EARLY_ROUNDS);
             self.take_better(model, next);
         }
         if !reading.is_explained(model) || self.is_odd(model) {
-            let next = self.start(reading, frame, wide, LONG_POLISH);
+            let next = self.start(reading, frame, WIDE, LONG_POLISH);
             self.take_better(model, next);
         }
         if !reading.is_explained(model)
@@ -52,6 +55,19 @@ impl Search {
         {
             *model = wider;
         }
+    }
+
+    /// Whether a background and another width can stand for emitters of a model that explains the frame.
+    pub(super) fn would_do_otherwise(&mut self, reading: &Reading, model: &Model) -> bool {
+        let mut next = model.clone();
+        next.nuisances = WIDE;
+        self.fitter.fit(reading, &mut next, TRIAL_STEPS);
+        let significance = self.significance(reading, &mut next);
+        if significance.iter().filter(|s| **s < DOUBT * self.price).count() < 2 {
+            return false;
+        }
+        self.shrink(reading, &mut next);
+        self.score(&next) < self.score(model)
     }
 
     fn take_better(&self, model: &mut Model, next: Model) {
@@ -104,13 +120,7 @@ impl Search {
         for nuisances in simpler {
             if nuisances.count() < model.nuisances.count() {
                 let mut next = model.clone();
-                next.nuisances = nuisances;
-                if nuisances.width == Width::Known {
-                    next.width = [1.0; 2];
-                }
-                if !nuisances.background {
-                    next.background = [0.0; 3];
-                }
+                next.confine(nuisances);
                 self.consider(reading, model, next);
             }
         }

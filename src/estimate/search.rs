@@ -7,6 +7,7 @@ use super::fit::Fitter;
 use super::heatmap::Heatmap;
 use super::model::{Model, Nuisances, Spot, Width};
 use super::noise::Growth;
+use super::otherwise::WIDE;
 use super::pencil::{Pencil, Sampler};
 use super::power::Prior;
 use super::reading::Reading;
@@ -27,6 +28,8 @@ pub(super) const EARLY_ROUNDS: usize = 3;
 const FAR: f64 = 5.0;
 /// Emitters of a candidate may be this much cheaper, together, than those of the present hypothesis are on average.
 const CHEAPER: f64 = 30.0;
+/// More overlapping emitters than these are first taken for something else.
+const BLOB: usize = 10;
 /// Least drop of the deviance that a nuisance parameter must bring.
 pub(super) const NUISANCE_PRICE: f64 = 5.0;
 
@@ -118,26 +121,49 @@ impl Search {
         if self.suspected.is_some() {
             return model;
         }
-        let first = model.clone();
-        if !reading.is_explained(&model) && !self.is_odd(&model) {
-            self.refine(reading, &mut model, EARLY_ROUNDS);
+        let mut is_settled = reading.is_explained(&model);
+        if is_settled {
+            self.refine(reading, &mut model, ROUNDS);
+        } else {
+            self.start_anew(reading, &mut model);
         }
-        if model.spots.len() > first.spots.len() + 1 {
-            model = first;
-        }
-        // A background has singular values of its own: what the first start explained with it may hold ghosts.
         let is_far = reading.misfit(&model) > 1.0 + FAR * (2.0 / reading.numbers).sqrt();
-        if is_far || model.nuisances != plain || self.is_odd(&model) {
+        if is_far || model.nuisances != plain || self.is_odd(&model) && self.would_do_otherwise(reading, &model) {
             self.explain_otherwise(reading, frame, &mut model);
+            is_settled = false;
         }
-        self.fitter.reserve(0.3);
-        self.refine(reading, &mut model, ROUNDS);
+        if !is_settled {
+            self.fitter.reserve(0.3);
+            self.refine(reading, &mut model, ROUNDS);
+        }
         self.simplify(reading, &mut model);
         if !reading.is_explained(&model) {
             self.lay_ghosts(reading, frame, &mut model);
         }
         self.finish(reading, &mut model);
         model
+    }
+
+    /// Another way to the frame from where a first start ended: nuisances free it from a false minimum and are taken out again,
+    /// then moves. What needs more emitters than a few beyond the first start's is not a matter of moves.
+    fn start_anew(&mut self, reading: &Reading, model: &mut Model) {
+        let first = model.clone();
+        if self.sampler.is_some() {
+            let mut free = first.clone();
+            free.nuisances = WIDE;
+            self.fitter.fit(reading, &mut free, TRIAL_STEPS);
+            free.confine(first.nuisances);
+            self.fitter.fit(reading, &mut free, TRIAL_STEPS);
+            if self.score(&free) < self.score(model) {
+                *model = free;
+            }
+        }
+        if !reading.is_explained(model) && first.spots.len() <= BLOB {
+            self.refine(reading, model, EARLY_ROUNDS);
+        }
+        if model.spots.len() > first.spots.len() + 1 {
+            *model = first;
+        }
     }
 
     /// The emitters that stand out at once, with a background where the frame looks lit: enough to tell what in the
@@ -206,7 +232,7 @@ impl Search {
         self.fitter.fit(reading, &mut best, TRIAL_STEPS);
         // A background and another width have singular values of their own.
         let is_plain = nuisances == Nuisances::default();
-        let (first, beyond) = if is_plain { (sure, 1) } else { (sure / 3, 3) };
+        let (first, beyond) = if is_plain { (sure, 2) } else { (sure / 3, 3) };
         self.climb(
             reading,
             &pencil,
