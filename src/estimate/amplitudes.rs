@@ -25,7 +25,7 @@ impl Fitter {
             for j in 0..=i {
                 gram[i * sources + j] = atoms.overlap(i, j, &reading.weights, &mut self.strip);
             }
-            rhs[i] = atoms.project(i, reading.weighted(), &mut self.strip)[0];
+            rhs[i] = atoms.project_value(i, reading.weighted(), &mut self.strip);
             if let Some(power) = atoms.spots.get(i).and_then(|s| s.power) {
                 gram[i * sources + i] += power.precision;
                 rhs[i] += power.precision * power.mean;
@@ -61,7 +61,7 @@ impl Fitter {
                 }
                 solution[order] = b;
                 for (column, j) in (0..=i).filter(|&j| self.active[j]).enumerate() {
-                    factor[order * size + column] = gram[i * sources + j];
+                    factor[column * size + order] = gram[i * sources + j];
                 }
                 factor[order * size + order] *= 1.0 + 1e-13;
                 order += 1;
@@ -72,7 +72,7 @@ impl Fitter {
                     let mut row = 0;
                     for i in (0..sources).filter(|&i| self.active[i]) {
                         for (column, j) in (0..=i).filter(|&j| self.active[j]).enumerate() {
-                            factor[row * size + column] = gram[i * sources + j];
+                            factor[column * size + row] = gram[i * sources + j];
                         }
                         factor[row * size + row] = gram[i * sources + i].max(1e-30) * (1.0 + ridge);
                         row += 1;

@@ -3,7 +3,7 @@
 use std::ops::Range;
 
 use super::basis::Basis;
-use super::linear::{axpy, dot};
+use super::linear::{axpy, combine, dot};
 use super::model::{Nuisances, Spot};
 use super::reading::Reading;
 
@@ -181,33 +181,40 @@ impl Atoms {
         [dot(t, self.x(i, 0)), dot(t, self.x(i, 1)), dot(t1, self.x(i, 0))]
     }
 
+    /// The first of these alone.
+    #[inline(always)]
+    pub fn project_value(&self, i: usize, matrix: &[f64], scratch: &mut Vec<f64>) -> f64 {
+        let [t] = self.fold(i, [0], matrix, scratch);
+        dot(t, self.x(i, 0))
+    }
+
     /// Inner products with the second derivatives: xx, xy, yy.
     #[inline(always)]
     pub fn bend(&self, i: usize, matrix: &[f64], scratch: &mut Vec<f64>) -> [f64; 3] {
         let [t, t1] = self.fold(i, [0, 1], matrix, scratch);
         let (xx, xy) = (dot(t, self.x(i, 2)), dot(t1, self.x(i, 1)));
-        let [t2, _] = self.fold(i, [2, 2], matrix, scratch);
+        let [t2] = self.fold(i, [2], matrix, scratch);
         [xx, xy, dot(t2, self.x(i, 0))]
     }
 
-    /// Rows of a matrix (my, mx) summed under two of the profiles along y of source `i`, over its columns.
+    /// Rows of a matrix (my, mx) summed under profiles along y of source `i`, over its columns.
     #[inline(always)]
-    fn fold<'a>(&self, i: usize, profiles: [usize; 2], matrix: &[f64], scratch: &'a mut Vec<f64>) -> [&'a [f64]; 2] {
+    fn fold<'a, const K: usize>(
+        &self,
+        i: usize,
+        profiles: [usize; K],
+        matrix: &[f64],
+        scratch: &'a mut Vec<f64>,
+    ) -> [&'a [f64]; K] {
         let [[x0, x1], [y0, _]] = self.spans[i];
         let m = x1 - x0;
-        scratch.clear();
-        scratch.resize(2 * m, 0.0);
-        let (t, t1) = scratch.split_at_mut(m);
-        let [a, b] = profiles.map(|d| self.y(i, d));
-        for (c, (&g, &g1)) in a.iter().zip(b).enumerate() {
-            let start = (y0 + c) * self.mx;
-            let row = &matrix[start + x0..start + x1];
-            for k in 0..m {
-                t[k] += g * row[k];
-                t1[k] += g1 * row[k];
-            }
+        scratch.resize(scratch.len().max(K * m), 0.0);
+        let weights = profiles.map(|d| self.y(i, d));
+        if m > 0 {
+            combine(weights, 1, &matrix[y0 * self.mx + x0..], self.mx, m, scratch);
         }
-        [t, t1]
+        let mut parts = scratch.chunks_exact(m.max(1));
+        std::array::from_fn(|_| parts.next().unwrap_or_default())
     }
 
     #[inline(always)]

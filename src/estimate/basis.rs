@@ -89,6 +89,12 @@ impl Basis {
         &self.u[k * self.stride..(k + 1) * self.stride]
     }
 
+    /// All rows, (n, stride).
+    #[inline(always)]
+    pub fn rows(&self) -> &[f64] {
+        &self.u
+    }
+
     /// Largest norm that a spot leaves outside the first `m` columns.
     pub fn tail(&self, m: usize) -> f64 {
         self.tail.get(m).copied().unwrap_or(0.0)

@@ -138,9 +138,9 @@ impl Fitter {
         });
     }
 
-    /// Information matrix at `model` over (x, y, energy) of each spot, then nuisances; units σ and noise. Row-major,
-    /// lower triangle; see `Model::parameters`.
-    pub fn information(&mut self, reading: &Reading, model: &mut Model) -> &[f64] {
+    /// Sets the information matrix at `model` over (x, y, energy) of each spot, then nuisances; units σ and noise. Row-major,
+    /// upper triangle; see `Model::parameters`.
+    pub fn information(&mut self, reading: &Reading, model: &mut Model) {
         pulp::Arch::new().dispatch(Job {
             fitter: self,
             reading,
@@ -149,7 +149,6 @@ impl Fitter {
             bar: f64::INFINITY,
             wants_information: true,
         });
-        &self.hessian
     }
 
     /// Weighted residual of `model` in the bases, (my, mx), with the deviance set.
@@ -199,13 +198,10 @@ impl Fitter {
         for i in 0..n {
             self.factor[i * n + i] *= 1.0 + RIDGE;
         }
-        if !cholesky(&mut self.factor, n) {
-            return false;
-        }
         out.clear();
         out.resize(n * n, 0.0);
-        invert(&self.factor, n, out);
-        true
+        let factor = &mut self.factor;
+        pulp::Arch::new().dispatch(Inverse { factor, n, out })
     }
 
     /// Condition number (1-norm) of an information matrix of `n` parameters, scaled to a unit diagonal (van der Sluis, 1969: no
@@ -386,10 +382,10 @@ impl Fitter {
         g.resize(p.max(g.len()), 0.0);
         for i in 0..sources {
             let ai = atoms.amplitude(i);
-            for j in 0..=i {
+            for j in i..sources {
                 let aj = atoms.amplitude(j);
                 let c = atoms.couple(i, j, &reading.weights, &mut self.strip);
-                if i < n {
+                if j < n {
                     let block = [
                         ai * aj * c[0],
                         ai * aj * c[1],
@@ -405,9 +401,10 @@ impl Fitter {
                         h[(3 * i + r) * p + 3 * j..(3 * i + r) * p + 3 * j + 3]
                             .copy_from_slice(&block[3 * r..3 * r + 3]);
                     }
-                } else if j < n {
-                    let row = &mut h[(2 * n + i) * p + 3 * j..(2 * n + i) * p + 3 * j + 3];
-                    row.copy_from_slice(&[aj * c[6], aj * c[7], c[8]]);
+                } else if i < n {
+                    for (r, v) in [ai * c[2], ai * c[5], c[8]].into_iter().enumerate() {
+                        h[(3 * i + r) * p + 2 * n + j] = v;
+                    }
                 } else {
                     h[(2 * n + i) * p + 2 * n + j] = c[8];
                 }
@@ -441,18 +438,20 @@ impl Fitter {
             for (d, w) in weighted.iter_mut().zip(&reading.weights) {
                 *d *= w;
             }
-            let row = &mut h[(first_width + w) * p..(first_width + w + 1) * p];
+            let column = first_width + w;
             for i in 0..sources {
                 let s = atoms.project(i, weighted, &mut self.strip);
                 if i < n {
                     let a = atoms.spots[i].a;
-                    (row[3 * i], row[3 * i + 1], row[3 * i + 2]) = (a * s[1], a * s[2], s[0]);
+                    for (r, v) in [a * s[1], a * s[2], s[0]].into_iter().enumerate() {
+                        h[(3 * i + r) * p + column] = v;
+                    }
                 } else {
-                    row[2 * n + i] = s[0];
+                    h[(2 * n + i) * p + column] = s[0];
                 }
             }
             for v in 0..=w {
-                row[first_width + v] = dot(weighted, &self.broadening[v]);
+                h[(first_width + v) * p + column] = dot(weighted, &self.broadening[v]);
             }
             g[first_width + w] = dot(&self.broadening[w], &self.residual);
         }
@@ -478,7 +477,7 @@ impl Fitter {
             for i in (0..p).filter(|&i| row[i] != 0.0) {
                 g[i] -= row[i] * left;
                 let s = -row[i];
-                axpy(s, &row[..i + 1], &mut h[i * p..i * p + i + 1]);
+                axpy(s, &row[i..p], &mut h[i * p + i..(i + 1) * p]);
             }
         }
     }
@@ -584,6 +583,25 @@ fn residual_at(bad: &BadPixel, atoms: &Atoms) -> f64 {
         left -= atoms.amplitude(i) * x[0] * y[0];
     }
     left
+}
+
+struct Inverse<'a> {
+    factor: &'a mut [f64],
+    n: usize,
+    out: &'a mut [f64],
+}
+
+impl pulp::NullaryFnOnce for Inverse<'_> {
+    type Output = bool;
+
+    #[inline(always)]
+    fn call(self) -> bool {
+        let is_regular = cholesky(self.factor, self.n);
+        if is_regular {
+            invert(self.factor, self.n, self.out);
+        }
+        is_regular
+    }
 }
 
 struct Job<'a> {

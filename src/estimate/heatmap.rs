@@ -119,18 +119,17 @@ impl Heatmap {
         let (nx, ny) = (self.grid[0].len(), self.grid[1].len());
         self.peaks.clear();
         let at = |i: usize, j: usize| self.map[j * nx + i];
-        for j in 0..ny {
-            for i in 0..nx {
-                let value = at(i, j);
-                if value < threshold {
+        for (j, row) in self.map.chunks_exact(nx).enumerate() {
+            for (i, &value) in row.iter().enumerate() {
+                if !(value >= threshold) {
                     continue;
                 }
-                let mut is_peak = true;
-                for b in j.saturating_sub(1)..=(j + 1).min(ny - 1) {
-                    for a in i.saturating_sub(1)..=(i + 1).min(nx - 1) {
-                        is_peak &= (a, b) == (i, j) || at(a, b) < value || (at(a, b) == value && (b, a) > (j, i));
-                    }
-                }
+                // Of equal neighbours the first is the peak.
+                let (lo, hi) = (i.saturating_sub(1), (i + 1).min(nx - 1));
+                let is_peak = (i == 0 || row[lo] < value)
+                    && (i == hi || row[hi] <= value)
+                    && (j == 0 || (lo..=hi).all(|a| at(a, j - 1) < value))
+                    && (j + 1 == ny || (lo..=hi).all(|a| at(a, j + 1) <= value));
                 if !is_peak {
                     continue;
                 }

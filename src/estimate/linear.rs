@@ -7,13 +7,20 @@ pub(super) fn dot(a: &[f64], b: &[f64]) -> f64 {
     let n = a.len().min(b.len());
     let (a, b) = (&a[..n], &b[..n]);
     let mut lanes = [0.0; 8];
-    let (ca, cb) = (a.chunks_exact(8), b.chunks_exact(8));
-    let rest: f64 = ca.remainder().iter().zip(cb.remainder()).map(|(x, y)| x * y).sum();
-    for (x, y) in ca.zip(cb) {
+    let (mut ca, mut cb) = (a.chunks_exact(8), b.chunks_exact(8));
+    for (x, y) in (&mut ca).zip(&mut cb) {
         for l in 0..8 {
             lanes[l] += x[l] * y[l];
         }
     }
+    let (mut a, mut b) = (ca.remainder(), cb.remainder());
+    if a.len() >= 4 {
+        for l in 0..4 {
+            lanes[l] += a[l] * b[l];
+        }
+        (a, b) = (&a[4..], &b[4..]);
+    }
+    let rest: f64 = a.iter().zip(b).map(|(x, y)| x * y).sum();
     rest + ((lanes[0] + lanes[4]) + (lanes[1] + lanes[5])) + ((lanes[2] + lanes[6]) + (lanes[3] + lanes[7]))
 }
 
@@ -27,48 +34,148 @@ pub(super) fn axpy(s: f64, x: &[f64], y: &mut [f64]) {
     }
 }
 
-/// Replaces the lower triangle of the n × n row-major `h` by its Cholesky factor L, H = L Lᵀ. `false` where H is
-/// not positive definite to rounding. The strict upper triangle is neither read nor written.
+/// Largest of `first` and the numbers of `v`.
+#[inline(always)]
+pub(super) fn largest(first: f64, v: &[f64]) -> f64 {
+    let mut lanes = [first; 8];
+    let chunks = v.chunks_exact(8);
+    let rest = chunks.remainder();
+    for chunk in chunks {
+        for l in 0..8 {
+            lanes[l] = if chunk[l] > lanes[l] { chunk[l] } else { lanes[l] };
+        }
+    }
+    lanes.iter().chain(rest).fold(first, |a, &x| a.max(x))
+}
+
+/// Writes Σₖ weights[j][k·step]·row(k) to row j of `out`, (K, width), for each of K weightings; the last weight is the last
+/// row's. Row k is the `width` numbers, a multiple of 4, from k·stride on. Sums are kept in registers.
+#[inline(always)]
+pub(super) fn combine<const K: usize>(
+    weights: [&[f64]; K],
+    step: usize,
+    rows: &[f64],
+    stride: usize,
+    width: usize,
+    out: &mut [f64],
+) {
+    let count = weights[0].len().div_ceil(step);
+    let mut x = 0;
+    while x < width {
+        x = if width - x >= 8 {
+            columns::<K, 8>(weights, step, count, rows, stride, width, x, out)
+        } else {
+            columns::<K, 4>(weights, step, count, rows, stride, width, x, out)
+        };
+    }
+}
+
+#[allow(clippy::too_many_arguments)]
+#[inline(always)]
+fn columns<const K: usize, const W: usize>(
+    weights: [&[f64]; K],
+    step: usize,
+    count: usize,
+    rows: &[f64],
+    stride: usize,
+    width: usize,
+    x: usize,
+    out: &mut [f64],
+) -> usize {
+    let mut sums = [[0.0; W]; K];
+    for k in 0..count {
+        let row = &rows[k * stride + x..k * stride + x + W];
+        for j in 0..K {
+            let weight = weights[j][k * step];
+            for l in 0..W {
+                sums[j][l] += weight * row[l];
+            }
+        }
+    }
+    for j in 0..K {
+        out[j * width + x..j * width + x + W].copy_from_slice(&sums[j]);
+    }
+    x + W
+}
+
+/// Replaces the upper triangle of the n × n row-major `h` by its Cholesky factor U, H = UᵀU. `false` where H is not positive
+/// definite to rounding. The strict lower triangle is neither read nor written. What is not coupled costs nothing.
 #[inline(always)]
 pub(super) fn cholesky(h: &mut [f64], n: usize) -> bool {
     for i in 0..n {
         let (above, row) = h.split_at_mut(i * n);
-        let row = &mut row[..n];
-        for j in 0..i {
-            let other = &above[j * n..j * n + j + 1];
-            let s = row[j] - dot(&row[..j], &other[..j]);
-            row[j] = s / other[j];
+        let row = &mut row[i..n];
+        let diagonal = row[0];
+        let mut rows = above.chunks_exact(n);
+        // Four rows at a time: each number of this one is loaded and stored once for all four.
+        while rows.len() >= 4
+            && let (Some(a), Some(b), Some(c), Some(d)) = (rows.next(), rows.next(), rows.next(), rows.next())
+        {
+            let s = [a[i], b[i], c[i], d[i]];
+            if s == [0.0; 4] {
+                continue;
+            }
+            let (a, b, c, d) = (&a[i..n], &b[i..n], &c[i..n], &d[i..n]);
+            for k in 0..row.len() {
+                row[k] -= (s[0] * a[k] + s[1] * b[k]) + (s[2] * c[k] + s[3] * d[k]);
+            }
         }
-        let pivot = row[i] - dot(&row[..i], &row[..i]);
-        if !(pivot > 1e-15 * row[i].abs() && pivot > 0.0) {
+        for a in rows.filter(|a| a[i] != 0.0) {
+            axpy(-a[i], &a[i..n], row);
+        }
+        let pivot = row[0];
+        if !(pivot > 1e-15 * diagonal.abs() && pivot > 0.0) {
             return false;
         }
-        row[i] = pivot.sqrt();
+        let root = pivot.sqrt();
+        row[0] = root;
+        for v in &mut row[1..] {
+            *v /= root;
+        }
     }
     true
 }
 
-/// Solves L Lᵀ x = b in place.
+/// Solves UᵀU x = b in place.
 #[inline(always)]
-pub(super) fn solve(l: &[f64], n: usize, b: &mut [f64]) {
+pub(super) fn solve(u: &[f64], n: usize, b: &mut [f64]) {
     for i in 0..n {
-        b[i] = (b[i] - dot(&l[i * n..i * n + i], &b[..i])) / l[i * n + i];
+        let (x, rest) = b[i..n].split_first_mut().expect("i < n");
+        *x /= u[i * n + i];
+        if *x != 0.0 {
+            axpy(-*x, &u[i * n + i + 1..(i + 1) * n], rest);
+        }
     }
     for i in (0..n).rev() {
-        b[i] /= l[i * n + i];
-        let s = -b[i];
-        axpy(s, &l[i * n..i * n + i], &mut b[..i]);
+        b[i] = (b[i] - dot(&u[i * n + i + 1..(i + 1) * n], &b[i + 1..n])) / u[i * n + i];
     }
 }
 
-/// Writes (L Lᵀ)⁻¹ into `out`, n × n.
-pub(super) fn invert(l: &[f64], n: usize, out: &mut [f64]) {
-    out[..n * n].fill(0.0);
-    for (i, row) in out.chunks_exact_mut(n.max(1)).take(n).enumerate() {
+/// Writes (UᵀU)⁻¹ into `out`, n × n, symmetric to the last bit.
+#[inline(always)]
+pub(super) fn invert(u: &[f64], n: usize, out: &mut [f64]) {
+    // W = U⁻¹, row by row from the last.
+    for i in (0..n).rev() {
+        let (row, below) = out[i * n..n * n].split_at_mut(n);
+        row.fill(0.0);
+        for (k, other) in (i + 1..n).zip(below.chunks_exact(n)) {
+            let s = u[i * n + k];
+            if s != 0.0 {
+                axpy(-s, &other[k..], &mut row[k..]);
+            }
+        }
+        let pivot = u[i * n + i];
         row[i] = 1.0;
-        solve(l, n, row);
+        for v in &mut row[i..] {
+            *v /= pivot;
+        }
     }
-    // Each column is rounded on its own; what is handed on must be symmetric to the last bit.
+    // W Wᵀ goes to the lower triangle, a row's diagonal last: nothing beyond needs it.
+    for i in 0..n {
+        for j in (i..n).rev() {
+            out[j * n + i] = dot(&out[i * n + j..(i + 1) * n], &out[j * n + j..(j + 1) * n]);
+        }
+    }
     for i in 0..n {
         for j in 0..i {
             out[j * n + i] = out[i * n + j];
@@ -99,7 +206,7 @@ mod tests {
                 assert!((product - f64::from(u8::from(i == j))).abs() < 1e-10);
             }
         }
-        let mut indefinite = vec![1.0, 0.0, 2.0, 1.0];
+        let mut indefinite = vec![1.0, 2.0, 0.0, 1.0];
         assert!(!cholesky(&mut indefinite, 2));
     }
 }

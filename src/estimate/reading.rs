@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 
 use super::basis::Basis;
-use super::linear::dot;
+use super::linear::{combine, dot, largest};
 use super::model::Model;
 use super::noise::Growth;
 use super::screen::Screened;
@@ -52,8 +52,18 @@ pub(super) struct BadPixel {
 impl Reading {
     /// Compresses `frame`, Z = Uᵧᵀ Y Uₓ.
     pub fn load(&mut self, frame: &Screened, bx: &Basis, by: &Basis) {
+        pulp::Arch::new().dispatch(Load {
+            reading: self,
+            frame,
+            bx,
+            by,
+        });
+    }
+
+    #[inline(always)]
+    fn read(&mut self, frame: &Screened, bx: &Basis, by: &Basis) {
         let (nx, ny) = (bx.n, by.n);
-        let brightest = frame.pixels.iter().fold(1.0f64, |a, &p| a.max(p));
+        let brightest = largest(1.0, &frame.pixels);
         // The brightest pixel bounds every amplitude: A ≤ peak / (largest pixel fraction)².
         let fraction = |b: &Basis| (b.pitch() / (2.0 * std::f64::consts::PI).sqrt()).min(1.0);
         let amplitude = brightest / (fraction(bx) * fraction(by));
@@ -103,29 +113,17 @@ impl Reading {
         (self.growth, self.mean_variance, self.lit_variance) = (Growth::default(), 1.0, 1.0);
     }
 
+    #[inline(always)]
     fn compress(&mut self, frame: &Screened, bx: &Basis, by: &Basis) {
-        let (nx, ny, mx, my) = (bx.n, by.n, self.mx, self.my);
-        self.rows.clear();
-        self.rows.resize(ny * mx, 0.0);
-        for y in 0..ny {
-            let out = &mut self.rows[y * mx..(y + 1) * mx];
-            for (x, &p) in frame.pixels[y * nx..(y + 1) * nx].iter().enumerate() {
-                for (o, u) in out.iter_mut().zip(bx.row(x)) {
-                    *o += p * u;
-                }
-            }
+        let (mx, my) = (self.mx, self.my);
+        self.rows.resize(by.n * mx, 0.0);
+        for (out, row) in self.rows.chunks_exact_mut(mx).zip(frame.pixels.chunks_exact(bx.n)) {
+            combine([row], 1, bx.rows(), bx.stride, mx, out);
         }
-        self.z.clear();
         self.z.resize(my * mx, 0.0);
-        for y in 0..ny {
-            let row = &self.rows[y * mx..(y + 1) * mx];
-            for (c, &u) in by.row(y)[..my].iter().enumerate() {
-                if u != 0.0 {
-                    for (z, r) in self.z[c * mx..(c + 1) * mx].iter_mut().zip(row) {
-                        *z += u * r;
-                    }
-                }
-            }
+        for (c, out) in self.z.chunks_exact_mut(4 * mx).enumerate() {
+            let columns = [0, 1, 2, 3].map(|k| &by.rows()[4 * c + k..]);
+            combine(columns, by.stride, &self.rows, mx, mx, out);
         }
     }
 
@@ -193,6 +191,17 @@ impl Reading {
 
     /// The same for any matrix (my, mx) of coefficients.
     pub fn expand_matrix(&self, matrix: &[f64], bx: &Basis, by: &Basis, out: &mut Vec<f64>) {
+        pulp::Arch::new().dispatch(Expand {
+            reading: self,
+            matrix,
+            bx,
+            by,
+            out,
+        });
+    }
+
+    #[inline(always)]
+    fn expand_rows(&self, matrix: &[f64], bx: &Basis, by: &Basis, out: &mut Vec<f64>) {
         let (mx, my) = (self.mx, self.my);
         out.clear();
         out.resize(bx.n * by.n, 0.0);
@@ -202,20 +211,50 @@ impl Reading {
             }
             return;
         }
-        for y in 0..by.n {
-            let mut row = vec![0.0; mx];
-            for (c, &u) in by.row(y)[..my].iter().enumerate() {
-                for (r, z) in row.iter_mut().zip(&matrix[c * mx..(c + 1) * mx]) {
-                    *r += u * z;
-                }
-            }
-            for x in 0..bx.n {
-                out[y * bx.n + x] = row.iter().zip(bx.row(x)).map(|(r, u)| r * u).sum();
+        let mut row = vec![0.0; mx];
+        for (y, out) in out.chunks_exact_mut(bx.n).enumerate() {
+            combine([&by.row(y)[..my]], 1, matrix, mx, mx, &mut row);
+            for (x, o) in out.iter_mut().enumerate() {
+                *o = dot(&row, &bx.row(x)[..mx]);
             }
         }
     }
 }
 
+struct Load<'a> {
+    reading: &'a mut Reading,
+    frame: &'a Screened,
+    bx: &'a Basis,
+    by: &'a Basis,
+}
+
+impl pulp::NullaryFnOnce for Load<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn call(self) {
+        self.reading.read(self.frame, self.bx, self.by);
+    }
+}
+
+struct Expand<'a> {
+    reading: &'a Reading,
+    matrix: &'a [f64],
+    bx: &'a Basis,
+    by: &'a Basis,
+    out: &'a mut Vec<f64>,
+}
+
+impl pulp::NullaryFnOnce for Expand<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn call(self) {
+        self.reading.expand_rows(self.matrix, self.bx, self.by, self.out);
+    }
+}
+
+#[inline(always)]
 fn square(v: &[f64]) -> f64 {
     dot(v, v)
 }

@@ -45,20 +45,26 @@ impl Screened {
         let (mut nan, mut masked) = (0, 0);
         let scale = 1.0 / camera.noise_std_j;
         let ceiling = camera.saturation_j.unwrap_or(f64::INFINITY);
-        for ((y, x), &value) in frame.pixels.indexed_iter() {
+        self.pixels.extend(frame.pixels.iter().map(|value| value * scale));
+        self.is_bad.resize(self.pixels.len(), false);
+        let is_sound = |value: f64| (value * scale).abs() < OVERFLOWS && value < ceiling;
+        // Most frames are: no branch, so that the compiler takes several pixels at a time.
+        if frame.masked.is_none() && frame.pixels.iter().fold(true, |all, &value| all & is_sound(value)) {
+            return Ok(());
+        }
+        for (k, ((y, x), &value)) in frame.pixels.indexed_iter().enumerate() {
             let is_masked = frame.masked.as_ref().is_some_and(|m| m.get((y, x)) == Some(&true));
+            if is_sound(value) && !is_masked {
+                continue;
+            }
             let is_saturated = value >= ceiling;
             // Squares of such a value leave the range of f64: it is as little light as ∞.
-            let is_number = (value * scale).abs() < OVERFLOWS;
-            let is_bad = is_masked || is_saturated || !is_number;
-            nan += usize::from(!is_number);
+            nan += usize::from(!((value * scale).abs() < OVERFLOWS));
             masked += usize::from(is_masked);
             self.saturated += usize::from(is_saturated);
-            if is_bad {
-                self.bad.push(Bad { x, y, is_saturated });
-            }
-            self.is_bad.push(is_bad);
-            self.pixels.push(if is_bad { ceiling * scale } else { value * scale });
+            self.bad.push(Bad { x, y, is_saturated });
+            self.is_bad[k] = true;
+            self.pixels[k] = ceiling * scale;
         }
         if self.bad.len() == self.pixels.len() {
             return Err(Error::NoUsablePixel {
