@@ -13,7 +13,8 @@ use super::atoms::{self, Atoms};
 use super::basis::Basis;
 use super::linear::{axpy, cholesky, dot, invert, solve};
 use super::model::{Model, Nuisances, pull};
-use super::reading::{BadPixel, Reading};
+use super::reading::Reading;
+use super::unusable::BadPixel;
 
 const LAMBDA_START: f64 = 1e-3;
 const LAMBDA_FLOOR: f64 = 1e-14;

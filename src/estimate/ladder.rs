@@ -240,20 +240,21 @@ impl Analytic {
     }
 
     /// The emitters that stand out at once, after taking out pixels that are lit alone.
-    fn first_look(&mut self) -> Option<Model> {
+    fn first_look(&mut self) -> Model {
         let Self { search, reading, .. } = self;
-        for look in 0.. {
-            let mut model = search.first_look(reading, &self.frame)?;
-            if look == LOOKS || reading.is_explained(&model) {
-                return Some(model);
+        let mut model = search.first_look(reading, &self.frame);
+        for _ in 0..LOOKS {
+            if reading.is_explained(&model) {
+                break;
             }
             let residual = search.fitter.residual_of(reading, &mut model).to_vec();
             let (bx, by) = (&search.fitter.bx, &search.fitter.by);
             if !self.inspection.reject_lone(&mut self.frame, reading, &residual, bx, by) {
-                return Some(model);
+                break;
             }
+            model = search.first_look(reading, &self.frame);
         }
-        None
+        model
     }
 }
 
@@ -269,20 +270,24 @@ impl Estimator for Analytic {
         self.search.restart(deadline);
         self.weighing.search.restart(deadline);
         let is_ml = self.rung.is_ordering();
-        let look = if is_ml { self.first_look() } else { None };
-        let Self { search, reading, .. } = self;
         let mut model = match self.rung.method {
-            Method::Peak { is_subpixel } => search.peaks(reading, is_subpixel),
+            Method::Peak { is_subpixel } => self.search.peaks(&self.reading, is_subpixel),
             Method::Greedy => {
-                let mut model = search.greedy(reading, &self.frame, Model::empty(Nuisances::default()));
-                search.shrink(reading, &mut model);
+                let dark = Model::empty(Nuisances::default());
+                let mut model = self.search.greedy(&self.reading, &self.frame, dark);
+                self.search.shrink(&self.reading, &mut model);
                 model
             }
-            Method::Pencil { steps } => search.start(reading, &self.frame, Nuisances::default(), steps),
+            Method::Pencil { steps } => {
+                let plain = Nuisances::default();
+                self.search.start(&self.reading, &self.frame, plain, steps)
+            }
             Method::MaximumLikelihood | Method::MaximumPosterior => {
-                search.maximum_likelihood(reading, &self.frame, look)
+                let look = self.first_look();
+                self.search.maximum_likelihood(&self.reading, &self.frame, look)
             }
         };
+        let Self { search, reading, .. } = self;
         let known = search
             .suspected
             .or((!reading.growth.is_flat()).then_some(reading.growth));

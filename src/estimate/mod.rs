@@ -31,6 +31,7 @@ mod spot;
 mod spread;
 #[doc(hidden)]
 pub mod stages;
+mod unusable;
 mod weigh;
 
 pub use bound::{Beside, position_bound, position_bound_beside};

@@ -16,8 +16,6 @@ const OUTLIER: f64 = 6.0;
 const PASSES: usize = 14;
 /// One pass rejects what stands out at least this share of the worst: the worst hide the rest.
 const SHARE: f64 = 0.5;
-/// Passes that settle the values of bad pixels.
-const SETTLING: usize = 3;
 /// Pixels wider than this, σ, can be lit alone by a spot.
 const WIDEST_PIXEL: f64 = 0.5;
 /// Signal levels that the noise is measured at.
@@ -123,7 +121,6 @@ pub(super) struct Inspection {
     smooth: Vec<f64>,
     leverage: [Vec<f64>; 2],
     squares: Vec<(f64, f64)>,
-    filled: Vec<f64>,
 }
 
 impl Inspection {
@@ -144,11 +141,6 @@ impl Inspection {
             if !self.reject(frame, reading, bx.n) {
                 break;
             }
-            reading.load(frame, bx, by);
-        }
-        for _ in 0..if frame.bad.is_empty() { 0 } else { SETTLING } {
-            reading.expand(bx, by, &mut self.smooth);
-            self.fill(frame, bx.n);
             reading.load(frame, bx, by);
         }
         reading.expand(bx, by, &mut self.smooth);
@@ -261,8 +253,7 @@ impl Inspection {
         }
     }
 
-    /// Rejects pixels that stand out and fills all bad ones so that nothing of them lies outside. `false` where
-    /// there was none to reject.
+    /// Rejects pixels that stand out. `false` where there was none.
     fn reject(&mut self, frame: &mut Screened, reading: &mut Reading, nx: usize) -> bool {
         let floor = self.grow(reading);
         let ny = frame.pixels.len() / nx;
@@ -295,22 +286,7 @@ impl Inspection {
         for &(x, y) in &found {
             frame.reject(x, y, nx);
         }
-        self.fill(frame, nx);
         !found.is_empty()
-    }
-
-    /// Fills bad pixels so that nothing of them lies outside, exactly where they stand alone.
-    fn fill(&mut self, frame: &mut Screened, nx: usize) {
-        self.filled.clear();
-        for bad in frame.bad.iter().filter(|b| !b.is_saturated) {
-            let k = bad.y * nx + bad.x;
-            let outside = (1.0 - self.leverage[0][bad.x] * self.leverage[1][bad.y]).max(0.05);
-            self.filled
-                .push(frame.pixels[k] - (frame.pixels[k] - self.smooth[k]) / outside);
-        }
-        for (bad, &value) in frame.bad.iter().filter(|b| !b.is_saturated).zip(&self.filled) {
-            frame.pixels[bad.y * nx + bad.x] = value;
-        }
     }
 
     /// Variance in the dark, with its growth with the signal set in `reading`. Medians, so that outliers count for

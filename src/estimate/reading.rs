@@ -8,6 +8,7 @@ use super::model::Model;
 use super::noise::Growth;
 use super::screen::Screened;
 use super::spot;
+use super::unusable::{self, BadPixel};
 
 /// What a frame may leave outside the basis, in units of the noise.
 const LOSS: f64 = 0.02;
@@ -30,7 +31,7 @@ pub(super) struct Reading {
     weighted: Vec<f64>,
     /// A spot farther out than this many of its widths is lost in the noise.
     pub reach: f64,
-    /// Numbers that the fit explains: coefficients less what unusable pixels take away.
+    /// Numbers that the fit explains: coefficients, or usable pixels where those are fewer.
     pub numbers: f64,
     /// Mean square of what lies outside the basis, and how many numbers that is.
     pub outside: (f64, f64),
@@ -39,14 +40,6 @@ pub(super) struct Reading {
     pub mean_variance: f64,
     pub lit_variance: f64,
     rows: Vec<f64>,
-}
-
-/// An unusable pixel with the value it was filled with, which the fit takes out again exactly.
-#[derive(Clone, Copy)]
-pub(super) struct BadPixel {
-    pub x: usize,
-    pub y: usize,
-    pub value: f64,
 }
 
 impl Reading {
@@ -100,16 +93,15 @@ impl Reading {
             self.bad.iter().map(|b| b.y).collect(),
         ]
         .map(|lines| lines.into_iter().collect());
-        let leverage: f64 = self
-            .bad
-            .iter()
-            .map(|b| square(&bx.row(b.x)[..mx]) * square(&by.row(b.y)[..my]))
-            .sum();
-        let inside = (self.rank[0] * self.rank[1]) as f64;
-        self.numbers = inside - leverage;
-        let left = (nx * ny) as f64 - inside - (self.bad.len() as f64 - leverage);
-        let energy = square(&frame.pixels) - square(&self.z) - self.filled_outside(frame, bx, by);
-        self.outside = (energy.max(0.0) / left.max(1.0), left.max(0.0));
+        if !(self.bad.is_empty() || bx.is_pixels && by.is_pixels) {
+            unusable::fill(&mut self.bad, &mut self.z, mx, bx, by);
+        }
+        let usable = (nx * ny - self.bad.len()) as f64;
+        self.numbers = ((self.rank[0] * self.rank[1]) as f64).min(usable);
+        let left = usable - self.numbers;
+        let filled = |b: &BadPixel| b.value.powi(2) - frame.pixels[b.y * nx + b.x].powi(2);
+        let energy = square(&frame.pixels) + self.bad.iter().map(filled).sum::<f64>() - square(&self.z);
+        self.outside = (energy.max(0.0) / left.max(1.0), left);
         (self.growth, self.mean_variance, self.lit_variance) = (Growth::default(), 1.0, 1.0);
     }
 
@@ -152,20 +144,6 @@ impl Reading {
         } else {
             &self.weighted
         }
-    }
-
-    /// Energy that the values filled into unusable pixels have outside the basis.
-    fn filled_outside(&self, frame: &Screened, bx: &Basis, by: &Basis) -> f64 {
-        let mut energy = 0.0;
-        let mut column = vec![0.0; if self.bad.is_empty() { 0 } else { self.my }];
-        for bad in &self.bad {
-            for (c, value) in column.iter_mut().enumerate() {
-                *value = dot(&self.z[c * self.mx..(c + 1) * self.mx], &bx.row(bad.x)[..self.mx]);
-            }
-            let smooth = dot(&column, &by.row(bad.y)[..self.my]);
-            energy += (frame.pixels[bad.y * bx.n + bad.x] - smooth).powi(2);
-        }
-        energy
     }
 
     /// Whether the model explains the frame to within the noise.

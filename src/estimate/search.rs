@@ -30,6 +30,8 @@ const FAR: f64 = 5.0;
 const CHEAPER: f64 = 30.0;
 /// More overlapping emitters than these are first taken for something else.
 const BLOB: usize = 10;
+/// Where more than this share of the pixels is unusable, the pencil would see what was filled in.
+const TORN: f64 = 0.03;
 /// Least drop of the deviance that a nuisance parameter must bring.
 pub(super) const NUISANCE_PRICE: f64 = 5.0;
 
@@ -111,12 +113,13 @@ impl Search {
 
     /// Maximum likelihood with the number of emitters unknown. Nuisances are fitted only where the frame cannot be
     /// explained without, and then within every hypothesis.
-    pub fn maximum_likelihood(&mut self, reading: &Reading, frame: &Screened, look: Option<Model>) -> Model {
+    pub fn maximum_likelihood(&mut self, reading: &Reading, frame: &Screened, look: Model) -> Model {
         self.factor = reading.lit_variance;
-        let plain = look.as_ref().map_or(Nuisances::default(), |l| l.nuisances);
-        let mut model = match look {
-            Some(look) => self.greedy(reading, frame, look),
-            None => self.start(reading, frame, plain, POLISH),
+        let plain = look.nuisances;
+        let mut model = if self.sampler.is_some() {
+            look
+        } else {
+            self.greedy(reading, frame, look)
         };
         if self.suspected.is_some() {
             return model;
@@ -166,11 +169,12 @@ impl Search {
         }
     }
 
-    /// The emitters that stand out at once, with a background where the frame looks lit: enough to tell what in the
-    /// residual cannot be light.
-    pub fn first_look(&mut self, reading: &Reading, frame: &Screened) -> Option<Model> {
+    /// The pencil's emitters, or those that stand out at once with a background where the frame looks lit: enough to tell what
+    /// in the residual cannot be light.
+    pub fn first_look(&mut self, reading: &Reading, frame: &Screened) -> Model {
+        self.factor = reading.lit_variance;
         if self.sampler.is_some() {
-            return None;
+            return self.start(reading, frame, Nuisances::default(), POLISH);
         }
         let mut model = Model::empty(Nuisances {
             background: self.looks_lit(frame),
@@ -181,7 +185,7 @@ impl Search {
         let spots = peaks.iter().take_while(|p| p.significance >= least).take(MOST);
         model.spots = spots.map(|p| Spot::new(p.u, p.a)).collect();
         self.fitter.fit(reading, &mut model, TRIAL_STEPS);
-        Some(model)
+        model
     }
 
     /// Adds peaks of the residual to `model` until none is significant, refitting all emitters each time.
@@ -221,6 +225,9 @@ impl Search {
     /// Seeds by the pencil for rising N until the frame is explained: as configured first, then with a background and
     /// another width, both of which have singular values of their own.
     fn pencil(&mut self, reading: &Reading, nuisances: Nuisances, polish: usize) -> Option<Model> {
+        if reading.bad.len() as f64 > TORN * (self.fitter.bx.n * self.fitter.by.n) as f64 {
+            return None;
+        }
         let pencil = self
             .sampler
             .as_mut()?
