@@ -212,7 +212,7 @@ impl Fitter {
         let column = |j: usize| {
             let (mut direct, mut inverted) = (0.0, 0.0);
             for i in 0..n {
-                let h = self.hessian[i.max(j) * n + i.min(j)];
+                let h = self.hessian[i.min(j) * n + i.max(j)];
                 direct += (h / (scale(i) * scale(j))).abs();
                 inverted += (inverse[i * n + j] * scale(i) * scale(j)).abs();
             }
