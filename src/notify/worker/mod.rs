@@ -1,3 +1,5 @@
+mod intake;
+
 use std::collections::HashMap;
 use std::pin::pin;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -10,11 +12,11 @@ use tokio::sync::{mpsc, oneshot};
 use tokio::task::{Id, JoinError, JoinSet};
 
 use super::client::{self, Failure, Verdict};
-use super::cooling::{CoolDown, Ruling};
+use super::cooling::CoolDown;
 use super::queue::{Next, Queue};
 use super::status::{EndpointState, EndpointStatus};
-use super::{Clock, Endpoint, schedule};
-use crate::journal::{self, Attempt, Journal, Outcome, Recorded, Waiting};
+use super::{Clock, Endpoint};
+use crate::journal::{self, Attempt, Journal, Outcome};
 use crate::metric;
 
 /// How long requests that are under way may still take when the daemon stops.
@@ -164,81 +166,6 @@ impl Worker {
             lane.queue.probe_first(now);
         }
         Ok(())
-    }
-
-    /// Takes the deliveries of new events into the queue.
-    async fn read_new(&mut self, k: usize) -> Result<(), journal::Error> {
-        let last = self.journal.last_seq();
-        let lane = &self.lanes[k];
-        if lane.read_to == last && last > 0 {
-            return Ok(());
-        }
-        let (name, after, is_cooled) = (lane.endpoint.name().to_owned(), lane.read_to, !lane.cool_down.is_off());
-        let rows = self
-            .ask(move |journal| {
-                let rows = journal.waiting(&name, after)?.into_iter();
-                // What an event says matters to a cool-down only.
-                let event = |seq| is_cooled.then(|| journal.event(seq)).transpose();
-                rows.map(|row| Ok((event(row.seq)?.flatten(), row))).collect()
-            })
-            .await?;
-        let rows: Vec<(Option<Recorded>, Waiting)> = rows;
-        let read_to = rows.last().map_or(last, |(_, row)| row.seq.max(last));
-        for (event, row) in rows {
-            self.cool(k, event, row);
-        }
-        self.lanes[k].read_to = read_to;
-        Ok(())
-    }
-
-    /// Queues a new delivery, holds it back, or keeps it from the receiver for good.
-    fn cool(&mut self, k: usize, event: Option<Recorded>, row: Waiting) {
-        let now = self.clock.uptime();
-        let ruling = match event {
-            Some(event) => self.lanes[k].cool_down.judge(row, &event.event, now),
-            None => Ruling::Send(vec![row]),
-        };
-        match ruling {
-            Ruling::Hold => {}
-            Ruling::Send(rows) => {
-                for row in &rows {
-                    self.push(k, row);
-                }
-            }
-            Ruling::Withhold(rows) => {
-                let lane = &mut self.lanes[k];
-                lane.status.withheld += rows.len() as u64;
-                let name = lane.endpoint.name();
-                counter!(metric::WEBHOOK_ATTEMPTS, "endpoint" => name.to_owned(), "outcome" => "withheld")
-                    .increment(rows.len() as u64);
-                for row in rows {
-                    self.journal.attempted(Attempt {
-                        seq: row.seq,
-                        endpoint: row.endpoint,
-                        at: self.clock.now(),
-                        outcome: Outcome::Withheld,
-                    });
-                }
-            }
-        }
-    }
-
-    /// Queues what was held back for long enough.
-    fn release_held(&mut self, now: Duration) {
-        for k in 0..self.lanes.len() {
-            for row in self.lanes[k].cool_down.due(now) {
-                self.push(k, &row);
-            }
-        }
-    }
-
-    fn push(&mut self, k: usize, row: &Waiting) {
-        // The wall clock may have been set since the row was written: no wait grows beyond its schedule.
-        let wait = Duration::try_from(row.next_at.duration_since(self.clock.now())).unwrap_or(Duration::ZERO);
-        let due = self.clock.uptime() + wait.min(schedule::longest_wait(row.step));
-        self.lanes[k]
-            .queue
-            .push(&row.alert, row.seq, row.step, due, row.recorded_at);
     }
 
     async fn ask<T: Send + 'static>(
