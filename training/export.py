@@ -9,24 +9,9 @@ import numpy as np
 import onnxruntime
 import torch
 
-from networks import FLOOR_SIGMA, NETWORKS, normalise
+from networks import FLOOR_SIGMA, build, normalise
 from samples import Stream
-from train import VALIDATION_SEED
-
-# Largest file that the repository takes.
-LIMIT_BYTES = 8_000_000
-
-
-class Deployed(torch.nn.Module):
-    """The heatmap alone; the U-Net's coordinates are for training."""
-
-    def __init__(self, network: torch.nn.Module):
-        super().__init__()
-        self.network = network
-
-    def forward(self, frame: torch.Tensor) -> torch.Tensor:
-        output = self.network(frame)
-        return output[0] if isinstance(output, tuple) else output
+from train import VALIDATION, VALIDATION_SEED
 
 
 def main() -> None:
@@ -39,57 +24,61 @@ def main() -> None:
     args = parser.parse_args()
 
     state = torch.load(args.run / "checkpoint.pt", map_location="cpu")
-    network = NETWORKS[state["name"]]()
+    layout = state["layout"]
+    nx, ny = layout["nx"], layout["ny"]
+    network = build(state["name"], nx, ny).eval()
     network.load_state_dict(state["network"])
-    deployed = Deployed(network).eval()
-    nx, ny = state["layout"]["nx"], state["layout"]["ny"]
     example = torch.rand(1, 1, ny, nx)
+    outputs = ["heatmap", "offsets"][: 2 if isinstance(network(example), tuple) else 1]
+    args.out.parent.mkdir(parents=True, exist_ok=True)
     torch.onnx.export(
-        deployed, (example,), args.out, input_names=["frame"], output_names=["heatmap"],
-        opset_version=17, dynamo=False, do_constant_folding=True,
+        network, (example,), args.out, input_names=["frame"], output_names=outputs, opset_version=17, dynamo=False, do_constant_folding=True
     )
     data = args.out.read_bytes()
-    if len(data) > LIMIT_BYTES:
-        args.out.unlink()
-        raise SystemExit(f"{args.out} would be {len(data)} bytes, more than {LIMIT_BYTES}; it was not kept")
 
     stream = Stream(args.program, args.scene, 1, 0, VALIDATION_SEED)
     frame, _ = next(stream.batches(1))
     stream.close()
     frame = normalise(frame)
     session = onnxruntime.InferenceSession(data, providers=["CPUExecutionProvider"])
-    (heatmap,) = session.run(None, {"frame": frame.numpy()})
-    difference = np.abs(heatmap - deployed(frame).detach().numpy()).max()
-    if difference > 1e-5:
+    found = session.run(None, {"frame": frame.numpy()})
+    with torch.no_grad():
+        expected = network(frame)
+    expected = expected if isinstance(expected, tuple) else (expected,)
+    difference = max(float(np.abs(a - b.numpy()).max()) for a, b in zip(found, expected))
+    # Whitening lifts what lies at the noise, some 10⁻⁴ of a frame, to the size of the rest, and float32's rounding with it.
+    if difference > (1e-2 if state["name"].endswith("-white") else 1e-4):
         raise SystemExit(f"onnxruntime and PyTorch differ by {difference}")
     if args.reference:
-        np.save(args.reference, np.stack([frame.numpy()[0, 0], heatmap[0, 0]]).astype("<f4"))
+        np.save(args.reference, np.stack([frame.numpy()[0, 0], found[0][0, 0]]).astype("<f4"))
 
-    layout = state["layout"]
     best = state["curve"][-1]
+    begun = f'\nbegun_from = "{state["from_run"]}"' if state.get("from_run") else ""
     args.out.with_suffix(".toml").write_text(
         f"""# Card of {args.out.name}; the program checks the sum and the shape before it uses the network.
-network = "{state['name']}"
+network = "{state["name"]}"
 sha256 = "{hashlib.sha256(data).hexdigest()}"
 shape = [{ny}, {nx}]              # Ny, Nx
 # Input: energies over the frame's maximum, but at least over this many times noise_std_j.
 floor_sigma = {FLOOR_SIGMA}
-target_sigma_px = {state['target_sigma_px']}
+target_sigma_px = {state["target_sigma_px"]}
 # What it was trained on. On other widths and noises it was never tried.
-scene = "{layout['scene']}"
-spot_sigma_px = {layout['spot_sigma_px'][0]}
-noise_std_j = {layout['noise_std_j']}
-samples = {state['seen']}
-training_seconds = {state['seconds']:.0f}
+scene = "{layout["scene"]}"
+spot_sigma_px = {layout["spot_sigma_px"][0]}
+noise_std_j = {layout["noise_std_j"]}
+samples = {state["seen"]}
+training_seconds = {state["seconds"]:.0f}          # of one processor core{begun}
 
-# 512 frames of another seed. Squared error: of peaks within 10 m, heatmap maxima with a 3 × 3 centroid.
+# {VALIDATION} frames of another seed: heatmap maxima, held to the nearest emitter within 10 m.
 [validation]
-loss = {best['loss']:.6g}
-recall_10m = {best['recall_10m']:.5f}
-median_squared_error_m2 = {best['median_squared_error_m2']:.5g}
+loss = {best["loss"]:.6g}
+recall_10m = {best["recall_10m"]:.5f}
+precision_10m = {best["precision_10m"]:.5f}
+median_squared_error_m2 = {best["median_squared_error_m2"]:.5g}
+mean_squared_error_m2 = {best["mean_squared_error_m2"]:.5g}
 """
     )
-    print(json.dumps({"file": str(args.out), "bytes": len(data), "difference_to_pytorch": float(difference)}))
+    print(json.dumps({"file": str(args.out), "bytes": len(data), "difference_to_pytorch": difference}))
 
 
 if __name__ == "__main__":

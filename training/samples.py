@@ -17,7 +17,7 @@ class Stream:
     """
 
     def __init__(self, program: Path, scene: Path, samples: int, first: int, seed: int):
-        command = [program, "training-data", "--scene", scene, "--samples", samples, "--first", first, "--seed", seed]
+        command = [program.resolve(), "training-data", "--scene", scene, "--samples", samples, "--first", first, "--seed", seed]
         self.process = subprocess.Popen([str(c) for c in command], stdout=subprocess.PIPE)
         line = self.process.stdout.readline()
         if not line:

@@ -3,7 +3,6 @@
 import argparse
 import json
 import math
-import os
 import time
 from pathlib import Path
 
@@ -11,12 +10,16 @@ import torch
 from torch.nn import functional
 from tqdm import tqdm
 
-from networks import NETWORKS, normalise
+from networks import NETWORKS, build, normalise
 from samples import Stream, heatmaps, offsets
 
-VALIDATION = 512
+VALIDATION = 256
 VALIDATION_SEED = 2
 TRAINING_SEED = 1
+# Samples that a whitening front is learned from.
+WHITENING = 2000
+# Share of the training in which the learning rate rises.
+WARM_UP = 0.05
 
 
 def loss_of(output, frames, emitters, sigma_px):
@@ -31,40 +34,51 @@ def loss_of(output, frames, emitters, sigma_px):
     return error + 0.5 * functional.binary_cross_entropy(heatmap, target)
 
 
-def peaks(heatmap, threshold=0.3, radius=2):
-    """Maxima of one heatmap within `radius` pixels, refined by the centroid of their 3×3 surroundings: (count, 2)."""
-    largest = functional.max_pool2d(heatmap[None, None], 2 * radius + 1, stride=1, padding=radius)[0, 0]
-    rows, columns = torch.nonzero((heatmap == largest) & (heatmap > threshold), as_tuple=True)
-    padded = functional.pad(heatmap, (1, 1, 1, 1))
-    found = []
-    for r, c in zip(rows.tolist(), columns.tolist()):
-        patch = padded[r : r + 3, c : c + 3]
-        step = torch.arange(-1.0, 2.0)
-        found.append((c + (patch.sum(0) * step).sum() / patch.sum(), r + (patch.sum(1) * step).sum() / patch.sum()))
-    return torch.tensor(found).reshape(-1, 2)
+def peaks(output, threshold=0.3, radius=1):
+    """What the program makes of a network's output: for each frame (count, 2), columns and rows in pixels.
+
+    Maxima of the heatmap within `radius` pixels and above `threshold`, moved by the coordinate head where there is one and else
+    to the vertex of the parabola through the logarithms of the neighbours along each axis, exact for a Gaussian.
+    """
+    heatmap, coordinates = output if isinstance(output, tuple) else (output, None)
+    largest = functional.max_pool2d(heatmap, 2 * radius + 1, stride=1, padding=radius)
+    frame, _, row, column = torch.nonzero((heatmap == largest) & (heatmap > threshold), as_tuple=True)
+    if coordinates is not None:
+        move = coordinates[frame, :, row, column].clamp(-radius, radius)
+    else:
+        height = functional.pad(heatmap, (1, 1, 1, 1)).clamp_min(1e-6).log()[:, 0]
+        at = [[height[frame, row + 1 + dy * k, column + 1 + dx * k] for k in (-1, 0, 1)] for dx, dy in ((1, 0), (0, 1))]
+        curved = [(a - 2 * b + c).clamp_max(-1e-6) for a, b, c in at]
+        move = torch.stack([(0.5 * (a - c) / k).clamp(-0.5, 0.5) for (a, b, c), k in zip(at, curved)], dim=1)
+    found = torch.stack([column, row], dim=1) + move
+    return [found[frame == k] for k in range(len(heatmap))]
 
 
 def validate(network, batches, sigma_px, metre_px):
-    """Loss, and what non-maximum suppression alone makes of the heatmaps: recall within 10 m, median squared error, m²."""
+    """Loss, and what the heatmaps' maxima alone are worth within 10 m: recall, precision, median and mean squared error, m²."""
     network.eval()
-    losses, found, total, squared = [], 0, 0, []
+    losses, found, total, named, squared = [], 0, 0, 0, []
     with torch.no_grad():
         for frames, emitters in batches:
             output = network(normalise(frames))
             losses.append(loss_of(output, frames, emitters, sigma_px).item())
-            heatmap = output[0] if isinstance(output, tuple) else output
-            for k in range(len(frames)):
-                truth = emitters[k, ~emitters[k, :, 0].isnan(), :2]
-                at = peaks(heatmap[k, 0])
+            for at, slots in zip(peaks(output), emitters):
+                truth = slots[~slots[:, 0].isnan(), :2]
                 total += len(truth)
+                named += len(at)
                 if len(at):
                     # Nearest peak of each emitter: the program's own studies match one to one.
                     distance = torch.cdist(truth, at).amin(1) * metre_px
                     found += int((distance < 10.0).sum())
                     squared += (distance[distance < 10.0] ** 2).tolist()
     network.train()
-    median = sorted(squared)[len(squared) // 2] if squared else math.nan
-    return {"loss": sum(losses) / len(losses), "recall_10m": found / total, "median_squared_error_m2": median}
+    return {
+        "loss": sum(losses) / len(losses),
+        "recall_10m": found / total,
+        "precision_10m": min(found, named) / max(named, 1),
+        "median_squared_error_m2": sorted(squared)[len(squared) // 2] if squared else math.nan,
+        "mean_squared_error_m2": sum(squared) / len(squared) if squared else math.nan,
+    }
 
 
 def save(path: Path, state: dict) -> None:
@@ -80,17 +94,29 @@ def main() -> None:
     parser.add_argument("--program", type=Path, default=Path("target/release/oapwatch"))
     parser.add_argument("--out", type=Path, required=True, help="folder of the checkpoint and the validation curve")
     parser.add_argument("--samples", type=int, default=500_000)
-    parser.add_argument("--minutes", type=float, default=math.inf, help="stop after this time; the rest can follow later")
+    parser.add_argument(
+        "--minutes", type=float, default=math.inf, help="CPU time of the whole training, whatever the number of samples; the schedule heeds it"
+    )
     parser.add_argument("--batch", type=int, default=32)
     parser.add_argument("--rate", type=float, default=3e-3, help="largest learning rate; falls as a cosine to nothing")
-    parser.add_argument("--target-sigma-px", type=float, default=1.0)
-    parser.add_argument("--threads", type=int, default=os.cpu_count())
+    parser.add_argument("--target-sigma-px", type=float, default=0.7)
+    parser.add_argument("--from-run", type=Path, help="begin with the weights of another run of the same network")
+    parser.add_argument("--precision", choices=("bf16", "f32"), default="bf16", help="of the convolutions while training")
+    parser.add_argument("--validations", type=int, default=10, help="how often to validate and keep a checkpoint")
+    parser.add_argument("--threads", type=int, default=1)
     args = parser.parse_args()
 
     torch.set_num_threads(args.threads)
     torch.manual_seed(0)
     args.out.mkdir(parents=True, exist_ok=True)
-    network = NETWORKS[args.network]()
+
+    held_out = Stream(args.program, args.scene, VALIDATION, 0, VALIDATION_SEED)
+    layout = held_out.layout
+    validation = list(held_out.batches(32))
+    held_out.close()
+    metre_px = layout["ground_m_per_px"][0]
+
+    network = build(args.network, layout["nx"], layout["ny"]).to(memory_format=torch.channels_last)
     optimiser = torch.optim.Adam(network.parameters(), lr=args.rate)
     seen, curve, spent = 0, [], 0.0
     checkpoint = args.out / "checkpoint.pt"
@@ -99,41 +125,52 @@ def main() -> None:
         network.load_state_dict(state["network"])
         optimiser.load_state_dict(state["optimiser"])
         seen, curve, spent = state["seen"], state["curve"], state["seconds"]
+    else:
+        if args.from_run:
+            network.body.load_state_dict(torch.load(args.from_run / "checkpoint.pt")["body"])
+        if args.network.endswith("-white"):
+            first = Stream(args.program, args.scene, WHITENING, 0, TRAINING_SEED)
+            network.front.learn(next(first.batches(WHITENING))[0])
+            first.close()
+    about = {"name": args.network, "target_sigma_px": args.target_sigma_px, "layout": layout}
+    about["from_run"] = args.from_run and args.from_run.name
 
-    held_out = Stream(args.program, args.scene, VALIDATION, 0, VALIDATION_SEED)
-    validation = list(held_out.batches(64))
-    metre_px = held_out.layout["ground_m_per_px"][0]
-    held_out.close()
+    def seconds():
+        return spent + time.process_time()
 
-    began = time.monotonic()
-    stream = Stream(args.program, args.scene, args.samples - seen, seen, TRAINING_SEED)
-    bar = tqdm(total=args.samples, initial=seen, unit="sample", smoothing=0.05)
-    every = max(args.samples // 50, args.batch)
+    def progress():
+        return min(1.0, max(seen / args.samples, seconds() / 60 / args.minutes))
 
     def keep():
-        seconds = spent + time.monotonic() - began
-        figures = validate(network, validation, args.target_sigma_px, metre_px)
-        curve.append({"samples": seen, "seconds": round(seconds), **figures})
+        at = seconds()
+        curve.append({"samples": seen, "seconds": round(at), **validate(network, validation, args.target_sigma_px, metre_px)})
         bar.write(json.dumps(curve[-1]))
-        state = {"network": network.state_dict(), "optimiser": optimiser.state_dict()}
-        about = {"name": args.network, "target_sigma_px": args.target_sigma_px, "layout": stream.layout}
-        save(checkpoint, {**state, "seen": seen, "curve": curve, "seconds": seconds, **about})
+        state = {"network": network.state_dict(), "body": network.body.state_dict(), "optimiser": optimiser.state_dict()}
+        save(checkpoint, {**state, "seen": seen, "curve": curve, "seconds": at, **about})
         (args.out / "curve.json").write_text(json.dumps(curve, indent=1))
 
+    if progress() >= 1.0:
+        print(f"{args.out} is trained: {seen} samples in {spent:.0f} s")
+        return
+    stream = Stream(args.program, args.scene, args.samples - seen, seen, TRAINING_SEED)
+    bar = tqdm(total=args.samples, initial=seen, unit="sample", smoothing=0.05, mininterval=1.0)
+    done = progress()
     for frames, emitters in stream.batches(args.batch):
         for group in optimiser.param_groups:
-            group["lr"] = args.rate * min(1.0, seen / 2000 + 0.05) * 0.5 * (1 + math.cos(math.pi * seen / args.samples))
+            group["lr"] = args.rate * min(1.0, done / WARM_UP + 0.05) * 0.5 * (1 + math.cos(math.pi * done))
         optimiser.zero_grad()
-        loss = loss_of(network(normalise(frames)), frames, emitters, args.target_sigma_px)
+        with torch.autocast("cpu", torch.bfloat16, enabled=args.precision == "bf16"):
+            output = network(normalise(frames).contiguous(memory_format=torch.channels_last))
+        loss = loss_of(output, frames, emitters, args.target_sigma_px)
         loss.backward()
         optimiser.step()
-        before, seen = seen, seen + len(frames)
+        seen += len(frames)
+        before, done = done, progress()
         bar.update(len(frames))
-        bar.set_postfix(loss=f"{loss.item():.2e}")
-        late = (time.monotonic() - began) / 60 > args.minutes
-        if seen // every != before // every or seen == args.samples or late:
+        bar.set_postfix(loss=f"{loss.item():.2e}", done=f"{100 * done:.0f} %")
+        if int(done * args.validations) > int(before * args.validations):
             keep()
-        if late:
+        if done >= 1.0:
             break
     stream.close()
     bar.close()

@@ -1,19 +1,35 @@
 #!/usr/bin/env bash
-# Trains, exports and draws every network: ./training/train.sh [SAMPLES]. Can be stopped and started again.
+# Trains, exports and draws every network of the paper's table: ./training/train.sh [MINUTES] [SAMPLES]
+# MINUTES is the CPU time for each 64 × 64 network; others get their share by the number of pixels (between 1/4 and 2 times).
+# Can be stopped at any time and started again. Then: oapwatch tradeoff --networks training/models
 set -euo pipefail
 cd "$(dirname "$0")/.."
-samples=${1:-500000}
-if [ ! -x training/.venv/bin/python ]; then
+minutes=${1:-60}
+samples=${2:-500000}
+sizes=${SIZES:-10 20 40 60 64 80 100}
+networks=${NETWORKS:-cnn16 cnn16-separable unet}
+python=${PYTHON:-training/.venv/bin/python}
+program=${PROGRAM:-target/release/oapwatch}
+if [ ! -x "$python" ]; then
   python3 -m venv training/.venv
   training/.venv/bin/pip install -r training/requirements.txt
 fi
-python=training/.venv/bin/python
-cargo build --release --locked
-for scene in energy-1mm-64 paper-8mm-64; do
-  for network in cnn16 cnn16-separable unet; do
-    run=training/runs/$network-$scene
-    $python training/train.py --network $network --scene training/scenes/$scene.toml --out "$run" --samples "$samples"
-    $python training/export.py --run "$run" --scene training/scenes/$scene.toml --out config/models/$network-$scene.onnx || true
+if [ ! -x "$program" ]; then cargo build --release --locked; fi
+mkdir -p training/runs training/models
+for pixels in $sizes; do
+  for reading in energy-1mm paper-8mm; do
+    scene=training/runs/$reading-$pixels.toml
+    sed "s/^pixels = .*/pixels = [$pixels, $pixels]/" "training/scenes/$reading.toml" > "$scene"
+    # Where spots melt into each other, a network learns from whitened frames what it does not from plain ones.
+    front=""
+    if [ "$reading" = paper-8mm ]; then front=-white; fi
+    for network in $networks; do
+      name=$network$front
+      run=training/runs/$name-$reading-$pixels
+      share=$(awk "BEGIN { s = $pixels^2 / 64^2; print $minutes * (s < 0.25 ? 0.25 : s > 2 ? 2 : s) }")
+      "$python" training/train.py --program "$program" --network "$name" --scene "$scene" --out "$run" --samples "$samples" --minutes "$share"
+      "$python" training/export.py --program "$program" --run "$run" --scene "$scene" --out "training/models/$name-$reading-$pixels.onnx"
+    done
   done
 done
-$python training/curve.py training/runs/* --out training/validation.svg
+"$python" training/curve.py training/runs/*/ --out training/models/validation.svg

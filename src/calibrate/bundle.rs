@@ -4,17 +4,16 @@
 use faer::Mat;
 use rayon::prelude::*;
 
+use super::believe::{Displacement, displacements, excess_variance, median};
+use super::device::{DEVICE, Prior, device_of, set_device};
 use super::maps;
 use super::shot::{Normal, PER_SPOT, Scaled, Shot, Spot};
+use super::sources::{add_missing, drop_dark, solve_energies};
 use super::truth::Beacon;
-use crate::optics::{Camera, Distortion, psf};
+use crate::optics::{Camera, Distortion};
 
-/// Distortion, ln σ_eff, spot growth.
-const DEVICE: usize = Distortion::PARAMETERS + 2;
 /// Mahalanobis distance past which a beacon's position is not believed.
 const REJECT: f64 = 5.0;
-/// Standard deviations of the residual that light without a spot must reach.
-const SIGNIFICANT: f64 = 12.0;
 /// A beacon is absent, and a source that nobody surveyed is modelled, below and above this share of the median energy.
 const NOTABLE: f64 = 0.15;
 const MAX_ROUNDS: usize = 24;
@@ -29,59 +28,6 @@ pub struct Fit<'a> {
     pub tether_m2: f64,
     prior: Prior,
     normals: Vec<Normal>,
-}
-
-/// Gaussian prior of the device parameters: generous next to real lenses, there to keep what few beacons cannot tell.
-struct Prior {
-    mean: [f64; DEVICE],
-    std: [f64; DEVICE],
-}
-
-impl Prior {
-    fn of(camera: &Camera) -> Self {
-        let half = camera.x.half_width().min(camera.y.half_width());
-        let r = camera.x.half_width().hypot(camera.y.half_width()) / camera.plane_distance_m;
-        Self {
-            mean: device_of(&Camera {
-                distortion: Distortion::default(),
-                spot_growth: 0.0,
-                ..camera.clone()
-            }),
-            std: [
-                0.1 * half,
-                0.1 * half,
-                0.1,
-                0.1 / r.powi(2),
-                0.05 / r.powi(4),
-                0.02 / r.powi(6),
-                0.02 / r,
-                0.02 / r,
-                0.3,
-                0.3,
-            ],
-        }
-    }
-
-    fn cost(&self, device: &[f64; DEVICE]) -> f64 {
-        (0..DEVICE)
-            .map(|k| ((device[k] - self.mean[k]) / self.std[k]).powi(2))
-            .sum()
-    }
-}
-
-fn device_of(camera: &Camera) -> [f64; DEVICE] {
-    let d = camera.distortion.parameters();
-    std::array::from_fn(|k| match k {
-        k if k < Distortion::PARAMETERS => d[k],
-        k if k == Distortion::PARAMETERS => camera.spot_sigma_m.ln(),
-        _ => camera.spot_growth,
-    })
-}
-
-fn set_device(camera: &mut Camera, device: &[f64; DEVICE]) {
-    camera.distortion = Distortion::from_parameters(std::array::from_fn(|k| device[k]));
-    camera.spot_sigma_m = device[Distortion::PARAMETERS].exp();
-    camera.spot_growth = device[Distortion::PARAMETERS + 1];
 }
 
 impl<'a> Fit<'a> {
@@ -382,162 +328,4 @@ impl<'a> Fit<'a> {
             self.camera.noise_std_j = m / 0.674_489_75;
         }
     }
-}
-
-/// How far an untethered spot lies from where its beacon puts it, m on the sensor.
-#[derive(Clone, Copy)]
-struct Displacement {
-    offset: [f64; 2],
-    cov: [[f64; 2]; 2],
-}
-
-impl Displacement {
-    fn mahalanobis2(&self, tether: f64) -> f64 {
-        let [[a, b], [_, c]] = self.cov;
-        let (a, c) = (a + tether, c + tether);
-        let [x, y] = self.offset;
-        (c * x * x - 2.0 * b * x * y + a * y * y) / (a * c - b * b)
-    }
-}
-
-/// One Newton step without the tether, from the fitted state.
-fn displacements(shot: &Shot, normal: &Normal) -> Vec<Option<Displacement>> {
-    let local = shot.local_columns();
-    let h = Mat::from_fn(local.len(), local.len(), |a, b| normal.gram[(local[a], local[b])]);
-    let g: Vec<f64> = local.iter().map(|&c| normal.rhs[c]).collect();
-    let Some(solver) = Scaled::new(&h, 0.0) else {
-        return vec![None; shot.spots.len()];
-    };
-    let (step, inverse) = (
-        solver.solve(&g),
-        solver.solve_many(&Mat::identity(local.len(), local.len())),
-    );
-    let spots = shot.spots.iter().enumerate();
-    spots
-        .map(|(i, spot)| {
-            spot.beacon?;
-            let at = |a: usize, b: usize| inverse[(3 * i + a, 3 * i + b)];
-            Some(Displacement {
-                offset: std::array::from_fn(|k| spot.sensor_m[k] + step[3 * i + k] - spot.predicted_m[k]),
-                cov: std::array::from_fn(|a| std::array::from_fn(|b| at(a, b))),
-            })
-        })
-        .collect()
-}
-
-/// The variance T that makes the median of offset²/(cov + T) that of χ² with one degree of freedom.
-fn excess_variance(axes: &[(f64, f64)]) -> f64 {
-    const MEDIAN_CHI2: f64 = 0.454_936;
-    let ratio = |t: f64| median(axes.iter().map(|(o2, c)| o2 / (c + t)).collect()).unwrap_or(0.0);
-    if ratio(0.0) <= MEDIAN_CHI2 {
-        return 0.0;
-    }
-    let (mut low, mut high) = (0.0, axes.iter().map(|a| a.0).fold(0.0, f64::max).max(1e-30) * 10.0);
-    // In the logarithm first: the answer may lie many orders of magnitude below the largest offset.
-    for _ in 0..200 {
-        let middle = if low == 0.0 { high * 0.1 } else { (low * high).sqrt() };
-        if ratio(middle) > MEDIAN_CHI2 {
-            low = middle
-        } else {
-            high = middle
-        }
-        if low > 0.0 && high / low < 1.001 {
-            break;
-        }
-    }
-    (low * high).sqrt().max(low)
-}
-
-/// Energies and background with the positions held where they are: a linear problem.
-fn solve_energies(shot: &mut Shot, camera: &Camera) {
-    let n = shot.spots.len();
-    let normal = shot.normal(camera);
-    let linear: Vec<usize> = (0..n)
-        .map(|i| PER_SPOT * i + 2)
-        .chain(PER_SPOT * n..normal.rhs.len())
-        .collect();
-    let h = Mat::from_fn(linear.len(), linear.len(), |a, b| normal.gram[(linear[a], linear[b])]);
-    let g: Vec<f64> = linear.iter().map(|&c| normal.rhs[c]).collect();
-    if let Some(solution) = Scaled::new(&h, 1e-9).map(|s| s.solve(&g)) {
-        for (spot, e) in shot.spots.iter_mut().zip(&solution) {
-            spot.energy_j = *e;
-        }
-        if let Some(background) = &mut shot.background {
-            background.copy_from_slice(&solution[n..]);
-        }
-    }
-}
-
-/// Drops the spots that surely have less energy than `least_j`: two that overlap may share theirs out at will.
-fn drop_dark(shot: &mut Shot, normal: &Normal, tether_m2: f64, least_j: f64) {
-    let (h, _) = shot.tethered(normal, tether_m2);
-    let Some(solver) = Scaled::new(&h, 1e-12) else { return };
-    let inverse = solver.solve_many(&Mat::identity(h.nrows(), h.nrows()));
-    let mut i = 0;
-    shot.spots.retain(|spot| {
-        let std = inverse[(3 * i + 2, 3 * i + 2)].max(0.0).sqrt();
-        i += 1;
-        spot.energy_j + 3.0 * std > least_j
-    });
-}
-
-/// Puts a spot without a beacon on the strongest light that the residual holds, if it is worth `least_j`.
-fn add_missing(shot: &mut Shot, camera: &Camera, least_j: f64) -> bool {
-    let (ny, nx) = camera.shape();
-    let mut residual = vec![0.0; ny * nx];
-    shot.residual(camera, &mut residual);
-    let sigma = camera.spot_sigma_m;
-    // Matched filter, one axis after the other: kernels centred on each pixel.
-    let kernels = |axis: &crate::optics::Axis| -> Vec<Vec<f64>> {
-        (0..axis.n)
-            .map(|k| {
-                let mut out = vec![0.0; axis.n];
-                psf::profile(axis, axis.centre(k), sigma, &mut out);
-                out
-            })
-            .collect()
-    };
-    let (kx, ky) = (kernels(&camera.x), kernels(&camera.y));
-    let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
-    let along_x: Vec<Vec<f64>> = residual
-        .chunks_exact(nx)
-        .map(|row| kx.iter().map(|k| dot(k, row)).collect())
-        .collect();
-    let norms = |k: &[Vec<f64>]| k.iter().map(|k| dot(k, k)).collect::<Vec<f64>>();
-    let (norm_x, norm_y) = (norms(&kx), norms(&ky));
-    let mut best: Option<(f64, f64, [f64; 2])> = None;
-    for (row, k) in ky.iter().enumerate() {
-        for col in 0..nx {
-            let product: f64 = k.iter().zip(&along_x).map(|(w, line)| w * line[col]).sum();
-            let norm2 = norm_x[col] * norm_y[row];
-            let strength = product / norm2.sqrt();
-            if best.is_none_or(|b| strength > b.0) {
-                best = Some((strength, product / norm2, [camera.x.centre(col), camera.y.centre(row)]));
-            }
-        }
-    }
-    let Some((strength, energy_j, sensor_m)) = best else {
-        return false;
-    };
-    let apart = |s: &Spot| (s.sensor_m[0] - sensor_m[0]).hypot(s.sensor_m[1] - sensor_m[1]) > 1.5 * sigma;
-    if strength < SIGNIFICANT * camera.noise_std_j || energy_j < least_j || !shot.spots.iter().all(apart) {
-        return false;
-    }
-    shot.spots.push(Spot {
-        beacon: None,
-        predicted_m: sensor_m,
-        sensor_m,
-        energy_j,
-        trusted: false,
-    });
-    true
-}
-
-/// The middle value; none of an empty list.
-pub fn median(mut values: Vec<f64>) -> Option<f64> {
-    if values.is_empty() {
-        return None;
-    }
-    let middle = values.len() / 2;
-    Some(*values.select_nth_unstable_by(middle, f64::total_cmp).1)
 }

@@ -58,6 +58,6 @@ pub fn score(estimator: &mut dyn Estimator, frames: &[(usize, &Array2<f64>)], be
         missed,
         cost_m2: (sum + missed as f64 * CUTOFF_M * CUTOFF_M) / total as f64,
         mse_m2: sum / squared.len() as f64,
-        median_m2: super::bundle::median(squared).unwrap_or(f64::NAN),
+        median_m2: super::believe::median(squared).unwrap_or(f64::NAN),
     }
 }

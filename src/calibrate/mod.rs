@@ -1,10 +1,13 @@
 //! Floor 2: what a device is, from frames with known positions.
 
+mod believe;
 mod bundle;
+mod device;
 pub mod file;
 mod judge;
 mod maps;
 mod shot;
+mod sources;
 pub mod truth;
 
 use ndarray::Array2;

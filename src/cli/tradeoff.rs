@@ -3,7 +3,7 @@ use std::path::PathBuf;
 use indicatif::{ProgressBar, ProgressStyle};
 
 use super::{Failure, Outcome};
-use crate::study::tradeoff::{Plan, run as study};
+use crate::study::tradeoff::{Plan, Trained, run as study};
 
 #[derive(Debug, clap::Args)]
 pub struct Args {
@@ -22,6 +22,9 @@ pub struct Args {
     /// Only these rungs, as "pencil,ml"
     #[arg(long, value_delimiter = ',')]
     rungs: Vec<String>,
+    /// Folder of trained networks with their cards: `network` and `hybrid` are measured with each where it was trained
+    #[arg(long)]
+    networks: Option<PathBuf>,
     /// The same seed gives the same frames
     #[arg(long)]
     seed: Option<u64>,
@@ -40,6 +43,9 @@ pub fn run(args: Args) -> Outcome {
     }
     if !args.rungs.is_empty() {
         plan.rungs.retain(|r| args.rungs.iter().any(|name| name == r));
+    }
+    if let Some(folder) = &args.networks {
+        plan.networks = Trained::in_folder(folder).map_err(Failure::input)?;
     }
     if plan.is_empty() {
         return Err(Failure::input(anyhow::anyhow!(

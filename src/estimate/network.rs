@@ -19,8 +19,10 @@ const EMBEDDED: (&str, &[u8], &str) = (
 );
 /// Least height of a maximum that counts.
 const THRESHOLD: f32 = 0.3;
+/// Heights below this say nothing of where a maximum is.
+const FLOOR: f32 = 1e-6;
 /// Non-maximum suppression within this many pixels.
-const RADIUS: usize = 2;
+const RADIUS: usize = 1;
 
 /// Why a network cannot be used.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
@@ -76,6 +78,8 @@ pub struct Network {
     path: PathBuf,
     input: Vec<f32>,
     heatmap: Vec<f32>,
+    /// Offsets to the nearest emitter in pixels, all in x and then all in y; empty without a coordinate head.
+    offsets: Vec<f32>,
     peaks: Vec<NetworkPeak>,
 }
 
@@ -135,6 +139,7 @@ impl Network {
             path: path.clone(),
             input: vec![0.0; ny * nx],
             heatmap: Vec::new(),
+            offsets: Vec::new(),
             peaks: Vec::new(),
         };
         // A model whose own input differs from its card shows itself here, before the daemon says that it is ready.
@@ -153,7 +158,8 @@ impl Network {
         Ok(&self.peaks)
     }
 
-    /// From `input` to `heatmap`, whose values are held to [0, 1]: some sigmoids overshoot by a rounding.
+    /// From `input` to `heatmap`, whose values are held to [0, 1]: some sigmoids overshoot by a rounding. A second output,
+    /// where there is one, is the coordinate head's.
     fn infer(&mut self) -> Result<(), NetworkError> {
         let not_runnable = |reason: String| NetworkError::NotRunnable {
             path: self.path.clone(),
@@ -169,10 +175,23 @@ impl Network {
         }
         self.heatmap.clear();
         self.heatmap.extend(values.iter().map(|v| v.clamp(0.0, 1.0)));
+        self.offsets.clear();
+        if let Some(offsets) = output.get(1) {
+            let values = offsets.to_plain_array_view::<f32>().map_err(failed)?;
+            if values.len() != 2 * self.ny * self.nx {
+                let found = values.len();
+                return Err(not_runnable(format!(
+                    "its second output gives {found} values, not two a pixel"
+                )));
+            }
+            self.offsets.extend(values.iter());
+        }
         Ok(())
     }
 
-    /// Maxima within `RADIUS` pixels, refined by the centroid of their 3 × 3 surroundings, row by row.
+    /// Maxima within `RADIUS` pixels, row by row, moved by the coordinate head where there is one and else to the vertex of the
+    /// parabola through the logarithms of their neighbours along each axis: exact where the heatmap is the Gaussian that it was
+    /// trained to be.
     fn find(&mut self) {
         let (nx, ny, map) = (self.nx, self.ny, &self.heatmap);
         self.peaks.clear();
@@ -197,14 +216,28 @@ impl Network {
                 if around(RADIUS).any(beaten) {
                     continue;
                 }
-                let (mut mass, mut x, mut y) = (0.0, 0.0, 0.0);
-                for (r, c) in around(1) {
-                    let m = f64::from(map[r * nx + c]);
-                    (mass, x, y) = (mass + m, x + m * c as f64, y + m * r as f64);
-                }
+                let height = |at: Option<usize>| at.map_or(FLOOR, |k| map[k].max(FLOOR)).ln();
+                let vertex = |before: Option<usize>, after: Option<usize>| {
+                    let (a, b, c) = (height(before), value.ln(), height(after));
+                    let curvature = a - 2.0 * b + c;
+                    if curvature < 0.0 {
+                        (0.5 * (a - c) / curvature).clamp(-0.5, 0.5)
+                    } else {
+                        0.0
+                    }
+                };
+                let [dx, dy] = if self.offsets.is_empty() {
+                    [
+                        vertex((column > 0).then(|| here - 1), (column + 1 < nx).then_some(here + 1)),
+                        vertex((row > 0).then(|| here - nx), (row + 1 < ny).then_some(here + nx)),
+                    ]
+                } else {
+                    let reach = RADIUS as f32;
+                    [here, nx * ny + here].map(|k| self.offsets[k].clamp(-reach, reach))
+                };
                 self.peaks.push(NetworkPeak {
-                    column: x / mass,
-                    row: y / mass,
+                    column: column as f64 + f64::from(dx),
+                    row: row as f64 + f64::from(dy),
                     pixel: (row, column),
                 });
             }
@@ -269,6 +302,26 @@ mod tests {
             .err()
             .unwrap();
         assert!(missing.to_string().contains("/nonexistent/n.onnx"), "{missing}");
+    }
+
+    #[test]
+    fn a_gaussian_maximum_is_found_between_the_pixels() {
+        let mut network = Network::load(None, (64, 64)).unwrap();
+        let at = [20.3, 41.4];
+        let gauss = |d: f64| libm::exp(-0.5 * d * d);
+        network.heatmap = (0..4096)
+            .map(|k| (gauss((k % 64) as f64 - at[0]) * gauss((k / 64) as f64 - at[1])) as f32)
+            .collect();
+        network.find();
+        let [peak] = network.peaks[..] else {
+            panic!("{:?}", network.peaks)
+        };
+        assert_eq!(peak.pixel, (41, 20));
+        assert!((peak.column - at[0]).hypot(peak.row - at[1]) < 1e-5, "{peak:?}");
+        // A coordinate head has the last word.
+        network.offsets = vec![0.25; 2 * 4096];
+        network.find();
+        assert_eq!((network.peaks[0].column, network.peaks[0].row), (20.25, 41.25));
     }
 
     #[test]

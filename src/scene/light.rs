@@ -2,7 +2,7 @@
 
 use super::average::Average;
 use super::config::Scene;
-use super::effects::{Pose, attitude};
+use super::effects::{Pose, Rays, attitude};
 use super::error::Error;
 use super::exposure::Exposure;
 use super::population::{Beam, Population};
@@ -23,6 +23,7 @@ pub(super) struct Light {
     average: Average,
     pose: Option<Pose>,
     vignetting: Option<Vignetting>,
+    rays: Option<Rays>,
     exposure: Exposure,
 }
 
@@ -141,8 +142,16 @@ impl Light {
                 "one factor a spot; the background's is in its image",
             );
         }
+        let aberrations = decisions.weigh(Effect::Aberrations, &effects.aberrations, |a| {
+            peak * a.defocus_share + moved(a.coma_m)
+        });
+        let rays = aberrations.map(|a| a.rays(sigma));
+        if let Some(rays) = &rays {
+            decisions.note(Effect::Aberrations, Status::On, format!("{} rays a spot", rays.count()));
+        }
         Ok(Self {
             lens,
+            rays,
             straight_j_per_w: straight_j_per_w(scene, camera),
             attenuation,
             average,
@@ -156,6 +165,13 @@ impl Light {
     pub fn passed(&self, sensor: [f64; 2]) -> f64 {
         let ratio = || self.lens.corner_ratio2(sensor);
         self.vignetting.as_ref().map_or(1.0, |v| v.passed(ratio()))
+    }
+
+    /// A place on the sensor as seen from the optical axis, over the sensor's half-diagonal.
+    fn field(&self, sensor: [f64; 2]) -> [f64; 2] {
+        let corner = self.lens.x.half_width().hypot(self.lens.y.half_width());
+        let axis = self.lens.distortion.principal_point_m;
+        std::array::from_fn(|k| (sensor[k] - axis[k]) / corner)
     }
 
     /// Prepares what all beams of a frame share.
@@ -211,11 +227,15 @@ impl Light {
             let centre = self.lens.distortion.project(self.lens.plane_distance_m, tangents);
             let energy_j = energy * shot.factors[s] / steps as f64 * self.passed(centre);
             total += energy_j;
-            out.push(Spot {
+            let spot = Spot {
                 centre,
                 sigma_m: self.lens.spot_sigma_at(centre),
                 energy_j,
-            });
+            };
+            match &self.rays {
+                Some(rays) => rays.cast(&spot, self.field(centre), out),
+                None => out.push(spot),
+            }
         }
         total
     }

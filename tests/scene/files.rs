@@ -124,12 +124,14 @@ fn the_blinding_scene_blinds() {
 }
 
 #[test]
-fn the_nastiest_scene_calls_for_every_effect() {
+fn the_nastiest_scene_calls_for_every_effect_but_the_dearest() {
     let plan = named("nastiest");
     let missing: Vec<Effect> = plan
         .decisions()
         .iter()
         .filter(|d| d.status == Status::Off && d.effect != Effect::Population)
+        // Eighty sub-frames of some hundred rays a spot would take a quarter of a second a frame.
+        .filter(|d| d.effect != Effect::Aberrations)
         .map(|d| d.effect)
         .collect();
     assert_eq!(missing, []);

@@ -1,5 +1,6 @@
 //! The effects: one small file each, with its equation and where it is valid.
 
+mod aberrations;
 mod aperture;
 mod attenuation;
 pub(super) mod attitude;
@@ -21,6 +22,7 @@ mod vibration;
 mod vignetting;
 mod wander;
 
+pub use aberrations::Aberrations;
 pub use aperture::ExactAperture;
 pub use attenuation::Attenuation;
 pub use attitude::Attitude;
@@ -42,6 +44,7 @@ pub use vibration::Vibration;
 pub use vignetting::Vignetting;
 pub use wander::Wander;
 
+pub(super) use aberrations::Rays;
 pub(super) use aperture::Capture;
 pub(super) use attitude::Pose;
 pub(super) use defects::DefectMap;
@@ -158,9 +161,10 @@ effects! {
     27 Defects defects: Defects,
     28 Quantisation quantisation: Quantisation,
     29 FrameLoss frame_loss: FrameLoss,
+    30 Aberrations aberrations: Aberrations,
 }
 
 impl Effect {
     /// Room for every number.
-    pub(super) const ROOM: usize = 30;
+    pub(super) const ROOM: usize = 31;
 }

@@ -1,6 +1,7 @@
 //! What accuracy costs in time: every rung of the ladder on the same frames, against the Cramér–Rao bound.
 
 mod condition;
+mod networks;
 mod picture;
 mod report;
 mod scene;
@@ -11,8 +12,10 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 
 use crate::estimate::{LADDER, Learned};
+use networks::Candidate;
 
 pub use condition::Condition;
+pub use networks::{Trained, Training};
 pub use scene::{Cell, Noise};
 pub use score::Row;
 
@@ -22,6 +25,8 @@ pub struct Plan {
     pub cells: Vec<Cell>,
     /// Names of rungs.
     pub rungs: Vec<&'static str>,
+    /// Networks for the learned rungs besides the embedded one, each in the cell that it was trained for.
+    pub networks: Vec<Trained>,
     /// Frames a cell.
     pub frames: usize,
     pub seed: u64,
@@ -34,6 +39,8 @@ pub enum Error {
     Io { path: PathBuf, source: std::io::Error },
     #[error("{path}: not a trade-off study: {source}")]
     Malformed { path: PathBuf, source: serde_json::Error },
+    #[error("{path}: not a network's card: {source}")]
+    Card { path: PathBuf, source: toml::de::Error },
     #[error("cell {cell}: {source}")]
     Optics { cell: String, source: crate::optics::Error },
     #[error(transparent)]
@@ -86,6 +93,7 @@ impl Plan {
         Self {
             cells,
             rungs: rungs(),
+            networks: Vec::new(),
             frames: 250,
             seed: 1,
         }
@@ -103,6 +111,7 @@ impl Plan {
         Self {
             cells,
             rungs: rungs(),
+            networks: Vec::new(),
             frames: 12,
             seed: 1,
         }
@@ -114,13 +123,12 @@ impl Plan {
     }
 
     /// Every cell with the rungs that can be had there: a network only where it was trained.
-    fn pairs(&self) -> impl Iterator<Item = (Cell, &'static str)> {
-        let trained = Cell::new(Noise::Energy, 1.0, 64);
-        let is_had = move |cell: &Cell, rung: &str| *cell == trained || Learned::ALL.iter().all(|l| l.name() != rung);
-        self.cells
-            .iter()
-            .flat_map(move |cell| self.rungs.iter().map(move |rung| (*cell, *rung)))
-            .filter(move |(cell, rung)| is_had(cell, rung))
+    fn pairs(&self) -> impl Iterator<Item = (Cell, Candidate)> {
+        let had = |cell: &Cell| -> Vec<(Cell, Candidate)> {
+            let rungs = self.rungs.iter().flat_map(|r| Candidate::of(r, cell, &self.networks));
+            rungs.map(|c| (*cell, c)).collect()
+        };
+        self.cells.iter().flat_map(had)
     }
 
     pub fn is_empty(&self) -> bool {
@@ -152,11 +160,15 @@ pub fn run(plan: &Plan, out: &Path, progress: &mut dyn FnMut(&Row)) -> Result<St
     };
     let mut kept = Vec::new();
     let mut drawn: Option<(Cell, Vec<scene::Scene>)> = None;
-    for (cell, rung) in plan.pairs() {
-        let known = study
-            .rows
-            .iter()
-            .find(|r| r.cell == cell && r.rung == rung && r.frames == plan.frames && r.seed == plan.seed);
+    for (cell, candidate) in plan.pairs() {
+        let label = candidate.label();
+        let known = study.rows.iter().find(|r| {
+            r.cell == cell
+                && r.rung == label
+                && r.frames == plan.frames
+                && r.seed == plan.seed
+                && r.training == candidate.training()
+        });
         let row = match known {
             Some(row) => row.clone(),
             None => {
@@ -164,7 +176,7 @@ pub fn run(plan: &Plan, out: &Path, progress: &mut dyn FnMut(&Row)) -> Result<St
                     Some((of, scenes)) if of == cell => scenes,
                     _ => cell.scenes(plan.frames, plan.seed)?,
                 };
-                let row = score::measure(&cell, rung, &scenes, plan.seed)?;
+                let row = score::measure(&cell, &candidate, &scenes, plan.seed)?;
                 drawn = Some((cell, scenes));
                 study.rows.push(row.clone());
                 let bytes = serde_json::to_vec_pretty(&study).expect("rows are plain numbers and names");

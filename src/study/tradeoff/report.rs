@@ -95,32 +95,77 @@ pub(super) fn markdown(study: &Study) -> String {
         }
     }
     text.push_str("\n## Beside the paper (σ_eff 8 mm, paper reading), mean squared error, m²\n\n");
-    text.push_str("| array | paper's hybrid | paper's U-Net |");
-    for rung in LADDER {
-        let _ = write!(text, " {} |", rung.name);
-    }
-    let _ = writeln!(text, "\n|---|---|---|{}", "---|".repeat(LADDER.len()));
-    for (pixels, hybrid, unet) in PAPER {
-        let _ = write!(text, "| {pixels}×{pixels} | {hybrid} | {unet} |");
-        for rung in LADDER {
-            let row = study
-                .rows
-                .iter()
-                .find(|r| is_paper_cell(r) && r.cell.pixels == pixels && r.rung == rung.name);
-            let _ = write!(
-                text,
-                " {} |",
-                row.and_then(|r| r.mean_m2)
-                    .map_or("–".to_owned(), |m| format!("{m:.3}"))
-            );
-        }
-        text.push('\n');
-    }
+    beside(&mut text, study, is_paper_cell);
     text.push_str(
         "\nThe paper's errors fall with the array's size because its estimators answer in pixels: its U-Net row is close to pitch²/6 on the \
          ground, the error of naming the right pixel. With a fixed noise per pixel the physical bound rises with the number of pixels.\n",
     );
+    let is_energy_cell = |row: &Row| row.cell.noise == Noise::Energy && row.cell.sigma_mm == 1.0 && row.cell.is_plain();
+    if study.rows.iter().any(|r| is_energy_cell(r) && r.training.is_some()) {
+        text.push_str("\n## The same under the energy reading (σ_eff 1 mm)\n\n");
+        beside(&mut text, study, is_energy_cell);
+    }
+    networks(&mut text, study);
     text
+}
+
+/// The paper's errors by array size, and those of every rung that has a row among the cells that `is_wanted` names.
+fn beside(text: &mut String, study: &Study, is_wanted: impl Fn(&Row) -> bool) {
+    let rows: Vec<&Row> = study.rows.iter().filter(|r| is_wanted(r)).collect();
+    let mut rungs: Vec<&str> = LADDER.iter().map(|r| r.name).collect();
+    for row in &rows {
+        if !rungs.contains(&row.rung.as_str()) {
+            rungs.push(&row.rung);
+        }
+    }
+    let _ = writeln!(
+        text,
+        "| array | paper's hybrid | paper's U-Net | {} |\n|---|---|---|{}",
+        rungs.join(" | "),
+        "---|".repeat(rungs.len())
+    );
+    for (pixels, hybrid, unet) in PAPER {
+        let _ = write!(text, "| {pixels}×{pixels} | {hybrid} | {unet} |");
+        for rung in &rungs {
+            let row = rows.iter().find(|r| r.cell.pixels == pixels && r.rung == *rung);
+            let mean = row
+                .and_then(|r| r.mean_m2)
+                .map_or("–".to_owned(), |m| format!("{m:.3}"));
+            let _ = write!(text, " {mean} |");
+        }
+        text.push('\n');
+    }
+}
+
+/// What the networks cost to train, with what a mean over matched pairs alone hides.
+fn networks(text: &mut String, study: &Study) {
+    let learned: Vec<&Row> = study.rows.iter().filter(|r| r.training.is_some()).collect();
+    if learned.is_empty() {
+        return;
+    }
+    text.push_str(
+        "\n## Networks\n\nMissed and invented are shares of the emitters; seconds are of one processor core.\n\n\
+         | cell | rung | samples | training s | mean m² | median m² | missed | invented | OSPA m |\n\
+         |---|---|---|---|---|---|---|---|---|\n",
+    );
+    let number = |v: Option<f64>| v.map_or("–".to_owned(), |v| format!("{v:.3}"));
+    for row in learned {
+        let Some(training) = row.training else { continue };
+        let share = |count: usize| 100.0 * count as f64 / row.emitters.max(1) as f64;
+        let _ = writeln!(
+            text,
+            "| {} | {} | {} | {:.0} | {} | {} | {:.1} % | {:.1} % | {:.2} |",
+            row.cell.name(),
+            row.rung,
+            training.samples,
+            training.seconds,
+            number(row.mean_m2),
+            number(row.median_m2),
+            share(row.missed),
+            share(row.invented),
+            row.ospa_m
+        );
+    }
 }
 
 pub(super) fn is_paper_cell(row: &Row) -> bool {

@@ -3,6 +3,7 @@ use std::time::Instant;
 use serde::{Deserialize, Serialize};
 
 use super::Error;
+use super::networks::{Candidate, Training};
 use super::scene::{Cell, Scene};
 use crate::assign::ospa;
 use crate::estimate;
@@ -20,6 +21,9 @@ pub struct Row {
     pub rung: String,
     pub frames: usize,
     pub seed: u64,
+    /// Of the network, where the study was given one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub training: Option<Training>,
     /// Squared error over matched pairs, both axes summed; none where nothing was matched.
     pub mean_m2: Option<f64>,
     pub median_m2: Option<f64>,
@@ -31,6 +35,9 @@ pub struct Row {
     /// of two degrees of freedom so trimmed divided out: 1 is at the bound.
     pub bound_ratio: Option<f64>,
     pub ospa_m: f64,
+    /// In all frames together.
+    #[serde(default)]
+    pub emitters: usize,
     pub missed: usize,
     pub invented: usize,
     /// Share of frames with the number of emitters right; the same among frames with all emitters resolvable.
@@ -45,10 +52,11 @@ pub struct Row {
 /// Mean of an exponential variate's smallest 95 %: (1 − 0.05(1 + ln 20))/0.95.
 const TRIMMED_EXPONENTIAL: f64 = 0.842_329_8;
 
-pub(super) fn measure(cell: &Cell, rung: &str, scenes: &[Scene], seed: u64) -> Result<Row, Error> {
+pub(super) fn measure(cell: &Cell, candidate: &Candidate, scenes: &[Scene], seed: u64) -> Result<Row, Error> {
     let camera = cell.camera()?;
     let config = estimate::Config {
-        name: Some(rung.to_owned()),
+        name: Some(candidate.rung.to_owned()),
+        network: candidate.network.as_ref().map(|n| n.path.clone()),
         known_power: Some(cell.known_power(&camera)),
         ..Default::default()
     };
@@ -95,7 +103,8 @@ pub(super) fn measure(cell: &Cell, rung: &str, scenes: &[Scene], seed: u64) -> R
     let emitters = bounds.len().max(1);
     Ok(Row {
         cell: *cell,
-        rung: rung.to_owned(),
+        rung: candidate.label(),
+        training: candidate.training(),
         frames,
         seed,
         mean_m2: mean(&squared),
@@ -104,6 +113,7 @@ pub(super) fn measure(cell: &Cell, rung: &str, scenes: &[Scene], seed: u64) -> R
         bound_median_m2: quantile(&bounds, 0.5),
         bound_ratio: trimmed(&ratios).map(|r| r / TRIMMED_EXPONENTIAL),
         ospa_m: total_ospa / frames.max(1) as f64,
+        emitters,
         missed,
         invented,
         count_right: right as f64 / frames.max(1) as f64,
