@@ -48,7 +48,7 @@ pub(super) fn largest(first: f64, v: &[f64]) -> f64 {
     lanes.iter().chain(rest).fold(first, |a, &x| a.max(x))
 }
 
-/// Writes Σₖ weights[j][k·step]·row(k) to row j of `out`, (K, width), for each of K weightings; the last weight is the last
+/// Writes `Σₖ weights[j][k·step]·row(k)` to row j of `out`, (K, width), for each of K weightings; the last weight is the last
 /// row's. Row k is the `width` numbers, a multiple of 4, from k·stride on. Sums are kept in registers.
 #[inline(always)]
 pub(super) fn combine<const K: usize>(
