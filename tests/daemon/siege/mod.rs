@@ -271,7 +271,6 @@ fn siege_a_thousand_streams_of_which_half_never_read() {
     stop.store(true, Ordering::Relaxed);
     let alive = readers
         .into_iter()
-        .filter(|_| true)
         .map(|r| runtime.block_on(r).unwrap())
         .filter(|a| *a)
         .count();
