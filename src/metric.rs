@@ -49,7 +49,7 @@ pub const HTTP_REQUESTS: &str = "oapwatch_http_requests_total";
 /// Label `route`.
 pub const HTTP_SECONDS: &str = "oapwatch_http_request_duration_seconds";
 pub const HTTP_CONNECTIONS: &str = "oapwatch_http_connections";
-/// Label `reason`: connections, rate, token, host.
+/// Label `reason`: connections, share, rate, token, host, origin.
 pub const HTTP_REFUSED: &str = "oapwatch_http_refused_total";
 /// Label `protocol`: websocket, sse.
 pub const STREAM_CLIENTS: &str = "oapwatch_stream_clients";

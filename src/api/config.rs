@@ -21,7 +21,7 @@ pub struct Config {
     pub allowed_origins: Vec<String>,
     /// Names, beside localhost and plain addresses, that this host is called by when no token is asked for.
     pub allowed_hosts: Vec<String>,
-    /// Connections open at a time, streams included.
+    /// Connections open at a time, streams included; one client holds at most three times as many as are still free.
     pub max_connections: usize,
     /// Requests a client address may make per second, on average.
     pub requests_per_second: u32,

@@ -15,6 +15,7 @@ use governor::{DefaultDirectRateLimiter, Quota, RateLimiter};
 
 use super::config::Config;
 use super::problem::Problem;
+use super::shares::client;
 use crate::metric;
 
 /// Clients share this many buckets by a keyed hash of their address, so that memory is bounded whoever asks.
@@ -110,13 +111,9 @@ impl Rates {
         }
     }
 
-    /// Seconds to wait, if the client has asked too often. One IPv6 client has a whole /64.
-    fn excess(&self, client: IpAddr) -> Option<u64> {
-        let key = match client.to_canonical() {
-            IpAddr::V4(v4) => u128::from(u32::from(v4)),
-            IpAddr::V6(v6) => u128::from(v6) >> 64 << 64 | 1,
-        };
-        let bucket = &self.buckets[self.hasher.hash_one(key) as usize % BUCKETS];
+    /// Seconds to wait, if the client has asked too often.
+    fn excess(&self, address: IpAddr) -> Option<u64> {
+        let bucket = &self.buckets[self.hasher.hash_one(client(address)) as usize % BUCKETS];
         let until = bucket.check().err()?;
         Some(until.wait_time_from(self.clock.now()).as_secs() + 1)
     }

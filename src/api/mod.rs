@@ -21,6 +21,7 @@ mod probes;
 mod problem;
 mod respond;
 mod server;
+mod shares;
 mod snapshot;
 mod sse;
 mod state;

@@ -15,11 +15,11 @@ use hyper_util::rt::{TokioExecutor, TokioTimer};
 use hyper_util::server::conn::auto;
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::net::TcpStream;
-use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio_io_timeout::TimeoutStream;
 
 use super::auth::{TokenError, Tokens};
 use super::config::{Config, ConfigError};
+use super::shares::{Share, Shares};
 use super::state::State;
 use crate::metric;
 
@@ -107,7 +107,7 @@ impl Server {
         let app = super::router(state, &self.config, self.tokens.clone());
         let service = app.into_make_service_with_connect_info::<SocketAddr>();
         let patience = self.config.patience();
-        let connections = Arc::new(Semaphore::new(self.config.max_connections));
+        let connections = Shares::new(self.config.max_connections);
         let mut server = axum_server::from_tcp(listener)?.handle(handle);
         *server.http_builder() = protocol(patience);
         let outcome = match self.tls {
@@ -223,7 +223,7 @@ async fn keep_up(metrics: metrics_exporter_prometheus::PrometheusHandle, tokens:
 #[derive(Clone)]
 struct Limited<A> {
     inner: A,
-    connections: Arc<Semaphore>,
+    connections: Arc<Shares>,
     patience: Duration,
 }
 
@@ -237,9 +237,16 @@ where
     type Future = Pin<Box<dyn Future<Output = io::Result<(Self::Stream, Self::Service)>> + Send>>;
 
     fn accept(&self, stream: TcpStream, service: S) -> Self::Future {
-        let Ok(permit) = self.connections.clone().try_acquire_owned() else {
-            metrics::counter!(metric::HTTP_REFUSED, "reason" => "connections").increment(1);
-            return Box::pin(std::future::ready(Err(io::ErrorKind::ConnectionRefused.into())));
+        let address = match stream.peer_addr() {
+            Ok(address) => address.ip(),
+            Err(e) => return Box::pin(std::future::ready(Err(e))),
+        };
+        let share = match self.connections.take(address) {
+            Ok(share) => share,
+            Err(refused) => {
+                metrics::counter!(metric::HTTP_REFUSED, "reason" => refused.reason()).increment(1);
+                return Box::pin(std::future::ready(Err(io::ErrorKind::ConnectionRefused.into())));
+            }
         };
         let counted = Counted::open();
         let socket = socket2::SockRef::from(&stream);
@@ -259,7 +266,7 @@ where
             let connection = Connection {
                 stream: Box::pin(stream),
                 is_silent: true,
-                _permit: permit,
+                _share: share,
                 _counted: counted,
             };
             Ok((connection, service))
@@ -272,7 +279,7 @@ struct Connection<S> {
     stream: Pin<Box<TimeoutStream<S>>>,
     /// Nothing has been read yet. Once something has, hyper's own clock watches the header, and a stream's pings the rest.
     is_silent: bool,
-    _permit: OwnedSemaphorePermit,
+    _share: Share,
     _counted: Counted,
 }
 

@@ -79,14 +79,12 @@ impl Search {
                 break;
             }
         }
-        let share = if self.sampler.is_some() {
-            LIKELY_IN_OVERLAP
-        } else {
-            LIKELY
-        };
+        let near = pairs(model, MERGE);
         for (gain, index, direction) in self.splits(reading, model).into_iter().take(3) {
+            let has_neighbour = near.iter().any(|&(_, i, j)| i == index || j == index);
+            let share = if has_neighbour { LIKELY_IN_OVERLAP } else { LIKELY };
             if reading.is_explained(model) && gain < share * self.factor * self.price {
-                return;
+                continue;
             }
             let mut next = model.clone();
             let spot = next.spots[index];
