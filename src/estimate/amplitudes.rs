@@ -23,7 +23,7 @@ impl Fitter {
         rhs.resize(sources.max(rhs.len()), 0.0);
         for i in 0..sources {
             for j in 0..=i {
-                gram[i * sources + j] = atoms.overlap(i, j, &reading.weights, &mut self.strip);
+                gram[i * sources + j] = atoms.inner(i, [0, 0], j, [0, 0], &reading.weights, &mut self.strip);
             }
             rhs[i] = atoms.project_value(i, reading.weighted(), &mut self.strip);
             if let Some(power) = atoms.spots.get(i).and_then(|s| s.power) {

@@ -223,26 +223,35 @@ impl Atoms {
         [0, 1].map(|k| [p[k][0].max(q[k][0]), p[k][1].min(q[k][1])])
     }
 
-    /// ⟨f_i, f_j⟩ under `weights` (my, mx), even where that is empty.
+    /// Inner product of source `i`'s derivative, `a[0]` times along x and `a[1]` times along y, with source `j`'s under `weights`
+    /// (my, mx), even where that is empty.
     #[inline(always)]
-    pub fn overlap(&self, i: usize, j: usize, weights: &[f64], scratch: &mut Vec<f64>) -> f64 {
+    pub fn inner(
+        &self,
+        i: usize,
+        a: [usize; 2],
+        j: usize,
+        b: [usize; 2],
+        weights: &[f64],
+        scratch: &mut Vec<f64>,
+    ) -> f64 {
         let [[x0, x1], [y0, y1]] = self.shared(i, j);
         if x0 >= x1 || y0 >= y1 {
             return 0.0;
         }
         let (mx, my) = (self.mx, self.my);
-        let x = |i: usize| &self.x[3 * i * mx + x0..3 * i * mx + x1];
-        let y = |i: usize| &self.y[3 * i * my + y0..3 * i * my + y1];
+        let x = |i: usize, d: usize| &self.x[(3 * i + d) * mx + x0..(3 * i + d) * mx + x1];
+        let y = |i: usize, d: usize| &self.y[(3 * i + d) * my + y0..(3 * i + d) * my + y1];
         if weights.is_empty() {
-            return dot(x(i), x(j)) * dot(y(i), y(j));
+            return dot(x(i, a[0]), x(j, b[0])) * dot(y(i, a[1]), y(j, b[1]));
         }
         scratch.clear();
         scratch.resize(x1 - x0, 0.0);
-        for (c, (a, b)) in y(i).iter().zip(y(j)).enumerate() {
+        for (c, (v, w)) in y(i, a[1]).iter().zip(y(j, b[1])).enumerate() {
             let start = (y0 + c) * mx;
-            axpy(a * b, &weights[start + x0..start + x1], scratch);
+            axpy(v * w, &weights[start + x0..start + x1], scratch);
         }
-        triple(scratch, x(i), x(j))
+        triple(scratch, x(i, a[0]), x(j, b[0]))
     }
 
     /// Inner products of (f′_x f_y, f_x f′_y, f_x f_y) of source `i` with those of source `j`, 3 × 3 row-major.

@@ -37,6 +37,16 @@ impl Serialize for Flags {
     }
 }
 
+/// What a frame says of second moments (xx, xy, yy) that an emitter has beyond one spot's, in σ²: two emitters of equal energy,
+/// d apart in units of σ, have d²/4 along the line between them. Zero where nothing is known.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Bend {
+    /// Derivative of the log likelihood in the moments; its covariance, with one spot, is `information`.
+    pub score: [f64; 3],
+    /// Inverse covariance of the moments, what the rest of the model adjusts taken out.
+    pub information: [[f64; 3]; 3],
+}
+
 /// One fitted light source, placed on the ground.
 #[derive(Clone, Debug, Serialize)]
 pub struct Emitter {
@@ -52,6 +62,8 @@ pub struct Emitter {
     /// Spot centre on the sensor, m.
     #[serde(skip)]
     pub sensor_m: [f64; 2],
+    #[serde(skip)]
+    pub bend: Bend,
     pub flags: Flags,
 }
 

@@ -11,7 +11,7 @@ use std::time::Instant;
 
 use super::atoms::{self, Atoms};
 use super::basis::Basis;
-use super::linear::{axpy, cholesky, dot, invert, solve};
+use super::linear::{axpy, cholesky, dot, solve};
 use super::model::{Model, Nuisances, pull};
 use super::reading::Reading;
 use super::unusable::BadPixel;
@@ -31,8 +31,6 @@ const LARGEST_ACCELERATION: f64 = 0.56 / 4.0;
 const HOPE: f64 = 5.0;
 /// Multiplications that a frame of a few emitters may cost: the same for every run, unlike a clock.
 const MOST_WORK: f64 = 1e8;
-/// What the diagonal of an information matrix is raised by, so that a singular one can be factorised.
-pub(super) const RIDGE: f64 = 1e-13;
 /// Emitters from which on a frame may cost more, with the square of their number.
 const MANY: f64 = 8.0;
 /// Share that the last fit may take beyond.
@@ -46,14 +44,14 @@ pub(super) struct Fitter {
     pub(super) now: Atoms,
     pub(super) trial: Atoms,
     /// Weighted residual, (my, mx).
-    residual: Vec<f64>,
+    pub(super) residual: Vec<f64>,
     trial_residual: Vec<f64>,
     /// The frame's derivatives in the widths, (my, mx), plain and weighted.
-    broadening: [Vec<f64>; 2],
-    weighted: Vec<f64>,
-    hessian: Vec<f64>,
+    pub(super) broadening: [Vec<f64>; 2],
+    pub(super) weighted: Vec<f64>,
+    pub(super) hessian: Vec<f64>,
     pub(super) factor: Vec<f64>,
-    gradient: Vec<f64>,
+    pub(super) gradient: Vec<f64>,
     velocity: Vec<f64>,
     pub(super) acceleration: Vec<f64>,
     pub(super) bend: Vec<f64>,
@@ -158,14 +156,6 @@ impl Fitter {
         &self.residual
     }
 
-    /// Inner products of the residual with each spot's second derivatives (xx, xy, yy): how it is bent there.
-    pub fn curvatures(&mut self, reading: &Reading, model: &mut Model) -> Vec<[f64; 3]> {
-        self.fit(reading, model, 0);
-        (0..model.spots.len())
-            .map(|i| self.now.bend(i, &self.residual, &mut self.strip))
-            .collect()
-    }
-
     /// What `model` expects of the frame, (my, mx).
     pub fn expectation(&mut self, reading: &Reading, model: &mut Model) -> Vec<f64> {
         self.fit(reading, model, 0);
@@ -186,57 +176,6 @@ impl Fitter {
                 axpy(-left * u, ux, &mut residual[c * reading.mx..(c + 1) * reading.mx]);
             }
         }
-    }
-
-    /// Inverse of an information matrix of `n` parameters with `prior` precision added to the spots' positions.
-    pub fn covariance(&mut self, n: usize, spots: usize, prior: f64, out: &mut Vec<f64>) -> bool {
-        self.factor.clear();
-        self.factor.extend_from_slice(&self.hessian[..n * n]);
-        for i in 0..spots {
-            self.factor[3 * i * n + 3 * i] += prior;
-            self.factor[(3 * i + 1) * n + 3 * i + 1] += prior;
-        }
-        for i in 0..n {
-            self.factor[i * n + i] *= 1.0 + RIDGE;
-        }
-        out.clear();
-        out.resize(n * n, 0.0);
-        let factor = &mut self.factor;
-        pulp::Arch::new().dispatch(Inverse { factor, n, out })
-    }
-
-    /// Condition number (1-norm) of an information matrix of `n` parameters, scaled to a unit diagonal (van der Sluis, 1969: no
-    /// other scaling does much better), given its inverse.
-    pub fn condition(&self, n: usize, inverse: &[f64]) -> f64 {
-        let scale = |i: usize| self.hessian[i * n + i].max(1e-300).sqrt();
-        let column = |j: usize| {
-            let (mut direct, mut inverted) = (0.0, 0.0);
-            for i in 0..n {
-                let h = self.hessian[i.min(j) * n + i.max(j)];
-                direct += (h / (scale(i) * scale(j))).abs();
-                inverted += (inverse[i * n + j] * scale(i) * scale(j)).abs();
-            }
-            (direct, inverted)
-        };
-        let (direct, inverted) = (0..n)
-            .map(column)
-            .fold((0.0f64, 0.0f64), |most, c| (most.0.max(c.0), most.1.max(c.1)));
-        (direct * inverted).max(1.0)
-    }
-
-    /// ln det of an information matrix of `n` parameters over its first `size`, with `floor` added to the precision of
-    /// the positions in x and y.
-    pub fn log_det(&mut self, n: usize, size: usize, floor: [f64; 2]) -> Option<f64> {
-        self.factor.clear();
-        for i in 0..size {
-            self.factor.extend_from_slice(&self.hessian[i * n..i * n + size]);
-            self.factor[i * size + i] *= 1.0 + RIDGE;
-            if i % 3 < 2 {
-                self.factor[i * size + i] += floor[i % 3];
-            }
-        }
-        let is_regular = cholesky(&mut self.factor, size);
-        is_regular.then(|| (0..size).map(|i| 2.0 * self.factor[i * size + i].ln()).sum())
     }
 
     #[inline(always)]
@@ -459,22 +398,7 @@ impl Fitter {
         for bad in &reading.bad {
             let row = &mut self.velocity;
             row.resize(p.max(row.len()), 0.0);
-            row[first_width..p].fill(0.0);
-            let mut left = bad.value;
-            for i in 0..sources {
-                let [[x0, x1, x2], [y0, y1, y2]] = atoms.at(i, bad.x, bad.y);
-                let a = atoms.amplitude(i);
-                left -= a * x0 * y0;
-                if i >= n {
-                    row[2 * n + i] = x0 * y0;
-                    continue;
-                }
-                (row[3 * i], row[3 * i + 1], row[3 * i + 2]) = (a * x1 * y0, a * x0 * y1, x0 * y0);
-                if widths > 0 {
-                    row[first_width] += a * atoms.width[0].powi(2) * x2 * y0;
-                    row[p - 1] += a * atoms.width[1].powi(2) * x0 * y2;
-                }
-            }
+            let left = slope_at(bad, atoms, widths, &mut row[..p]);
             for i in (0..p).filter(|&i| row[i] != 0.0) {
                 g[i] -= row[i] * left;
                 let s = -row[i];
@@ -575,6 +499,29 @@ impl Fitter {
     }
 }
 
+/// What an unusable pixel holds beyond the model, and the model's slope there in all parameters.
+#[inline(always)]
+pub(super) fn slope_at(bad: &BadPixel, atoms: &Atoms, widths: usize, row: &mut [f64]) -> f64 {
+    let (n, p) = (atoms.spots.len(), row.len());
+    row[p - widths..].fill(0.0);
+    let mut left = bad.value;
+    for i in 0..atoms.sources() {
+        let [[x0, x1, x2], [y0, y1, y2]] = atoms.at(i, bad.x, bad.y);
+        let a = atoms.amplitude(i);
+        left -= a * x0 * y0;
+        if i >= n {
+            row[2 * n + i] = x0 * y0;
+            continue;
+        }
+        (row[3 * i], row[3 * i + 1], row[3 * i + 2]) = (a * x1 * y0, a * x0 * y1, x0 * y0);
+        if widths > 0 {
+            row[p - widths] += a * atoms.width[0].powi(2) * x2 * y0;
+            row[p - 1] += a * atoms.width[1].powi(2) * x0 * y2;
+        }
+    }
+    left
+}
+
 /// What an unusable pixel holds beyond the model.
 #[inline(always)]
 fn residual_at(bad: &BadPixel, atoms: &Atoms) -> f64 {
@@ -584,25 +531,6 @@ fn residual_at(bad: &BadPixel, atoms: &Atoms) -> f64 {
         left -= atoms.amplitude(i) * x[0] * y[0];
     }
     left
-}
-
-struct Inverse<'a> {
-    factor: &'a mut [f64],
-    n: usize,
-    out: &'a mut [f64],
-}
-
-impl pulp::NullaryFnOnce for Inverse<'_> {
-    type Output = bool;
-
-    #[inline(always)]
-    fn call(self) -> bool {
-        let is_regular = cholesky(self.factor, self.n);
-        if is_regular {
-            invert(self.factor, self.n, self.out);
-        }
-        is_regular
-    }
 }
 
 struct Job<'a> {

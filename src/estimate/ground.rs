@@ -1,11 +1,11 @@
 //! From a fitted model to positions on the ground, each with its covariance and flags.
 
-use super::fit::RIDGE;
+use super::covariance::RIDGE;
 use super::model::Model;
 use super::reading::Reading;
 use super::screen::Screened;
 use super::search::Search;
-use super::{Emitter, Estimate, Flags, spread};
+use super::{Bend, Emitter, Estimate, Flags, spread};
 use crate::optics::Camera;
 
 /// Unusable pixels this near, σ, are told to the reader.
@@ -16,6 +16,8 @@ const EDGE: f64 = 2.0;
 const MOST_CONDITION: f64 = 0.01 / RIDGE;
 /// Two emitters this many standard deviations of their difference apart are two.
 const RESOLVED: f64 = 3.0;
+/// An emitter may be two where a split promises this drop of the deviance, though not the price of another emitter.
+const DOUBTFUL: f64 = 12.0;
 
 /// Turns `model` into what the frame holds.
 pub(super) fn locate(
@@ -49,6 +51,11 @@ pub(super) fn locate(
     } else {
         f64::INFINITY
     };
+    let bends = match is_regular {
+        true => search.fitter.bends(reading, model, &cov),
+        false => vec![Bend::default(); n],
+    };
+    let (bx, by) = (&search.fitter.bx, &search.fitter.by);
     let block = |i: usize, j: usize| {
         if is_regular {
             [0, 1].map(|r| [0, 1].map(|c| cov[(3 * i + r) * p + 3 * j + c]))
@@ -58,7 +65,6 @@ pub(super) fn locate(
         }
     };
     let sigma = camera.spot_sigma_m;
-    let (bx, by) = (&search.fitter.bx, &search.fitter.by);
     let emitters = (0..n)
         .map(|i| {
             let spot = model.spots[i];
@@ -91,7 +97,8 @@ pub(super) fn locate(
                     let d2 = d[0] * d[0] + d[1] * d[1];
                     d2 * d2 < RESOLVED * RESOLVED * inflation * along
                 });
-            flags.set(Flags::UNRESOLVED, is_merged);
+            let may_be_two = bends[i].split(i).is_some_and(|s| s.gain > DOUBTFUL * inflation);
+            flags.set(Flags::UNRESOLVED, is_merged || may_be_two);
             let (mut u, mut own) = (spot.u, own);
             for k in 0..if is_regular { 2 } else { 0 } {
                 if let Some(s) = spread::along([bx, by], k, &spot) {
@@ -119,6 +126,7 @@ pub(super) fn locate(
                 energy_j: spot.a * noise_j,
                 energy_std_j: (energy_variance * inflation).max(0.0).sqrt() * noise_j,
                 sensor_m,
+                bend: bends[i],
                 flags,
             }
         })

@@ -4,9 +4,11 @@
 mod amplitudes;
 mod atoms;
 mod basis;
+mod bend;
 mod bound;
 mod config;
 mod corrected;
+mod covariance;
 #[cfg(test)]
 mod descent;
 mod emitter;
@@ -36,7 +38,7 @@ mod weigh;
 
 pub use bound::{Beside, position_bound, position_bound_beside};
 pub use config::Config;
-pub use emitter::{Emitter, Estimate, Flags};
+pub use emitter::{Bend, Emitter, Estimate, Flags};
 pub use ladder::{ConfigError, DEFAULT, LADDER, Rung, build, rung};
 pub use learned::Learned;
 pub use network::NetworkError;

@@ -1,5 +1,6 @@
 //! The moves that change the number of emitters: add, split, relocate, merge, drop.
 
+use super::bend::Split;
 use super::model::{Model, Spot};
 use super::reading::Reading;
 use super::search::{MOST, Search, TRIAL_STEPS};
@@ -12,12 +13,10 @@ const SEPARATION: f64 = 2.5;
 const MERGE: f64 = 2.5;
 /// Spots that are tried to be done without, a round.
 const FAINTEST: usize = 6;
-/// A split that promises this share of an emitter's price is tried though the frame is explained without: less where spots
-/// overlap, since others then hide part of what it brings.
+/// A split that promises this share of an emitter's price is tried though the frame is explained without.
 const LIKELY: f64 = 0.6;
-const LIKELY_IN_OVERLAP: f64 = 0.1;
-/// A split puts its halves this far to either side, σ.
-const SPLIT: f64 = 0.4;
+/// A split puts its halves at least and at most this far to either side, σ.
+const SPLIT: [f64; 2] = [0.4, 1.0];
 
 impl Search {
     /// The number of emitters of least score: moves from `model` until none helps, then a fit to convergence.
@@ -79,17 +78,20 @@ impl Search {
                 break;
             }
         }
-        let near = pairs(model, MERGE);
-        for (gain, index, direction) in self.splits(reading, model).into_iter().take(3) {
-            let has_neighbour = near.iter().any(|&(_, i, j)| i == index || j == index);
-            let share = if has_neighbour { LIKELY_IN_OVERLAP } else { LIKELY };
-            if reading.is_explained(model) && gain < share * self.factor * self.price {
-                continue;
+        for split in self.splits(reading, model).into_iter().take(3) {
+            if reading.is_explained(model) && split.gain < LIKELY * self.factor * self.price {
+                break;
             }
             let mut next = model.clone();
-            let spot = next.spots[index];
-            let half = |sign: f64| Spot::new([0, 1].map(|k| spot.u[k] + sign * SPLIT * direction[k]), 0.5 * spot.a);
-            next.spots[index] = half(1.0);
+            let spot = next.spots[split.index];
+            let distance = split.distance.clamp(SPLIT[0], SPLIT[1]);
+            let half = |sign: f64| {
+                Spot::new(
+                    [0, 1].map(|k| spot.u[k] + sign * distance * split.direction[k]),
+                    0.5 * spot.a,
+                )
+            };
+            next.spots[split.index] = half(1.0);
             next.spots.push(half(-1.0));
             if self.consider(reading, model, next) {
                 return;
@@ -174,26 +176,20 @@ impl Search {
         (d[0] * d[0] * s[1][1] - 2.0 * d[0] * d[1] * s[0][1] + d[1] * d[1] * s[0][0]) / det.max(1e-300)
     }
 
-    /// Spots whose residual is bent as that of two, with the drop of the deviance that a split may bring at least and the
-    /// direction they lie in; the most bent first.
-    pub(super) fn splits(&mut self, reading: &Reading, model: &mut Model) -> Vec<(f64, usize, [f64; 2])> {
-        let pitch = self.fitter.bx.pitch() * self.fitter.by.pitch();
-        // What amplitude and position leave of a unit spot's second derivative, squared: ½·⟨f, f⟩.
-        let norm = 0.5 * pitch / (4.0 * std::f64::consts::PI);
-        let mut bent: Vec<(f64, usize, [f64; 2])> = self
+    /// Splits that the residual asks for, the most promising first.
+    pub(super) fn splits(&mut self, reading: &Reading, model: &mut Model) -> Vec<Split> {
+        self.fitter.information(reading, model);
+        let mut cov = Vec::new();
+        if !self
             .fitter
-            .curvatures(reading, model)
-            .into_iter()
-            .enumerate()
-            .filter_map(|(i, [xx, xy, yy])| {
-                let (mean, half) = (0.5 * (xx + yy), 0.5 * (xx - yy));
-                let largest = mean + half.hypot(xy);
-                let angle = 0.5 * xy.atan2(half);
-                (largest > 0.0).then(|| (largest * largest / norm, i, [angle.cos(), angle.sin()]))
-            })
-            .collect();
-        bent.sort_by(|a, b| b.0.total_cmp(&a.0));
-        bent
+            .covariance(model.parameters(), model.spots.len(), 1e-9, &mut cov)
+        {
+            return Vec::new();
+        }
+        let bends = self.fitter.bends(reading, model, &cov);
+        let mut splits: Vec<_> = bends.iter().enumerate().filter_map(|(i, b)| b.split(i)).collect();
+        splits.sort_by(|a, b| b.gain.total_cmp(&a.gain));
+        splits
     }
 }
 

@@ -111,7 +111,10 @@ impl Search {
         let directions = self.splits(reading, model);
         for (multiple, index) in bright {
             let spot = model.spots[index];
-            let along = directions.iter().find(|d| d.1 == index).map_or([1.0, 0.0], |d| d.2);
+            let along = directions
+                .iter()
+                .find(|d| d.index == index)
+                .map_or([1.0, 0.0], |d| d.direction);
             let parts = (multiple.round() as usize).max(2);
             for direction in [along, [-along[1], along[0]]] {
                 let mut next = model.clone();

@@ -3,6 +3,7 @@ use std::collections::VecDeque;
 use jiff::Timestamp;
 use nalgebra::{Matrix2, Vector2};
 
+use super::bends::{Bends, Common};
 use super::motion::mahalanobis2;
 use super::tracks::Detection;
 use crate::claims::seconds;
@@ -31,13 +32,15 @@ const MOST_UNREST: f64 = 8.0;
 /// Honest unrest against its own past, and against the other users' median.
 const HONEST_UNREST: f64 = 1.5;
 const UNLIKE_OTHERS: f64 = 4.0;
+/// Share of the chance of a false alert that is for the test with the width: where that says anything it says much.
+const FOR_WIDTH: f64 = 0.1;
 /// Squared sums of second differences of white noise scatter as if only this share of them were independent:
 /// 1/(1 + 2(ρ₁² + ρ₂²)), ρ₁ = −2/3, ρ₂ = 1/6.
 const INDEPENDENT: f64 = 0.514;
 
-/// Whether what looks like one beam may be two: how bright the spot is against its own past, and how it jumps about. Two
-/// beams too near to be told apart show one spot at their centre of light; they fade independently, so the spot is brighter
-/// than before and wanders between the two from frame to frame.
+/// Whether what looks like one beam may be two: how bright the spot is against its own past, how it jumps about and how wide it
+/// is. Two beams too near to be told apart show one spot at their centre of light; they fade independently, so the spot is
+/// brighter than before and wanders between the two from frame to frame; and it is spread along the line between them.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Blend {
     energies: VecDeque<f64>,
@@ -48,6 +51,7 @@ pub(super) struct Blend {
     rest: f64,
     rested: u32,
     last: VecDeque<(Timestamp, Vector2<f64>, Matrix2<f64>)>,
+    pub bends: Bends,
 }
 
 #[derive(Clone, Copy, Debug, Default)]
@@ -71,6 +75,7 @@ pub(super) struct Company {
     /// Medians over the others of the rise in ln energy and of the unrest, where there are enough.
     pub rise: Option<f64>,
     pub unrest: Option<f64>,
+    pub moments: Common,
     /// Scatter of everybody's blocks.
     pub scatter: Scatter,
 }
@@ -84,13 +89,21 @@ pub(super) struct Suspicion {
     /// Frame-to-frame unrest over what is expected.
     pub restless: f64,
     pub unrest_surprise: f64,
+    /// Second moment beyond one spot's, σ².
+    pub wider: f64,
+    pub width_surprise: f64,
 }
 
 impl Suspicion {
-    /// Both at once. With P(Sᵢ > s) ≤ e⁻ˢ and independent energies and positions, P(S₁ + S₂ > s) ≤ (1 + s)·e⁻ˢ.
+    /// All at once. With P(Sᵢ > s) ≤ e⁻ˢ and independent energies, positions and shapes, P(S₁ + S₂ > s) ≤ (1 + s)·e⁻ˢ and
+    /// P(S₁ + S₂ + S₃ > s) ≤ (1 + s + s²/2)·e⁻ˢ. Two beams on top of each other have the shape of one, so that both are asked, the
+    /// latter with a smaller share of the chance.
     pub fn surprise(&self) -> f64 {
-        let sum = self.energy_surprise + self.unrest_surprise;
-        sum - sum.ln_1p()
+        let two = self.energy_surprise + self.unrest_surprise;
+        let three = two + self.width_surprise;
+        let of_two = two - two.ln_1p() + (1.0 - FOR_WIDTH).ln();
+        let of_three = three - (three + 0.5 * three * three).ln_1p() + FOR_WIDTH.ln();
+        of_two.max(of_three).max(0.0)
     }
 }
 
@@ -162,6 +175,7 @@ impl Blend {
     pub fn note(&mut self, detection: &Detection, jump: Option<(Vector2<f64>, Matrix2<f64>)>, learn: bool) {
         let spoilt = Flags::SATURATED | Flags::MASKED | Flags::NEAR_EDGE | Flags::OUT_OF_TIME;
         if detection.energy_j > 0.0 && !detection.flags.intersects(spoilt) {
+            self.bends.note(&detection.moments, learn);
             self.energies.push_back(detection.energy_j.ln());
             if self.energies.len() > LONGEST
                 && let Some(old) = self.energies.pop_front()
@@ -227,6 +241,7 @@ impl Blend {
                 (worst.restless, worst.unrest_surprise) = (restless, s);
             }
         }
+        (worst.wider, worst.width_surprise) = self.bends.surprise(&company.moments);
         worst
     }
 

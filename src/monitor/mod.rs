@@ -2,6 +2,7 @@
 //! no clock in here, so a replay gives the same alerts every time.
 
 mod alert;
+mod bends;
 mod blend;
 mod book;
 mod clock;

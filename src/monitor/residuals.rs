@@ -28,7 +28,7 @@ pub(super) struct Residuals {
     newest: Option<Timestamp>,
 }
 
-/// How far a mean residual lies outside what is tolerated.
+/// How far a weighted mean of residuals lies outside what is tolerated.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Excess {
     /// Half the squared distance from the tolerated disc, in standard deviations: −ln of the bound on its probability.
@@ -85,10 +85,14 @@ impl Residuals {
     pub fn excess(&self, radius_m: f64, floor: &Matrix2<f64>) -> Excess {
         let mut worst = Excess::default();
         for m in WINDOWS.into_iter().take_while(|&m| m <= self.kept.len()) {
-            let of = |f: &dyn Fn(&Residual) -> f64| self.kept.iter().rev().take(m).map(f).sum::<f64>() / m as f64;
+            // Newer residuals weigh more, m : m − 1 : … : 1, since who drifts away is farther now.
+            let all = (m * (m + 1) / 2) as f64;
+            let weighted = || (0..m).rev().map(|k| (k + 1) as f64 / all).zip(self.kept.iter().rev());
+            let of = |f: &dyn Fn(&Residual) -> f64| weighted().map(|(w, r)| w * f(r)).sum::<f64>();
             let mean = Vector2::new(of(&|r| r.offset.x), of(&|r| r.offset.y));
             let beam = Matrix2::from_fn(|i, j| of(&|r| r.beam[(i, j)]));
-            let claim = of(&|r| r.claim) * (COMMON_SHARE + (1.0 - COMMON_SHARE) / m as f64);
+            let own: f64 = weighted().map(|(w, r)| w * w * r.claim).sum();
+            let claim = COMMON_SHARE * of(&|r| r.claim) + (1.0 - COMMON_SHARE) * own;
             let cov = beam + Matrix2::identity() * claim + floor;
             let s = surprise(mean, &cov, radius_m);
             if s > worst.surprise || m == 1 {

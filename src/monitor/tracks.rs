@@ -3,6 +3,7 @@ use std::collections::VecDeque;
 use jiff::Timestamp;
 use nalgebra::{Matrix2, Vector2};
 
+use super::bends::Moments;
 use super::motion::{Motion, largest_eigenvalue, mahalanobis2};
 use crate::assign::assign;
 use crate::claims::seconds;
@@ -36,6 +37,7 @@ pub(super) struct Detection {
     pub cov: Matrix2<f64>,
     pub energy_j: f64,
     pub flags: Flags,
+    pub moments: Moments,
     /// Distance within which a second emitter of like energy cannot be told apart, m.
     pub resolution_m: f64,
     /// How probable a spurious detection is here in a frame.
@@ -103,6 +105,7 @@ impl Detection {
                     cov,
                     energy_j: e.energy_j,
                     flags: e.flags,
+                    moments: Moments::of(&e.bend, inflation),
                     resolution_m: resolution_m(camera, e.energy_j),
                     ghost: 0.0,
                 }

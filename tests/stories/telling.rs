@@ -4,11 +4,12 @@ use std::collections::BTreeMap;
 
 use oapwatch::claim::{Claim, ClaimState};
 use oapwatch::claims::{self, Store};
-use oapwatch::estimate::{Emitter, Error, Estimate, Flags};
+use oapwatch::estimate::{Bend, Emitter, Error, Estimate, Flags};
 use oapwatch::monitor::{AlertEvent, AlertEventKind, AlertKind, AlertState, Monitor, Observation, Report, Source};
+use oapwatch::optics::Camera;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use rand_distr::{Distribution, Normal};
+use rand_distr::{Distribution, Normal, StandardNormal};
 
 use super::{Sensor, Story, at, camera, expected, start};
 
@@ -59,6 +60,32 @@ impl Told {
     }
 }
 
+/// Light that is one spot.
+struct Blob {
+    place: [f64; 2],
+    energy_j: f64,
+    /// Of the brightest of them.
+    brightest_j: f64,
+    /// Second moments about the centre of light: xx, xy, yy.
+    moments_m2: [f64; 3],
+}
+
+/// What a fit of one spot would say of the second moments. For a Gaussian spot their information is ¼, ½ and ¼ of that of a
+/// coordinate, in units of σ: ⟨f_xx, f_xx⟩ less what the amplitude takes is half of ⟨f, f⟩, as is ⟨f_x, f_x⟩. The story's error of
+/// positions is one beam's; information grows with the square of the energy.
+fn bend(blob: &Blob, story: &Story, camera: &Camera, rng: &mut ChaCha8Rng) -> Bend {
+    let sigma_m = camera.spot_sigma_m * camera.ground_scale();
+    let coordinate = (sigma_m / story.position_std_m * blob.energy_j / blob.brightest_j).powi(2);
+    let mut bend = Bend::default();
+    for (k, share) in [0.25, 0.5, 0.25].into_iter().enumerate() {
+        let information = share * coordinate;
+        let z: f64 = StandardNormal.sample(rng);
+        bend.score[k] = information * blob.moments_m2[k] / sigma_m.powi(2) + information.sqrt() * z;
+        bend.information[k][k] = information;
+    }
+    bend
+}
+
 /// Detections of one frame: beams that are too near each other melt into one.
 fn detect(story: &Story, t: f64, rng: &mut ChaCha8Rng) -> Vec<Emitter> {
     let camera = camera();
@@ -78,23 +105,36 @@ fn detect(story: &Story, t: f64, rng: &mut ChaCha8Rng) -> Vec<Emitter> {
     if rng.random::<f64>() < story.ghosts {
         spots.push(([rng.random_range(-120.0..120.0), rng.random_range(-120.0..120.0)], 1e-3));
     }
-    let mut merged: Vec<([f64; 2], f64)> = Vec::new();
+    let mut merged: Vec<Blob> = Vec::new();
     'spots: for (p, energy) in spots {
-        for (q, sum) in &mut merged {
-            if (p[0] - q[0]).hypot(p[1] - q[1]) < story.resolution_m {
-                let share = energy / (*sum + energy);
-                *q = [q[0] + share * (p[0] - q[0]), q[1] + share * (p[1] - q[1])];
-                *sum += energy;
+        for blob in &mut merged {
+            let [x, y] = [p[0] - blob.place[0], p[1] - blob.place[1]];
+            if x.hypot(y) < story.resolution_m {
+                let share = energy / (blob.energy_j + energy);
+                blob.place = [blob.place[0] + share * x, blob.place[1] + share * y];
+                blob.energy_j += energy;
+                blob.brightest_j = blob.brightest_j.max(energy);
+                for (m, d) in blob.moments_m2.iter_mut().zip([x * x, x * y, y * y]) {
+                    *m = (1.0 - share) * *m + share * (1.0 - share) * d;
+                }
                 continue 'spots;
             }
         }
-        merged.push((p, energy));
+        merged.push(Blob {
+            place: p,
+            energy_j: energy,
+            brightest_j: energy,
+            moments_m2: [0.0; 3],
+        });
     }
+    // A stream of its own: the other draws stay what they are without it.
+    let mut shapes = ChaCha8Rng::seed_from_u64(story.seed ^ t.to_bits());
     let error = Normal::new(0.0, story.position_std_m).unwrap();
     merged
         .into_iter()
-        .map(|(p, energy_j)| {
+        .map(|blob| {
             let variance = story.position_std_m.powi(2);
+            let (p, energy_j) = (blob.place, blob.energy_j);
             let (x_m, y_m) = (p[0] + error.sample(rng), p[1] + error.sample(rng));
             Emitter {
                 x_m,
@@ -103,6 +143,7 @@ fn detect(story: &Story, t: f64, rng: &mut ChaCha8Rng) -> Vec<Emitter> {
                 energy_j,
                 energy_std_j: 1e-5,
                 sensor_m: camera.to_sensor([x_m, y_m]),
+                bend: bend(&blob, story, &camera, &mut shapes),
                 flags: Flags::empty(),
             }
         })

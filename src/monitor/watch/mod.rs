@@ -1,7 +1,7 @@
 //! The monitor: one frame after another through the steps that lead to verdicts, one file a step.
 
 mod answers;
-mod habits;
+pub(super) mod habits;
 mod inputs;
 mod spots;
 mod summary;

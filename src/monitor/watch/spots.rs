@@ -7,6 +7,7 @@ use serde_json::json;
 use super::habits::median;
 use super::{ESCALATE_S, Monitor};
 use crate::claims::seconds;
+use crate::monitor::bends::Common;
 use crate::monitor::blend::{Blend, Company, Scatter};
 use crate::monitor::book::{Cause, Finding};
 use crate::monitor::tracks::Track;
@@ -67,6 +68,7 @@ impl Monitor {
                     "past_ln_std": past.map(|p| p.1),
                 },
                 "unrest_over_the_expected": { "ratio": seen.restless, "surprise": seen.unrest_surprise },
+                "width_over_the_expected": { "moment_in_sigma2": seen.wider, "surprise": seen.width_surprise },
                 "surprise": seen.surprise(),
                 "threshold": level,
                 "flags": track.detection.flags,
@@ -155,6 +157,7 @@ impl Monitor {
         };
         let scatters = blends.iter().map(|(_, b)| b.scatter());
         Company {
+            moments: Common::of(others().map(|b| &b.bends)),
             rise: enough(others().filter_map(|b| b.recent_rise()).collect()),
             unrest: enough(others().filter_map(|b| b.recent_unrest()).collect()),
             scatter: scatters.fold(Scatter::default(), |sum, s| Scatter {

@@ -13,8 +13,9 @@ use crate::monitor::{AlertKind, Severity};
 
 /// ln likelihood ratio from which a user counts as vanished: three frames in a row.
 const VANISHED: f64 = 6.9;
-/// Share of the time to decide that a beam waits for its claim; the rest is for frames that miss it.
-const PATIENCE: f64 = 0.85;
+/// Share of the time to decide that a beam waits for its claim; the rest is for frames that miss it, and for a beam that comes on
+/// within another's spot and is seen only as it walks out.
+const PATIENCE: f64 = 0.65;
 
 impl Monitor {
     /// Notes since when each beam has had no claim.

@@ -5,7 +5,7 @@ use jiff::{SignedDuration, Timestamp};
 use super::trial::camera;
 use super::{Case, Observed};
 use crate::claims::{self, Claim, ClaimState, Store};
-use crate::estimate::{Emitter, Estimate, Flags};
+use crate::estimate::{Bend, Emitter, Estimate, Flags};
 use crate::monitor::{self, Monitor, Observation, Source};
 use crate::optics::Camera;
 
@@ -137,6 +137,7 @@ fn emitter(camera: &Camera, frame: u64, [x_m, y_m]: [f64; 2], cov_m2: [[f64; 2];
         energy_j: 7e-3,
         energy_std_j: 1e-5,
         sensor_m: camera.to_sensor([x_m, y_m]),
+        bend: Bend::default(),
         flags: Flags::empty(),
     }
 }
