@@ -31,8 +31,9 @@ const LARGEST_ACCELERATION: f64 = 0.56 / 4.0;
 const HOPE: f64 = 5.0;
 /// Multiplications that a frame of a few emitters may cost: the same for every run, unlike a clock.
 const MOST_WORK: f64 = 1e8;
-/// Emitters from which on a frame may cost more, with the square of their number.
+/// Emitters from which on a frame may cost more, with the square of their number, and up to how many times as many.
 const MANY: f64 = 8.0;
+const MOST_TIMES: f64 = 5.0;
 /// Share that the last fit may take beyond.
 const BEYOND: f64 = 1.2;
 
@@ -112,7 +113,7 @@ impl Fitter {
     }
 
     fn most_work(&self) -> f64 {
-        MOST_WORK * (self.most_sources / MANY).max(1.0).powi(2)
+        MOST_WORK * (self.most_sources / MANY).clamp(1.0, MOST_TIMES).powi(2)
     }
 
     /// Whether the frame has had its share of work, or of time where a budget is set.

@@ -210,17 +210,19 @@ impl Inspection {
                 if frame.is_bad[k] {
                     continue;
                 }
-                let (mut sum, mut count) = (0.0, 0.0);
+                let (mut sum, mut count, mut most) = (0.0, 0.0, 0.0f64);
                 for (a, b) in [(x.wrapping_sub(1), y), (x + 1, y), (x, y.wrapping_sub(1)), (x, y + 1)] {
                     if a < nx && b < ny && !frame.is_bad[b * nx + a] {
                         sum += left[b * nx + a];
                         count += 1.0;
+                        most = most.max(left[b * nx + a].abs());
                     }
                 }
                 let beyond = (left[k] - if count > 0.0 { sum / count } else { 0.0 }).abs();
                 let noise = reading.growth.at(self.smooth[k]).sqrt();
                 // The mean of four neighbours adds a quarter of their variance.
-                if beyond > OUTLIER * noise * 1.12 && beyond > 0.8 * left[k].abs() && left[k].abs() > 0.6 * beyond {
+                let is_alone = beyond > 0.8 * left[k].abs() && left[k].abs() > 0.6 * beyond.max(most);
+                if is_alone && beyond > OUTLIER * noise * 1.12 {
                     found.push((x, y));
                 }
             }
