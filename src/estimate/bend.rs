@@ -4,8 +4,9 @@
 
 use super::Bend;
 use super::atoms::Atoms;
-use super::fit::{Fitter, slope_at};
+use super::fit::Fitter;
 use super::linear::{axpy, dot};
+use super::linearise::slope_at;
 use super::model::Model;
 use super::reading::Reading;
 

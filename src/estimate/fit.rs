@@ -11,7 +11,7 @@ use std::time::Instant;
 
 use super::atoms::{self, Atoms};
 use super::basis::Basis;
-use super::linear::{axpy, cholesky, dot, solve};
+use super::linear::{axpy, dot};
 use super::model::{Model, Nuisances, pull};
 use super::reading::Reading;
 use super::unusable::BadPixel;
@@ -25,8 +25,6 @@ const SMALL_DROP: f64 = 1e-3;
 const NO_DROP: f64 = 1e-4;
 /// Spots farther apart than this, σ, along either axis need no curved steps.
 const OVERLAP: f64 = 3.0;
-/// |acceleration|² over |velocity|² above which a step is not trusted (Transtrum and Sethna, 2012, eq. 15).
-const LARGEST_ACCELERATION: f64 = 0.56 / 4.0;
 /// A bar is out of reach when this many times the drop that a quadratic promises does not get there.
 const HOPE: f64 = 5.0;
 /// Multiplications that a frame of a few emitters may cost: the same for every run, unlike a clock.
@@ -41,7 +39,7 @@ const BEYOND: f64 = 1.2;
 pub(super) struct Fitter {
     pub bx: Basis,
     pub by: Basis,
-    backgrounds: [[Vec<f64>; 2]; 2],
+    pub(super) backgrounds: [[Vec<f64>; 2]; 2],
     pub(super) now: Atoms,
     pub(super) trial: Atoms,
     /// Weighted residual, (my, mx).
@@ -53,7 +51,7 @@ pub(super) struct Fitter {
     pub(super) hessian: Vec<f64>,
     pub(super) factor: Vec<f64>,
     pub(super) gradient: Vec<f64>,
-    velocity: Vec<f64>,
+    pub(super) velocity: Vec<f64>,
     pub(super) acceleration: Vec<f64>,
     pub(super) bend: Vec<f64>,
     pub(super) scratch: Vec<f64>,
@@ -308,219 +306,6 @@ impl Fitter {
         }
         deviance
     }
-
-    /// Gradient Jᵀr and information JᵀJ at the present hypothesis.
-    #[inline(always)]
-    fn linearise(&mut self, reading: &Reading, nuisances: Nuisances) {
-        let (mx, my) = (reading.mx, reading.my);
-        let n = self.now.spots.len();
-        let p = 3 * n + nuisances.count();
-        let atoms = &self.now;
-        let sources = atoms.sources();
-        let h = &mut self.hessian;
-        h.resize(p * p, 0.0);
-        let g = &mut self.gradient;
-        g.resize(p.max(g.len()), 0.0);
-        for i in 0..sources {
-            let ai = atoms.amplitude(i);
-            for j in i..sources {
-                let aj = atoms.amplitude(j);
-                let c = atoms.couple(i, j, &reading.weights, &mut self.strip);
-                if j < n {
-                    let block = [
-                        ai * aj * c[0],
-                        ai * aj * c[1],
-                        ai * c[2],
-                        ai * aj * c[3],
-                        ai * aj * c[4],
-                        ai * c[5],
-                        aj * c[6],
-                        aj * c[7],
-                        c[8],
-                    ];
-                    for r in 0..3 {
-                        h[(3 * i + r) * p + 3 * j..(3 * i + r) * p + 3 * j + 3]
-                            .copy_from_slice(&block[3 * r..3 * r + 3]);
-                    }
-                } else if i < n {
-                    for (r, v) in [ai * c[2], ai * c[5], c[8]].into_iter().enumerate() {
-                        h[(3 * i + r) * p + 2 * n + j] = v;
-                    }
-                } else {
-                    h[(2 * n + i) * p + 2 * n + j] = c[8];
-                }
-            }
-            let s = atoms.project(i, &self.residual, &mut self.strip);
-            if i < n {
-                (g[3 * i], g[3 * i + 1], g[3 * i + 2]) = (ai * s[1], ai * s[2], s[0]);
-                if let Some(power) = atoms.spots[i].power {
-                    h[(3 * i + 2) * p + 3 * i + 2] += power.precision;
-                    g[3 * i + 2] += power.precision * (power.mean - ai);
-                }
-            } else {
-                g[2 * n + i] = s[0];
-            }
-        }
-        let widths = nuisances.widths();
-        let first_width = p - widths;
-        for d in &mut self.broadening[..widths] {
-            d.clear();
-            d.resize(mx * my, 0.0);
-        }
-        // ∂/∂ln w of a spot is w² f″ (the heat equation).
-        for i in 0..if widths > 0 { n } else { 0 } {
-            let [ax, ay] = atoms.width.map(|w| atoms.spots[i].a * w * w);
-            atoms.add(i, 2, 0, ax, &mut self.broadening[0]);
-            atoms.add(i, 0, 2, ay, &mut self.broadening[widths - 1]);
-        }
-        for w in 0..widths {
-            let weighted = &mut self.weighted;
-            weighted.clone_from(&self.broadening[w]);
-            for (d, w) in weighted.iter_mut().zip(&reading.weights) {
-                *d *= w;
-            }
-            let column = first_width + w;
-            for i in 0..sources {
-                let s = atoms.project(i, weighted, &mut self.strip);
-                if i < n {
-                    let a = atoms.spots[i].a;
-                    for (r, v) in [a * s[1], a * s[2], s[0]].into_iter().enumerate() {
-                        h[(3 * i + r) * p + column] = v;
-                    }
-                } else {
-                    h[(2 * n + i) * p + column] = s[0];
-                }
-            }
-            for v in 0..=w {
-                h[(first_width + v) * p + column] = dot(weighted, &self.broadening[v]);
-            }
-            g[first_width + w] = dot(&self.broadening[w], &self.residual);
-        }
-        for bad in &reading.bad {
-            let row = &mut self.velocity;
-            row.resize(p.max(row.len()), 0.0);
-            let left = slope_at(bad, atoms, widths, &mut row[..p]);
-            for i in (0..p).filter(|&i| row[i] != 0.0) {
-                g[i] -= row[i] * left;
-                let s = -row[i];
-                axpy(s, &row[i..p], &mut h[i * p + i..(i + 1) * p]);
-            }
-        }
-    }
-
-    /// Sets the trial hypothesis one damped, accelerated step away. `false` where no step could be had.
-    #[inline(always)]
-    fn step(&mut self, reading: &Reading, nuisances: Nuisances, lambda: f64, overlap: bool) -> bool {
-        let n = self.now.spots.len();
-        let p = 3 * n + nuisances.count();
-        self.factor.clear();
-        self.factor.extend_from_slice(&self.hessian[..p * p]);
-        for i in 0..p {
-            self.factor[i * p + i] = self.factor[i * p + i].max(1e-30) * (1.0 + lambda + 1e-14);
-        }
-        if !cholesky(&mut self.factor, p) {
-            return false;
-        }
-        self.velocity.clear();
-        self.velocity.extend_from_slice(&self.gradient[..p]);
-        solve(&self.factor, p, &mut self.velocity);
-        if overlap {
-            self.accelerate(reading, nuisances, p);
-        } else {
-            self.acceleration.clear();
-            self.acceleration.resize(p, 0.0);
-        }
-        let (mut speed, mut turn) = (0.0, 0.0);
-        for i in 0..p {
-            let scale = self.hessian[i * p + i];
-            speed += scale * self.velocity[i].powi(2);
-            turn += scale * self.acceleration[i].powi(2);
-        }
-        let is_trusted = turn <= LARGEST_ACCELERATION * speed;
-        let delta = |i: usize| {
-            let d = self.velocity[i] + if is_trusted { 0.5 * self.acceleration[i] } else { 0.0 };
-            d.clamp(-1.0, 1.0)
-        };
-        let trial = &mut self.trial;
-        trial.spots.clone_from(&self.now.spots);
-        for (i, s) in trial.spots.iter_mut().enumerate() {
-            s.u[0] = (s.u[0] + delta(3 * i)).clamp(self.bx.lowest(), self.bx.highest());
-            s.u[1] = (s.u[1] + delta(3 * i + 1)).clamp(self.by.lowest(), self.by.highest());
-        }
-        trial.background = self.now.background;
-        trial.width = self.now.width;
-        let widths = nuisances.widths();
-        for w in 0..if widths > 0 { 2 } else { 0 } {
-            let d = delta(p - widths + w.min(widths - 1)).clamp(-0.1, 0.1);
-            trial.width[w] = (self.now.width[w] * d.exp()).clamp(0.5, 2.0);
-        }
-        true
-    }
-
-    /// Geodesic acceleration a = −(JᵀJ + λD)⁻¹ Jᵀ M_vv, with M_vv the model's second derivative along the velocity.
-    #[inline(always)]
-    fn accelerate(&mut self, reading: &Reading, nuisances: Nuisances, p: usize) {
-        let atoms = &self.now;
-        let n = atoms.spots.len();
-        let bend = &mut self.bend;
-        bend.clear();
-        bend.resize(reading.mx * reading.my, 0.0);
-        for i in 0..n {
-            let a = atoms.spots[i].a;
-            let (vx, vy, va) = (self.velocity[3 * i], self.velocity[3 * i + 1], self.velocity[3 * i + 2]);
-            atoms.add_bent(
-                i,
-                [a * vx * vx, 2.0 * va * vx],
-                [2.0 * a * vx * vy, 2.0 * va * vy],
-                a * vy * vy,
-                &mut self.scratch,
-                bend,
-            );
-        }
-        for (b, w) in bend.iter_mut().zip(&reading.weights) {
-            *b *= w;
-        }
-        self.acceleration.clear();
-        self.acceleration.resize(p, 0.0);
-        let out = &mut self.acceleration;
-        for i in 0..atoms.sources() {
-            let s = atoms.project(i, bend, &mut self.strip);
-            if i < n {
-                let a = atoms.spots[i].a;
-                (out[3 * i], out[3 * i + 1], out[3 * i + 2]) = (-a * s[1], -a * s[2], -s[0]);
-            } else {
-                out[2 * n + i] = -s[0];
-            }
-        }
-        let widths = nuisances.widths();
-        for w in 0..widths {
-            out[p - widths + w] = -dot(&self.broadening[w], bend);
-        }
-        solve(&self.factor, p, out);
-    }
-}
-
-/// What an unusable pixel holds beyond the model, and the model's slope there in all parameters.
-#[inline(always)]
-pub(super) fn slope_at(bad: &BadPixel, atoms: &Atoms, widths: usize, row: &mut [f64]) -> f64 {
-    let (n, p) = (atoms.spots.len(), row.len());
-    row[p - widths..].fill(0.0);
-    let mut left = bad.value;
-    for i in 0..atoms.sources() {
-        let [[x0, x1, x2], [y0, y1, y2]] = atoms.at(i, bad.x, bad.y);
-        let a = atoms.amplitude(i);
-        left -= a * x0 * y0;
-        if i >= n {
-            row[2 * n + i] = x0 * y0;
-            continue;
-        }
-        (row[3 * i], row[3 * i + 1], row[3 * i + 2]) = (a * x1 * y0, a * x0 * y1, x0 * y0);
-        if widths > 0 {
-            row[p - widths] += a * atoms.width[0].powi(2) * x2 * y0;
-            row[p - 1] += a * atoms.width[1].powi(2) * x0 * y2;
-        }
-    }
-    left
 }
 
 /// What an unusable pixel holds beyond the model.

@@ -18,6 +18,7 @@ mod heatmap;
 mod ladder;
 mod learned;
 mod linear;
+mod linearise;
 mod model;
 mod moves;
 mod network;
@@ -33,6 +34,7 @@ mod spot;
 mod spread;
 #[doc(hidden)]
 pub mod stages;
+mod step;
 mod unusable;
 mod weigh;
 
