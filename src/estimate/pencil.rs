@@ -22,6 +22,8 @@ const SPACING: f64 = 0.33;
 const CENTRES: f64 = 8.0;
 /// Sensors wider than this, σ, are not for the pencil.
 const WIDEST: f64 = 13.0;
+/// Samples are held to the Gaussian no better than the noise of a bright spot lets them; without, many columns only amplify it.
+const FAINTEST: f64 = 1e-5;
 /// Frames of noise by which singular values are judged.
 const DRAWS: usize = 6;
 /// The mix of the two shifts whose eigenvectors are taken; any generic one does.
@@ -122,8 +124,9 @@ impl Sampler {
                 atoms[(j, c)] = atom[c];
             }
         }
+        let held = basis.tail(rank).max(FAINTEST);
         for c in 0..rank {
-            atoms[(centres + c, c)] = basis.tail(rank).max(1e-14);
+            atoms[(centres + c, c)] = held;
         }
         let samples = Mat::from_fn(centres + rank, self.count[k], |j, i| {
             let d = self.first[k] + i as f64 * self.spacing[k] - at(j.min(centres - 1));
