@@ -7,6 +7,7 @@ use super::users::claimed;
 use crate::claims::{Store, seconds};
 use crate::monitor::book::{Cause, Finding};
 use crate::monitor::residuals::surprise;
+use crate::monitor::thresholds::Family;
 use crate::monitor::users::Asserted;
 use crate::monitor::{AlertKind, Severity};
 
@@ -88,7 +89,7 @@ impl Monitor {
         let (agreeing, of) = self.pose.support();
         let (place, worst) = self.worst_displacement();
         let surprise = surprise(worst, &self.floor(place), limit);
-        let level = self.thresholds.level(1.0);
+        let level = self.thresholds.level(Family::Pose, 1.0);
         let is_open = self.book.is_open(&cause);
         if surprise > level || (is_open && worst.norm() > 0.9 * limit) {
             let severity = if worst.norm() > 4.0 * limit {

@@ -17,7 +17,7 @@ use super::blend::Blend;
 use super::book::{Book, Cause, Finding};
 use super::pose::Pose;
 use super::sight::Sight;
-use super::thresholds::Thresholds;
+use super::thresholds::{Family, Thresholds};
 use super::tracks::{Detection, Track, Tracks};
 use super::users::{Asserted, CLAIM_LIFE_S, User};
 use super::{Alert, AlertEvent, AlertKind, Config, Observation, Report, Source};
@@ -66,7 +66,7 @@ pub struct Monitor {
 impl Monitor {
     pub fn new(config: &Config, claims: &crate::claims::Config, camera: &Camera, source: Source) -> Self {
         let thresholds = Thresholds::new(config, source.rate_hz);
-        let level_unclaimed = thresholds.level(1.0);
+        let level_unclaimed = thresholds.level(Family::Unclaimed, 1.0);
         Self {
             camera: camera.clone(),
             default_sigma_m: claims.default_sigma_m,

@@ -10,6 +10,7 @@ use crate::claims::seconds;
 use crate::monitor::bends::Common;
 use crate::monitor::blend::{Blend, Company, Scatter};
 use crate::monitor::book::{Cause, Finding};
+use crate::monitor::thresholds::Family;
 use crate::monitor::tracks::Track;
 use crate::monitor::users::Asserted;
 use crate::monitor::{AlertKind, Severity};
@@ -24,7 +25,7 @@ const BESIDE: f64 = 3.0;
 impl Monitor {
     /// Looks for a second beam within each user's spot.
     pub(super) fn decide_spots(&mut self, asserted: &[Asserted], answers: &[Option<u64>], now: Timestamp) {
-        let level = self.thresholds.level(asserted.len() as f64);
+        let level = self.thresholds.level(Family::Blended, asserted.len() as f64);
         let watched: Vec<(usize, Track)> = (0..asserted.len())
             .filter_map(|i| Some((i, self.tracks.get(answers[i]?)?.clone())))
             .filter(|(i, t)| t.hit && t.confirmed && !self.is_shared(*i, t, asserted, answers))

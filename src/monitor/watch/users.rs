@@ -8,6 +8,7 @@ use super::{COINCIDENCE_S, ESCALATE_S, Monitor, SYSTEMATIC_M};
 use crate::claims::seconds;
 use crate::monitor::book::{Cause, Finding};
 use crate::monitor::residuals::{WINDOWS, surprise};
+use crate::monitor::thresholds::Family;
 use crate::monitor::users::{Asserted, User};
 use crate::monitor::{AlertKind, Severity};
 
@@ -31,7 +32,7 @@ impl Monitor {
     /// Adds the frame's and the new claims' evidence to what is known of each user.
     pub(super) fn weigh(&mut self, asserted: &[Asserted], answers: &[Option<u64>], now: Timestamp) {
         let tolerated = self.config.tolerated_distance_m;
-        let gate = self.thresholds.level(asserted.len() as f64);
+        let gate = self.thresholds.level(Family::Mismatch, asserted.len() as f64);
         let displacement = self.pose.displacement();
         let unsure_s = self.unsure_of_clock_s(now);
         // Before everybody has claimed once our own pose and the log's clock are not known.
@@ -98,8 +99,10 @@ impl Monitor {
     }
     pub(super) fn decide_users(&mut self, asserted: &[Asserted], answers: &[Option<u64>], now: Timestamp) {
         let each = (asserted.len() * WINDOWS.len()) as f64;
-        let level = self.thresholds.level_every(self.period_s.unwrap_or(0.0), each);
-        let level_unseen = self.thresholds.level(asserted.len() as f64);
+        let level = self
+            .thresholds
+            .level_every(self.period_s.unwrap_or(0.0), Family::Mismatch, each);
+        let level_unseen = self.thresholds.level(Family::Unseen, asserted.len() as f64);
         let mut strangers = Strangers::default();
         for (a, answer) in asserted.iter().zip(answers) {
             self.decide_mismatch(a, *answer, level, now);
