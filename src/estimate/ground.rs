@@ -18,6 +18,8 @@ const MOST_CONDITION: f64 = 0.01 / RIDGE;
 const RESOLVED: f64 = 3.0;
 /// An emitter may be two where a split promises this drop of the deviance, though not the price of another emitter.
 const DOUBTFUL: f64 = 12.0;
+/// What one hides another emitter in moves those nearer than this, σ, too.
+const TOUCHING: f64 = 2.0;
 
 /// Turns `model` into what the frame holds.
 pub(super) fn locate(
@@ -56,6 +58,11 @@ pub(super) fn locate(
         false => vec![Bend::default(); n],
     };
     let (bx, by) = (&search.fitter.bx, &search.fitter.by);
+    let may_be_two: Vec<bool> = bends
+        .iter()
+        .enumerate()
+        .map(|(i, b)| b.split(i).is_some_and(|s| s.gain > DOUBTFUL * inflation))
+        .collect();
     let block = |i: usize, j: usize| {
         if is_regular {
             [0, 1].map(|r| [0, 1].map(|c| cov[(3 * i + r) * p + 3 * j + c]))
@@ -97,8 +104,11 @@ pub(super) fn locate(
                     let d2 = d[0] * d[0] + d[1] * d[1];
                     d2 * d2 < RESOLVED * RESOLVED * inflation * along
                 });
-            let may_be_two = bends[i].split(i).is_some_and(|s| s.gain > DOUBTFUL * inflation);
-            flags.set(Flags::UNRESOLVED, is_merged || may_be_two);
+            let is_beside_two = (0..n).filter(|&j| may_be_two[j]).any(|j| {
+                let d = [0, 1].map(|k| spot.u[k] - model.spots[j].u[k]);
+                d[0].hypot(d[1]) < TOUCHING
+            });
+            flags.set(Flags::UNRESOLVED, is_merged || is_beside_two);
             let (mut u, mut own) = (spot.u, own);
             for k in 0..if is_regular { 2 } else { 0 } {
                 if let Some(s) = spread::along([bx, by], k, &spot) {
