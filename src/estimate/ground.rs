@@ -17,9 +17,9 @@ const MOST_CONDITION: f64 = 0.01 / RIDGE;
 /// Two emitters this many standard deviations of their difference apart are two.
 const RESOLVED: f64 = 3.0;
 /// An emitter may be two where a split promises this drop of the deviance, though not the price of another emitter.
-const DOUBTFUL: f64 = 12.0;
-/// What one hides another emitter in moves those nearer than this, σ, too.
-const TOUCHING: f64 = 2.0;
+const DOUBTFUL: f64 = 10.0;
+/// Emitters nearer than this, σ, to such a one, or to a pair that is not resolved, may be displaced by it.
+const TOUCHING: f64 = 2.5;
 
 /// Turns `model` into what the frame holds.
 pub(super) fn locate(
@@ -58,11 +58,6 @@ pub(super) fn locate(
         false => vec![Bend::default(); n],
     };
     let (bx, by) = (&search.fitter.bx, &search.fitter.by);
-    let may_be_two: Vec<bool> = bends
-        .iter()
-        .enumerate()
-        .map(|(i, b)| b.split(i).is_some_and(|s| s.gain > DOUBTFUL * inflation))
-        .collect();
     let block = |i: usize, j: usize| {
         if is_regular {
             [0, 1].map(|r| [0, 1].map(|c| cov[(3 * i + r) * p + 3 * j + c]))
@@ -71,6 +66,19 @@ pub(super) fn locate(
             [[v, 0.0], [0.0, v]]
         }
     };
+    let is_merged = |i: usize| {
+        let own = block(i, i);
+        (0..n).filter(|&j| j != i).any(|j| {
+            let d = [0, 1].map(|k| model.spots[i].u[k] - model.spots[j].u[k]);
+            let (other, cross) = (block(j, j), block(i, j));
+            let s = [0, 1].map(|r| [0, 1].map(|c| own[r][c] + other[r][c] - cross[r][c] - cross[c][r]));
+            let along: f64 = (0..2).map(|r| (0..2).map(|c| d[r] * s[r][c] * d[c]).sum::<f64>()).sum();
+            let d2 = d[0] * d[0] + d[1] * d[1];
+            d2 * d2 < RESOLVED * RESOLVED * inflation * along
+        })
+    };
+    let may_be_two = |i: usize| bends[i].split(i).is_some_and(|s| s.gain > DOUBTFUL * inflation);
+    let is_doubtful: Vec<bool> = (0..n).map(|i| !is_regular || is_merged(i) || may_be_two(i)).collect();
     let sigma = camera.spot_sigma_m;
     let emitters = (0..n)
         .map(|i| {
@@ -95,20 +103,11 @@ pub(super) fn locate(
                 }
             }
             let own = block(i, i);
-            let is_merged = !is_regular
-                || (0..n).filter(|&j| j != i).any(|j| {
-                    let d = [0, 1].map(|k| spot.u[k] - model.spots[j].u[k]);
-                    let (other, cross) = (block(j, j), block(i, j));
-                    let s = [0, 1].map(|r| [0, 1].map(|c| own[r][c] + other[r][c] - cross[r][c] - cross[c][r]));
-                    let along: f64 = (0..2).map(|r| (0..2).map(|c| d[r] * s[r][c] * d[c]).sum::<f64>()).sum();
-                    let d2 = d[0] * d[0] + d[1] * d[1];
-                    d2 * d2 < RESOLVED * RESOLVED * inflation * along
-                });
-            let is_beside_two = (0..n).filter(|&j| may_be_two[j]).any(|j| {
+            let is_near_doubt = (0..n).filter(|&j| is_doubtful[j]).any(|j| {
                 let d = [0, 1].map(|k| spot.u[k] - model.spots[j].u[k]);
                 d[0].hypot(d[1]) < TOUCHING
             });
-            flags.set(Flags::UNRESOLVED, is_merged || is_beside_two);
+            flags.set(Flags::UNRESOLVED, is_near_doubt);
             let (mut u, mut own) = (spot.u, own);
             for k in 0..if is_regular { 2 } else { 0 } {
                 if let Some(s) = spread::along([bx, by], k, &spot) {

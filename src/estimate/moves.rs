@@ -71,6 +71,8 @@ impl Search {
     /// Adds, splits and relocates.
     pub(super) fn grow(&mut self, reading: &Reading, model: &mut Model) {
         let peaks: Vec<_> = self.residual_peaks(reading, model).iter().take(2).copied().collect();
+        let before = model.clone();
+        let splits = self.splits(reading, model);
         for peak in &peaks {
             let mut next = model.clone();
             next.spots.push(Spot::new(peak.u, peak.a));
@@ -78,22 +80,13 @@ impl Search {
                 break;
             }
         }
-        for split in self.splits(reading, model).into_iter().take(3) {
-            if reading.is_explained(model) && split.gain < LIKELY * self.factor * self.price {
+        // A peak may be what a split leaves: both start from the same model.
+        for split in splits.into_iter().take(3) {
+            let is_likely = split.gain > LIKELY * self.factor * self.price;
+            if reading.is_explained(model) && !is_likely {
                 break;
             }
-            let mut next = model.clone();
-            let spot = next.spots[split.index];
-            let distance = split.distance.clamp(SPLIT[0], SPLIT[1]);
-            let half = |sign: f64| {
-                Spot::new(
-                    [0, 1].map(|k| spot.u[k] + sign * distance * split.direction[k]),
-                    0.5 * spot.a,
-                )
-            };
-            next.spots[split.index] = half(1.0);
-            next.spots.push(half(-1.0));
-            if self.consider(reading, model, next) {
+            if self.consider(reading, model, halved(&before, &split)) {
                 return;
             }
         }
@@ -191,6 +184,20 @@ impl Search {
         splits.sort_by(|a, b| b.gain.total_cmp(&a.gain));
         splits
     }
+}
+
+/// `model` with two halves of a spot to either side of it.
+fn halved(model: &Model, split: &Split) -> Model {
+    let mut next = model.clone();
+    let spot = model.spots[split.index];
+    let distance = split.distance.clamp(SPLIT[0], SPLIT[1]);
+    let half = |sign: f64| {
+        let u = [0, 1].map(|k| spot.u[k] + sign * distance * split.direction[k]);
+        Spot::new(u, 0.5 * spot.a)
+    };
+    next.spots[split.index] = half(1.0);
+    next.spots.push(half(-1.0));
+    next
 }
 
 /// Pairs of spots nearer than `limit`, σ, with their distance; the nearest first.
