@@ -254,6 +254,22 @@ impl Atoms {
         triple(scratch, x(i, a[0]), x(j, b[0]))
     }
 
+    /// Inner products along x and along y of source `i`'s f, f′ and f″ with source `j`'s f and f′; `None` where they share nothing.
+    #[inline(always)]
+    pub fn grams(&self, i: usize, j: usize) -> Option<[[[f64; 2]; 3]; 2]> {
+        let [[x0, x1], [y0, y1]] = self.shared(i, j);
+        if x0 >= x1 || y0 >= y1 {
+            return None;
+        }
+        let (mx, my) = (self.mx, self.my);
+        let x = |i: usize, d: usize| &self.x[(3 * i + d) * mx + x0..(3 * i + d) * mx + x1];
+        let y = |i: usize, d: usize| &self.y[(3 * i + d) * my + y0..(3 * i + d) * my + y1];
+        Some([
+            [0, 1, 2].map(|a| [0, 1].map(|b| dot(x(i, a), x(j, b)))),
+            [0, 1, 2].map(|a| [0, 1].map(|b| dot(y(i, a), y(j, b)))),
+        ])
+    }
+
     /// Inner products of (f′_x f_y, f_x f′_y, f_x f_y) of source `i` with those of source `j`, 3 × 3 row-major.
     #[inline(always)]
     pub fn couple(&self, i: usize, j: usize, weights: &[f64], scratch: &mut Vec<f64>) -> [f64; 9] {

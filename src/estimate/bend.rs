@@ -127,20 +127,31 @@ impl Fitter {
         let n = atoms.spots.len();
         let own = SECOND.map(|(_, f)| f * atoms.amplitude(i));
         let strip = &mut self.strip;
-        let mut inner = |a: [usize; 2], j: usize, b: [usize; 2]| atoms.inner(i, a, j, b, &reading.weights, strip);
+        let mut grams = None;
+        let mut inner = |a: [usize; 2], j: usize, b: [usize; 2], grams: &Option<[[[f64; 2]; 3]; 2]>| match grams {
+            Some([x, y]) => x[a[0]][b[0]] * y[a[1]][b[1]],
+            None => atoms.inner(i, a, j, b, &reading.weights, strip),
+        };
         for j in 0..atoms.sources() {
+            if reading.weights.is_empty() {
+                grams = atoms.grams(i, j);
+                if grams.is_none() {
+                    continue;
+                }
+            }
             for (r, (second, _)) in SECOND.into_iter().enumerate() {
                 if j >= n {
-                    cross[r * p + 2 * n + j] = own[r] * inner(second, j, [0, 0]);
+                    cross[r * p + 2 * n + j] = own[r] * inner(second, j, [0, 0], &grams);
                     continue;
                 }
                 for (c, first) in FIRST.into_iter().enumerate() {
                     let scale = if c < 2 { atoms.amplitude(j) } else { 1.0 };
-                    cross[r * p + 3 * j + c] = own[r] * scale * inner(second, j, first);
+                    cross[r * p + 3 * j + c] = own[r] * scale * inner(second, j, first, &grams);
                 }
             }
         }
-        let information = [0, 1, 2].map(|r| [0, 1, 2].map(|c| own[r] * own[c] * inner(SECOND[r].0, i, SECOND[c].0)));
+        let information =
+            [0, 1, 2].map(|r| [0, 1, 2].map(|c| own[r] * own[c] * inner(SECOND[r].0, i, SECOND[c].0, &None)));
         for w in 0..widths {
             self.weighted.clone_from(&self.broadening[w]);
             for (d, w) in self.weighted.iter_mut().zip(&reading.weights) {

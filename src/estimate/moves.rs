@@ -1,7 +1,7 @@
 //! The moves that change the number of emitters: add, split, relocate, merge, drop.
 
 use super::bend::Split;
-use super::model::{Model, Spot};
+use super::model::{Model, Nuisances, Spot};
 use super::reading::Reading;
 use super::search::{MOST, Search, TRIAL_STEPS};
 
@@ -144,11 +144,10 @@ impl Search {
     /// Squared amplitude over its variance, for each spot (Wald's test).
     pub(super) fn significance(&mut self, reading: &Reading, model: &mut Model) -> Vec<f64> {
         let (p, n) = (model.parameters(), model.spots.len());
-        self.fitter.information(reading, model);
-        let mut cov = Vec::new();
-        if !self.fitter.covariance(p, n, 1e-9, &mut cov) {
+        if !self.assure(reading, model) {
             return vec![0.0; n];
         }
+        let cov = &self.certainty.covariance;
         (0..n)
             .map(|i| model.spots[i].a.powi(2) / cov[(3 * i + 2) * p + 3 * i + 2].max(1e-300))
             .collect()
@@ -156,12 +155,11 @@ impl Search {
 
     /// Rise of the deviance, to second order, when spots i and j become one.
     fn separation(&mut self, reading: &Reading, model: &mut Model, i: usize, j: usize) -> f64 {
-        let (p, n) = (model.parameters(), model.spots.len());
-        self.fitter.information(reading, model);
-        let mut cov = Vec::new();
-        if !self.fitter.covariance(p, n, 1e-9, &mut cov) {
+        let p = model.parameters();
+        if !self.assure(reading, model) {
             return 0.0;
         }
+        let cov = &self.certainty.covariance;
         let at = |a: usize, r: usize, b: usize, c: usize| cov[(3 * a + r) * p + 3 * b + c];
         let d = [0, 1].map(|k| model.spots[i].u[k] - model.spots[j].u[k]);
         let s = [0, 1].map(|r| [0, 1].map(|c| at(i, r, i, c) + at(j, r, j, c) - at(i, r, j, c) - at(j, r, i, c)));
@@ -171,18 +169,54 @@ impl Search {
 
     /// Splits that the residual asks for, the most promising first.
     pub(super) fn splits(&mut self, reading: &Reading, model: &mut Model) -> Vec<Split> {
-        self.fitter.information(reading, model);
-        let mut cov = Vec::new();
-        if !self
-            .fitter
-            .covariance(model.parameters(), model.spots.len(), 1e-9, &mut cov)
-        {
+        let is_known = self.certainty.is_of(model);
+        if !self.assure(reading, model) {
             return Vec::new();
         }
-        let bends = self.fitter.bends(reading, model, &cov);
+        if let Some(known) = &self.certainty.splits {
+            return known.clone();
+        }
+        if is_known {
+            self.fitter.information(reading, model);
+        }
+        let bends = self.fitter.bends(reading, model, &self.certainty.covariance);
         let mut splits: Vec<_> = bends.iter().enumerate().filter_map(|(i, b)| b.split(i)).collect();
         splits.sort_by(|a, b| b.gain.total_cmp(&a.gain));
+        self.certainty.splits = Some(splits.clone());
         splits
+    }
+
+    /// Sets the certainty of `model`; `false` where its information is singular.
+    fn assure(&mut self, reading: &Reading, model: &mut Model) -> bool {
+        if !self.certainty.is_of(model) {
+            self.fitter.information(reading, model);
+            let known = &mut self.certainty;
+            let (p, n) = (model.parameters(), model.spots.len());
+            known.is_regular = self.fitter.covariance(p, n, 1e-9, &mut known.covariance);
+            known.splits = None;
+            known.deviance = model.deviance;
+            known.nuisances = model.nuisances;
+            known.spots.clone_from(&model.spots);
+        }
+        self.certainty.is_regular
+    }
+}
+
+/// What is known of how well one hypothesis is known: moves ask for it several times.
+#[derive(Default)]
+pub(super) struct Certainty {
+    spots: Vec<Spot>,
+    nuisances: Nuisances,
+    deviance: f64,
+    is_regular: bool,
+    covariance: Vec<f64>,
+    splits: Option<Vec<Split>>,
+}
+
+impl Certainty {
+    /// The deviance tells frames and their weights apart.
+    fn is_of(&self, model: &Model) -> bool {
+        self.deviance == model.deviance && self.nuisances == model.nuisances && self.spots == model.spots
     }
 }
 

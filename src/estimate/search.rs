@@ -6,6 +6,7 @@ use super::basis::Basis;
 use super::fit::Fitter;
 use super::heatmap::Heatmap;
 use super::model::{Model, Nuisances, Spot, Width};
+use super::moves::Certainty;
 use super::noise::Growth;
 use super::otherwise::WIDE;
 use super::pencil::{Pencil, Sampler};
@@ -50,6 +51,7 @@ pub(super) struct Search {
     /// What is known of powers, where that is to be weighed in.
     pub prior: Option<Prior>,
     pub(super) residual: Vec<f64>,
+    pub(super) certainty: Certainty,
 }
 
 impl Search {
@@ -71,6 +73,7 @@ impl Search {
             suspected: None,
             prior: None,
             residual: Vec::new(),
+            certainty: Certainty::default(),
         }
     }
 
@@ -79,6 +82,7 @@ impl Search {
         self.fitter.restart(deadline);
         self.factor = 1.0;
         self.suspected = None;
+        self.certainty = Certainty::default();
     }
 
     /// Whether the frame has had its share of work, or of time where a budget is set.
