@@ -68,6 +68,7 @@ impl Fitter {
     fn bent(&mut self, reading: &Reading, model: &Model, covariance: &[f64]) -> Vec<Bend> {
         let p = model.parameters();
         let widths = model.nuisances.widths();
+        self.work += (model.spots.len() * p * (3 * reading.bad.len() + 3 * p)) as f64;
         let mut rows = Vec::new();
         let mut lefts = Vec::new();
         for bad in &reading.bad {

@@ -59,7 +59,7 @@ pub(super) struct Fitter {
     pub(super) small: Vec<f64>,
     pub(super) active: Vec<bool>,
     /// Multiplications since the last frame, and the time it must be done by.
-    work: f64,
+    pub(super) work: f64,
     /// Sources of the largest hypothesis since.
     most_sources: f64,
     /// Steps since.
@@ -335,6 +335,7 @@ impl pulp::NullaryFnOnce for Job<'_> {
     fn call(self) {
         self.fitter.run(self.reading, self.model, self.steps, self.bar);
         if self.wants_information {
+            self.fitter.work += self.fitter.step_work(self.reading);
             self.fitter.linearise(self.reading, self.model.nuisances);
         }
     }

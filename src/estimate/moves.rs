@@ -170,7 +170,7 @@ impl Search {
     /// Splits that the residual asks for, the most promising first.
     pub(super) fn splits(&mut self, reading: &Reading, model: &mut Model) -> Vec<Split> {
         let is_known = self.certainty.is_of(model);
-        if !self.assure(reading, model) {
+        if self.is_exhausted() || !self.assure(reading, model) {
             return Vec::new();
         }
         if let Some(known) = &self.certainty.splits {

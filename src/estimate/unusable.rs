@@ -6,7 +6,7 @@ use super::linear::{axpy, cholesky, dot, solve};
 /// A further change of the deviance that is not worth another round.
 const SMALL: f64 = 0.01;
 const ROUNDS: usize = 100;
-/// From so many pixels on it is cheaper to solve for the coefficients.
+/// From so many pixels on it may be cheaper to solve for the coefficients, where there are few.
 const MANY: usize = 200;
 /// Precision of what only unusable pixels could tell, over a coefficient's.
 const RIDGE: f64 = 1e-9;
@@ -25,7 +25,9 @@ pub(super) struct BadPixel {
 /// With P the projection on the bases, the values solve (I − P)ᵦᵦ v = (P y)ᵦ; conjugate gradients (Hestenes and Stiefel, 1952).
 #[inline(always)]
 pub(super) fn fill(bad: &mut [BadPixel], z: &mut [f64], mx: usize, bx: &Basis, by: &Basis) {
-    if bad.len() > MANY {
+    let size = z.len() as f64;
+    let iterated = ROUNDS as f64 * 4.0 * bad.len() as f64 * size;
+    if bad.len() > MANY && size * size * (size / 3.0 + bad.len() as f64 / 2.0) < iterated {
         return solve_all(bad, z, mx, bx, by);
     }
     let my = z.len() / mx;
