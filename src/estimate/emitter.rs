@@ -5,7 +5,7 @@ bitflags::bitflags! {
     /// in lower case.
     #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
     pub struct Flags: u16 {
-        /// Another emitter is so near that the data cannot tell the two apart.
+        /// Another emitter is so near that the data cannot tell the two apart; or this one, or an overlapping one, may be two.
         const UNRESOLVED = 1;
         /// Within 2σ of the sensor's edge, or past it.
         const NEAR_EDGE = 1 << 1;
