@@ -71,8 +71,6 @@ impl Search {
     /// Adds, splits and relocates.
     pub(super) fn grow(&mut self, reading: &Reading, model: &mut Model) {
         let peaks: Vec<_> = self.residual_peaks(reading, model).iter().take(2).copied().collect();
-        let before = model.clone();
-        let splits = self.splits(reading, model);
         for peak in &peaks {
             let mut next = model.clone();
             next.spots.push(Spot::new(peak.u, peak.a));
@@ -80,13 +78,12 @@ impl Search {
                 break;
             }
         }
-        // A peak may be what a split leaves: both start from the same model.
-        for split in splits.into_iter().take(3) {
+        for split in self.splits(reading, model).into_iter().take(3) {
             let is_likely = split.gain > LIKELY * self.factor * self.price;
             if reading.is_explained(model) && !is_likely {
                 break;
             }
-            if self.consider(reading, model, halved(&before, &split)) {
+            if self.consider(reading, model, halved(model, &split)) {
                 return;
             }
         }

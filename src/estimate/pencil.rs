@@ -22,7 +22,9 @@ const SPACING: f64 = 0.33;
 const CENTRES: f64 = 8.0;
 /// Sensors wider than this, σ, are not for the pencil.
 const WIDEST: f64 = 13.0;
-/// Samples are held to the Gaussian no better than the noise of a bright spot lets them; without, many columns only amplify it.
+/// Where a basis leaves out so few of an array's pixels, its last columns only amplify the noise: samples are held to the
+/// Gaussian no better than that of a bright spot lets them.
+const NEARLY: usize = 4;
 const FAINTEST: f64 = 1e-5;
 /// Frames of noise by which singular values are judged.
 const DRAWS: usize = 6;
@@ -124,7 +126,8 @@ impl Sampler {
                 atoms[(j, c)] = atom[c];
             }
         }
-        let held = basis.tail(rank).max(FAINTEST);
+        let least = if rank + NEARLY >= basis.n { FAINTEST } else { 1e-14 };
+        let held = basis.tail(rank).max(least);
         for c in 0..rank {
             atoms[(centres + c, c)] = held;
         }
