@@ -2,6 +2,8 @@
 //! `cargo test --release --test review -- --ignored --nocapture`.
 
 use oapwatch::monitor::AlertKind::UnclaimedEmitter;
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
 
 use super::stage::{Story, review};
 
@@ -63,4 +65,36 @@ fn honest_pixels_raise_nothing() {
         assert!(told.raised().is_empty(), "seed {seed}: {:?}", told.raised());
     }
     println!("{frames} honest frames, no alert");
+}
+
+/// A stranger who comes on anywhere in view, as strong as the users, after a quarter of a minute of peace.
+#[test]
+#[ignore = "minutes; see the file's head"]
+fn a_stranger_anywhere_in_view() {
+    const N: u64 = 1500;
+    let mut delays = Vec::new();
+    for seed in 0..N {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let [x, y] = [0; 2].map(|_| rng.random_range(-120.0..120.0f64));
+        let intruder = format!("[[intruder]]\nname = \"e\"\npresent = {{ from_s = 15 }}\nmotion.still = [{x}, {y}]");
+        let mut story = Story::with(seed, &intruder);
+        story.seconds = 20.0;
+        let raised = review(&story).raised();
+        let delay = match raised.first() {
+            Some((UnclaimedEmitter, None, at)) if *at >= 15.0 => at - 15.0,
+            _ => f64::INFINITY,
+        };
+        if delay > 1.0 {
+            println!("({x:.1}, {y:.1}): {raised:?}");
+        }
+        delays.push(delay);
+    }
+    let within = |s: f64| delays.iter().filter(|d| **d <= s).count();
+    println!(
+        "of {N}: {} within 1 s, {} within 2 s, {} within 5 s",
+        within(1.0),
+        within(2.0),
+        within(5.0)
+    );
+    assert!(within(1.0) as f64 > 0.98 * N as f64);
 }
