@@ -21,6 +21,8 @@ bitflags::bitflags! {
         const OUT_OF_TIME = 1 << 6;
         /// Positions and energies trade against each other so nearly that rounding has a say in them.
         const ILL_CONDITIONED = 1 << 7;
+        /// The covariance is only an outline: two standard deviations out the likelihood differs from it by a factor of two.
+        const NON_GAUSSIAN = 1 << 8;
     }
 }
 

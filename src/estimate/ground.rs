@@ -57,7 +57,6 @@ pub(super) fn locate(
         true => search.fitter.bends(reading, model, &cov),
         false => vec![Bend::default(); n],
     };
-    let (bx, by) = (&search.fitter.bx, &search.fitter.by);
     let block = |i: usize, j: usize| {
         if is_regular {
             [0, 1].map(|r| [0, 1].map(|c| cov[(3 * i + r) * p + 3 * j + c]))
@@ -79,6 +78,15 @@ pub(super) fn locate(
     };
     let may_be_two = |i: usize| bends[i].split(i).is_some_and(|s| s.gain > DOUBTFUL * inflation);
     let is_doubtful: Vec<bool> = (0..n).map(|i| !is_regular || is_merged(i) || may_be_two(i)).collect();
+    let is_near = |i: usize, j: usize| {
+        let d = [0, 1].map(|k| model.spots[i].u[k] - model.spots[j].u[k]);
+        d[0].hypot(d[1]) < TOUCHING
+    };
+    let is_crowded = |i: usize| (0..n).any(|j| j != i && is_near(i, j));
+    let is_straight: Vec<bool> = (0..n)
+        .map(|i| !is_regular || !is_crowded(i) || search.is_straight(reading, model, &cov, i))
+        .collect();
+    let (bx, by) = (&search.fitter.bx, &search.fitter.by);
     let sigma = camera.spot_sigma_m;
     let emitters = (0..n)
         .map(|i| {
@@ -103,11 +111,8 @@ pub(super) fn locate(
                 }
             }
             let own = block(i, i);
-            let is_near_doubt = (0..n).filter(|&j| is_doubtful[j]).any(|j| {
-                let d = [0, 1].map(|k| spot.u[k] - model.spots[j].u[k]);
-                d[0].hypot(d[1]) < TOUCHING
-            });
-            flags.set(Flags::UNRESOLVED, is_near_doubt);
+            flags.set(Flags::UNRESOLVED, (0..n).any(|j| is_doubtful[j] && is_near(i, j)));
+            flags.set(Flags::NON_GAUSSIAN, !is_straight[i]);
             let (mut u, mut own) = (spot.u, own);
             for k in 0..if is_regular { 2 } else { 0 } {
                 if let Some(s) = spread::along([bx, by], k, &spot) {

@@ -35,6 +35,7 @@ mod spread;
 #[doc(hidden)]
 pub mod stages;
 mod step;
+mod straight;
 mod unusable;
 mod weigh;
 

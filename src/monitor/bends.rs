@@ -197,7 +197,8 @@ impl Bends {
         });
     }
 
-    /// How much wider the spot is than expected (trace, σ²), and the surprise of the window that shows it most.
+    /// How much wider the spot is than expected (trace, σ²), and the surprise of the window and test that show it most: with no
+    /// correction for their number, up to ten of which share data.
     pub fn surprise(&self, common: &Common) -> (f64, f64) {
         let mut worst = (0.0, 0.0);
         let unlike = Matrix3::identity() * UNLIKE_OTHERS.powi(2);
@@ -250,9 +251,9 @@ fn middle(of: Vec<Vector3<f64>>) -> (Vector3<f64>, Matrix3<f64>) {
     )
 }
 
-/// Trace of the moments of a second beam in the direction that explains `off` best, and the surprise of it. The directions make a
-/// curve on the unit sphere of length √2·π where coordinates are equally well known, so that the largest of them exceeds u
-/// with a chance of at most Q(u) + e^(−u²/2)/√2 (Davies, 1977, eq. 3.2), below 1.5·e^(−u²/2) in any case.
+/// Trace of the moments of a second beam in the direction that explains `off` best, and the surprise of it. Whitened, the
+/// directions are the edge of a convex cone: a closed convex curve on the unit sphere, at most 2π long. The largest of them exceeds
+/// u with a chance of at most Q(u) + e^(−u²/2) (Rice, 1945, for the upcrossings), below 1.5·e^(−u²/2).
 fn spread(off: Vector3<f64>, inverse: Matrix3<f64>) -> (f64, f64) {
     let mut best = (0.0, 0.0);
     for k in 0..DIRECTIONS {

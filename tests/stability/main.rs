@@ -19,7 +19,7 @@ fn options(frames: usize) -> Options {
 
 /// Cases that need hundreds of frames or a release build to say anything; `oapwatch stability` shows them.
 fn is_slow(name: &str) -> bool {
-    ["forty", "100 × 100", "constant", "ramp"]
+    ["forty", "five in a line", "100 × 100", "constant", "ramp"]
         .iter()
         .any(|s| name.contains(s))
 }

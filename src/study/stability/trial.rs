@@ -181,7 +181,8 @@ pub const WARNING: Flags = Flags::UNRESOLVED
     .union(Flags::NO_CONVERGENCE)
     .union(Flags::POOR_FIT)
     .union(Flags::OUT_OF_TIME)
-    .union(Flags::ILL_CONDITIONED);
+    .union(Flags::ILL_CONDITIONED)
+    .union(Flags::NON_GAUSSIAN);
 
 impl Tally {
     /// Estimates without the frames that were refused.
