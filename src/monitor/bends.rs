@@ -1,6 +1,6 @@
 use std::collections::VecDeque;
 
-use nalgebra::{Matrix3, Vector3};
+use nalgebra::{Matrix2, Matrix3, Vector3};
 
 use super::watch::habits::median;
 use crate::estimate::Bend;
@@ -84,6 +84,16 @@ impl Moments {
         Self {
             score: Vector3::from(bend.score) / inflation,
             information: Matrix3::from_fn(|r, c| 0.5 * (s[r][c] + s[c][r])) / inflation,
+        }
+    }
+
+    /// Of light spread by `moments`, σ², of that signal-to-noise ratio. A Gaussian spot f of unit norm has
+    /// ‖½f_xx‖² = 1/8 and ‖f_xy‖² = 1/4 with its energy adjusted; the three are orthogonal to each other and to its position.
+    pub fn of_spread(moments: Matrix2<f64>, snr: f64) -> Self {
+        let information = Matrix3::from_diagonal(&Vector3::new(0.125, 0.25, 0.125)) * (snr * snr);
+        Self {
+            score: information * Vector3::new(moments[(0, 0)], moments[(0, 1)], moments[(1, 1)]),
+            information,
         }
     }
 

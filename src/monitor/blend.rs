@@ -4,8 +4,9 @@ use jiff::Timestamp;
 use nalgebra::{Matrix2, Vector2};
 
 use super::bends::{Bends, Common};
+use super::detection::Detection;
 use super::motion::mahalanobis2;
-use super::tracks::Detection;
+
 use crate::claims::seconds;
 use crate::estimate::Flags;
 

@@ -7,6 +7,7 @@ mod blend;
 mod book;
 mod clock;
 mod config;
+mod detection;
 mod motion;
 mod pose;
 mod report;

@@ -3,12 +3,10 @@ use std::collections::VecDeque;
 use jiff::Timestamp;
 use nalgebra::{Matrix2, Vector2};
 
-use super::bends::Moments;
+use super::detection::Detection;
 use super::motion::{Motion, largest_eigenvalue, mahalanobis2};
 use crate::assign::assign;
 use crate::claims::seconds;
-use crate::estimate::{Estimate, Flags};
-use crate::optics::Camera;
 
 /// Squared Mahalanobis gate of the association: χ² of two degrees exceeds it 4 times in 10⁶.
 const GATE: f64 = 25.0;
@@ -16,8 +14,6 @@ const GATE: f64 = 25.0;
 const SHARING: f64 = 4.0;
 /// Added to the gate per axis, m: a beam may turn between two frames faster than the motion model likes.
 const GATE_FLOOR_M: f64 = 0.4;
-/// What a fit's covariance leaves out (calibration, pixel gains), m.
-const POSITION_FLOOR_M: f64 = 0.02;
 /// A track is confirmed by M hits of its last N frames.
 const CONFIRM: (u32, u32) = (3, 5);
 /// A confirmed track is kept this long without a hit, in time the sensor could see.
@@ -29,20 +25,6 @@ const FORGET_AFTER_S: f64 = 30.0;
 /// How far back a track knows where it was, for claims that come late.
 const TRAIL_S: f64 = 6.0;
 const TRAIL_STEP_S: f64 = 0.05;
-
-/// One frame's emitter as the tracks take it.
-#[derive(Clone, Debug)]
-pub(super) struct Detection {
-    pub position: Vector2<f64>,
-    pub cov: Matrix2<f64>,
-    pub energy_j: f64,
-    pub flags: Flags,
-    pub moments: Moments,
-    /// Distance within which a second emitter of like energy cannot be told apart, m.
-    pub resolution_m: f64,
-    /// How probable a spurious detection is here in a frame.
-    pub ghost: f64,
-}
 
 /// A beam over time. Its identity comes from its positions alone.
 #[derive(Clone, Debug)]
@@ -76,90 +58,6 @@ pub(super) struct Tracks {
 
 /// Chance that an emitter in view is detected in a frame; low, so that misses cost an eavesdropper's score little.
 const DETECTED: f64 = 0.9;
-
-impl Detection {
-    /// The emitters of an estimate on the ground, with what is known of how far each can be trusted.
-    pub fn of(estimate: &Estimate, camera: &Camera) -> Vec<Self> {
-        // A frame that the model explains badly has errors beyond its covariances.
-        let inflation = if estimate.reduced_chi2.is_finite() {
-            estimate.reduced_chi2.clamp(1.0, 100.0)
-        } else {
-            100.0
-        };
-        let usable = |e: &&crate::estimate::Emitter| {
-            e.x_m.is_finite() && e.y_m.is_finite() && e.cov_m2.iter().flatten().all(|c| c.is_finite())
-        };
-        let mut detections: Vec<Self> = estimate
-            .emitters
-            .iter()
-            .filter(usable)
-            .map(|e| {
-                let [[a, b], [_, c]] = e.cov_m2;
-                let (a, c) = (a.max(0.0), c.max(0.0));
-                // No correlation beyond ±1, whatever a learned estimator claims.
-                let most = a.sqrt() * c.sqrt();
-                let b = b.clamp(-most, most);
-                let cov = Matrix2::new(a, b, b, c) * inflation + Matrix2::identity() * POSITION_FLOOR_M.powi(2);
-                Self {
-                    position: Vector2::new(e.x_m, e.y_m),
-                    cov,
-                    energy_j: e.energy_j,
-                    flags: e.flags,
-                    moments: Moments::of(&e.bend, inflation),
-                    resolution_m: resolution_m(camera, e.energy_j),
-                    ghost: 0.0,
-                }
-            })
-            .collect();
-        for i in 0..detections.len() {
-            detections[i].ghost = ghost(&detections, i, camera);
-        }
-        detections
-    }
-
-    /// Of either beam's position, when two share the spot.
-    fn shared_cov(&self) -> Matrix2<f64> {
-        self.cov + Matrix2::identity() * self.resolution_m.powi(2)
-    }
-}
-
-/// An equal pair can be told apart at d ≥ 5 σ/√SNR, SNR = A·pitch/(2√π·σ·σ_n) (measured on the fit); never taken beyond
-/// 3 σ, where any two spots show two maxima.
-fn resolution_m(camera: &Camera, energy_j: f64) -> f64 {
-    let sigma = camera.spot_sigma_m;
-    let pitch = camera.x.pitch_m.max(camera.y.pitch_m);
-    let noise = camera.noise_std_j;
-    let snr = energy_j.max(0.0) * pitch / (2.0 * std::f64::consts::PI.sqrt() * sigma * noise);
-    let apart = 5.0 * sigma / snr.max(1e-3).sqrt();
-    apart.max(0.5 * pitch).min(3.0 * sigma) * camera.ground_scale()
-}
-
-/// How probable it is that detection `i` is spurious: rare on its own, common where one spot may have been split in two.
-/// Even there it is no excuse for silence: nine detections in ten frames outweigh it, so that nobody gains more than a second
-/// by making the fit doubtful.
-fn ghost(detections: &[Detection], i: usize, camera: &Camera) -> f64 {
-    const ALONE: f64 = 1e-3;
-    const NEIGHBOURED: f64 = 1e-2;
-    const POORLY_FITTED: f64 = 0.03;
-    const UNRESOLVED: f64 = 0.1;
-    let d = &detections[i];
-    let nearest = (0..detections.len())
-        .filter(|&j| j != i)
-        .map(|j| (detections[j].position - d.position).norm())
-        .fold(f64::INFINITY, f64::min);
-    if d.flags.contains(Flags::UNRESOLVED) || nearest < d.resolution_m {
-        UNRESOLVED
-    } else if d
-        .flags
-        .intersects(Flags::NO_CONVERGENCE | Flags::POOR_FIT | Flags::ILL_CONDITIONED)
-    {
-        POORLY_FITTED
-    } else if nearest < 3.0 * camera.spot_sigma_m * camera.ground_scale() {
-        NEIGHBOURED
-    } else {
-        ALONE
-    }
-}
 
 impl Track {
     fn start(id: u64, time: Timestamp, detection: &Detection) -> Self {

@@ -98,6 +98,6 @@ pub(super) struct User {
     pub displaced: bool,
     /// Whether the beam is two.
     pub blend: Blend,
-    /// There are first signs that it is: the present is not taken for the past.
-    pub suspected: bool,
+    /// Since when there are signs that it is: the present is not taken for the past.
+    pub suspected_since: Option<Timestamp>,
 }

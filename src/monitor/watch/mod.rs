@@ -15,10 +15,11 @@ use nalgebra::{Matrix2, Vector2};
 
 use super::blend::Blend;
 use super::book::{Book, Cause, Finding};
+use super::detection::Detection;
 use super::pose::Pose;
 use super::sight::Sight;
 use super::thresholds::{Family, Thresholds};
-use super::tracks::{Detection, Track, Tracks};
+use super::tracks::{Track, Tracks};
 use super::users::{Asserted, CLAIM_LIFE_S, User};
 use super::{Alert, AlertEvent, AlertKind, Config, Observation, Report, Source};
 use crate::claims::{Store, seconds};

@@ -10,6 +10,7 @@ use crate::claims::seconds;
 use crate::monitor::bends::Common;
 use crate::monitor::blend::{Blend, Company, Scatter};
 use crate::monitor::book::{Cause, Finding};
+use crate::monitor::motion::largest_eigenvalue;
 use crate::monitor::thresholds::Family;
 use crate::monitor::tracks::Track;
 use crate::monitor::users::Asserted;
@@ -19,7 +20,7 @@ use crate::monitor::{AlertKind, Severity};
 const FEWEST_OTHERS: usize = 2;
 /// Share of the level from which a beam's present is no longer taken into its past.
 const SUSPECT: f64 = 0.2;
-/// Resolutions within which one beam's light disturbs another's.
+/// Resolutions within which one beam's light disturbs another's, and where it is lost may have become part of it.
 const BESIDE: f64 = 3.0;
 
 impl Monitor {
@@ -29,9 +30,11 @@ impl Monitor {
         let watched: Vec<(usize, Track)> = (0..asserted.len())
             .filter_map(|i| Some((i, self.tracks.get(answers[i]?)?.clone())))
             .filter(|(i, t)| t.hit && t.confirmed && !self.is_shared(*i, t, asserted, answers))
+            .map(|(i, t)| (i, self.with_whole_spot(t, answers)))
             .collect();
         self.note_spots(asserted, &watched);
         let brightening = self.config.tolerated_brightening;
+        let patience_s = self.patience_s();
         let mut suspects = BTreeSet::new();
         for (i, track) in &watched {
             let name = &asserted[*i].claim.user;
@@ -39,9 +42,14 @@ impl Monitor {
             let company = self.company(name, asserted, &watched);
             let Some(user) = self.users.get_mut(name) else { continue };
             let seen = user.blend.suspicion(brightening, &company);
-            user.suspected = seen.surprise() > SUSPECT * level;
+            let is_suspect = seen.surprise() > SUSPECT * level;
+            user.suspected_since = is_suspect.then(|| user.suspected_since.unwrap_or(now));
+            let Some(suspected) = user.suspected_since else {
+                continue;
+            };
             let open = self.book.is_open(&cause);
-            if seen.surprise() <= if open { SUSPECT * level } else { level } {
+            // A second beam may be a user's whose claim has yet to come.
+            if !open && (seen.surprise() <= level || seconds(suspected, now) < patience_s) {
                 continue;
             }
             let past = user.blend.past_energy();
@@ -99,6 +107,19 @@ impl Monitor {
         }
     }
 
+    /// `track` with all the light of its spot that answers nobody else's claim.
+    fn with_whole_spot(&self, mut track: Track, answers: &[Option<u64>]) -> Track {
+        let detection = &track.detection;
+        let others = self.tracks.all.iter().filter(|t| {
+            let near = &t.detection;
+            let reach = detection.resolution_m + 2.0 * largest_eigenvalue(&near.cov).sqrt().min(detection.resolution_m);
+            let is_near = (near.position - detection.position).norm() < reach;
+            t.hit && t.id != track.id && is_near && !answers.contains(&Some(t.id))
+        });
+        track.detection = detection.united(others.map(|t| &t.detection), &self.camera);
+        track
+    }
+
     /// Whether another user's beam may be in this spot, by tracks or by claims.
     fn is_shared(&self, i: usize, track: &Track, asserted: &[Asserted], answers: &[Option<u64>]) -> bool {
         let (here, reach) = (track.motion.position(), track.detection.resolution_m);
@@ -140,7 +161,7 @@ impl Monitor {
         for ((i, track), jump) in watched.iter().zip(jumps) {
             if let Some(user) = self.users.get_mut(&asserted[*i].claim.user) {
                 let jump = jump.map(|(d, cov)| (d - common, cov));
-                user.blend.note(&track.detection, jump, !user.suspected);
+                user.blend.note(&track.detection, jump, user.suspected_since.is_none());
             }
         }
     }
@@ -188,7 +209,7 @@ impl Monitor {
             };
             let away = (Vector2::new(alert.x_m?, alert.y_m?) - here).norm();
             let lost = self.tracks.get(*id).is_none_or(|t| !t.hit);
-            (lost && away < 2.0 * track.detection.resolution_m).then(|| cause.clone())
+            (lost && away < BESIDE * track.detection.resolution_m).then(|| cause.clone())
         })
     }
 }

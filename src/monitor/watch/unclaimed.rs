@@ -13,7 +13,7 @@ use crate::monitor::{AlertKind, Severity};
 
 /// ln likelihood ratio from which a user counts as vanished: three frames in a row.
 const VANISHED: f64 = 6.9;
-/// Share of the time to decide that a beam waits for its claim; the rest is for frames that miss it, and for a beam that comes on
+/// Share of the time to decide that a beam is given to be claimed; the rest is for frames that miss it, and for a beam that comes on
 /// within another's spot and is seen only as it walks out.
 const PATIENCE: f64 = 0.65;
 
@@ -31,9 +31,14 @@ impl Monitor {
         }
     }
 
+    /// How long what may be a user's waits for a claim.
+    pub(super) fn patience_s(&self) -> f64 {
+        PATIENCE * self.config.decision_s + self.delay_s
+    }
+
     pub(super) fn decide_unclaimed(&mut self, asserted: &[Asserted], answers: &mut [Option<u64>], now: Timestamp) {
         let settled = self.claims_settled(now);
-        let patience = PATIENCE * self.config.decision_s + self.delay_s;
+        let patience = self.patience_s();
         let candidates: Vec<Track> = self
             .tracks
             .all
