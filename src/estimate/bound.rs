@@ -14,6 +14,9 @@ pub struct Beside<'a> {
     pub background: bool,
     /// Pixels (Ny × Nx, row-major) that tell nothing.
     pub unusable: Option<&'a [bool]>,
+    /// Standard deviation of each emitter's energy, J, where it is known beforehand as well as that; every emitter is then
+    /// known to be in view too.
+    pub known: Option<&'a [f64]>,
 }
 
 const DARK: PixelResponse = PixelResponse {
@@ -35,7 +38,14 @@ pub fn position_bound_beside(camera: &Camera, positions: &[[f64; 2]], energies: 
     let jacobian = jacobian(camera, &positions[..n], energies, beside);
     let p = jacobian.ncols();
     let sigma = camera.spot_sigma_m;
-    let information = jacobian.transpose() * &jacobian;
+    let mut information = jacobian.transpose() * &jacobian;
+    // Bayesian information adds to Fisher's (Van Trees, 1968, ch. 2), as if what is known were Gaussian.
+    for (i, std) in beside.known.iter().flat_map(|k| k.iter()).enumerate().take(n) {
+        for (k, axis) in [&camera.x, &camera.y].into_iter().enumerate() {
+            information[(3 * i + k, 3 * i + k)] += 3.0 * (sigma / axis.half_width()).powi(2);
+        }
+        information[(3 * i + 2, 3 * i + 2)] += (camera.noise_std_j / std).powi(2);
+    }
     let scales: Vec<f64> = (0..p).map(|k| information[(k, k)].max(1e-300).sqrt()).collect();
     let scaled = Mat::from_fn(p, p, |r, c| information[(r, c)] / (scales[r] * scales[c]));
     let Ok(eigen) = scaled.self_adjoint_eigen(Side::Lower) else {
@@ -116,5 +126,30 @@ mod tests {
         let expected = 2.0 * axis * camera.ground_scale().powi(2);
         // A pixel of 0.3 σ widens the spot by pitch²/12: 0.75 % of σ², 1.5 % of σ⁴.
         assert!((bound / expected - 1.0).abs() < 0.02, "{bound} against {expected}");
+    }
+
+    #[test]
+    fn knowing_the_energies_tells_a_melted_pair_apart() {
+        let config = crate::optics::Config {
+            spot_sigma_m: Some(4e-3),
+            pixels: [40, 40],
+            ..Default::default()
+        };
+        let camera = config.camera().unwrap();
+        let (pair, energies) = ([[0.0, 0.0], [1.0, 0.0]], [7e-3; 2]);
+        let bound = |std: f64| {
+            let known = [std; 2];
+            let beside = Beside {
+                known: Some(&known),
+                ..Default::default()
+            };
+            position_bound_beside(&camera, &pair, &energies, beside)[0]
+        };
+        let plain = position_bound(&camera, &pair, &energies)[0];
+        let bounds: Vec<f64> = [1e-1, 1e-3, 1e-4].map(bound).into();
+        assert!(bounds.windows(2).all(|b| b[1] < b[0]), "{bounds:?} fall");
+        assert!(bounds[2] < 0.5 * plain, "{bounds:?} against {plain}");
+        // In view is somewhere within a hundred metres or so.
+        assert!(bounds[0] < 2.0 * 72.0f64.powi(2), "{bounds:?}");
     }
 }

@@ -65,15 +65,17 @@ impl Condition {
         truth
     }
 
-    /// Does to a frame what the condition does; returns each emitter's bound, m², with what is to be estimated under it.
+    /// Does to a frame what the condition does; returns each emitter's bound, m², with what is to be estimated under it, and the
+    /// same where energies are known to `relative_std` beforehand.
     pub(super) fn apply(
         condition: Option<Self>,
         truth: &Camera,
         pixels: &mut Array2<f64>,
         positions: &[[f64; 2]],
         energies: &[f64],
+        relative_std: f64,
         rng: &mut ChaCha8Rng,
-    ) -> Vec<f64> {
+    ) -> [Vec<f64>; 2] {
         let mean = energies.iter().sum::<f64>() / energies.len().max(1) as f64;
         let peak = typical_peak(truth, mean);
         let mut camera = truth.clone();
@@ -107,7 +109,9 @@ impl Condition {
             }
         }
         beside.unusable = Some(&unusable);
-        position_bound_beside(&camera, positions, energies, beside)
+        let known: Vec<f64> = energies.iter().map(|e| e * relative_std).collect();
+        [None, Some(known.as_slice())]
+            .map(|known| position_bound_beside(&camera, positions, energies, Beside { known, ..beside }))
     }
 }
 

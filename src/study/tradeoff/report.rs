@@ -51,7 +51,8 @@ pub(super) fn markdown(study: &Study) -> String {
         text,
         "{frames} frames a cell, seed {seed}; one thread. A cell is the reading of the noise (E energy, P paper), σ_eff in mm, and pixels \
          a side; 5 to 9 emitters unless it says otherwise. Squared errors are over matched pairs, both axes summed; r is the trimmed \
-         ratio to the Cramér–Rao bound among resolvable emitters, 1 being at the bound; N right is the share of frames with the \
+         ratio to the Cramér–Rao bound among resolvable emitters, 1 being at the bound. The bound with powers known is for `map`, over all \
+         emitters; N right is the share of frames with the \
          number of emitters right, of all and of those where every emitter can be resolved. Bold names are on the Pareto front of time \
          and OSPA (order 2, 25 m). Times depend on the machine and on what else it does; everything else only on the seed.\n"
     );
@@ -67,11 +68,12 @@ pub(super) fn markdown(study: &Study) -> String {
         let first = rows[0];
         let _ = writeln!(
             text,
-            "\n## {}\n\nBound (median) {} m²; {} of emitters can be resolved.\n\n\
+            "\n## {}\n\nBound: median {} m²; with powers known, mean {} m². {} of emitters can be resolved.\n\n\
              | rung | mean m² | median m² | trimmed m² | r | OSPA m | N right | where resolvable | missed | invented | µs median | µs 99th |\n\
              |---|---|---|---|---|---|---|---|---|---|---|---|",
             first.cell.name(),
             number(first.bound_median_m2),
+            number(first.known_bound_mean_m2),
             share(first.resolvable)
         );
         for row in &rows {

@@ -37,6 +37,8 @@ pub(super) struct Scene {
     pub frame: Frame,
     pub positions: Vec<[f64; 2]>,
     pub bound_m2: Vec<f64>,
+    /// The same for who knows what users send with.
+    pub known_bound_m2: Vec<f64>,
 }
 
 const AREA_HALF_M: f64 = 125.0;
@@ -162,7 +164,16 @@ impl Cell {
                 *pixel += e * column[b] * row[a];
             }
         }
-        let bound_m2 = Condition::apply(self.condition, &truth, &mut pixels, &positions, &energies, rng);
+        let relative_std = self.known_power(camera).relative_std;
+        let [bound_m2, known_bound_m2] = Condition::apply(
+            self.condition,
+            &truth,
+            &mut pixels,
+            &positions,
+            &energies,
+            relative_std,
+            rng,
+        );
         Scene {
             frame: Frame {
                 index,
@@ -171,6 +182,7 @@ impl Cell {
                 masked: None,
             },
             bound_m2,
+            known_bound_m2,
             positions,
         }
     }

@@ -31,6 +31,9 @@ pub struct Row {
     pub trimmed_m2: Option<f64>,
     /// Median of the emitters' Cramér–Rao bounds.
     pub bound_median_m2: Option<f64>,
+    /// Mean over all emitters of the bound for who knows what users send with and that they are in view.
+    #[serde(default)]
+    pub known_bound_mean_m2: Option<f64>,
     /// Mean of squared error over bound among resolvable emitters, the largest 5 % left out and the mean of a χ² variate
     /// of two degrees of freedom so trimmed divided out: 1 is at the bound.
     pub bound_ratio: Option<f64>,
@@ -61,7 +64,8 @@ pub(super) fn measure(cell: &Cell, candidate: &Candidate, scenes: &[Scene], seed
         ..Default::default()
     };
     let mut estimator = estimate::build(&config, &camera)?;
-    let (mut squared, mut ratios, mut bounds, mut latencies) = (vec![], vec![], vec![], vec![]);
+    let (mut squared, mut ratios, mut bounds, mut known_bounds, mut latencies) =
+        (vec![], vec![], vec![], vec![], vec![]);
     let (mut total_ospa, mut missed, mut invented) = (0.0, 0, 0);
     let (mut right, mut clear, mut clear_right, mut resolvable) = (0, 0, 0, 0);
     if let Some(scene) = scenes.first() {
@@ -87,6 +91,7 @@ pub(super) fn measure(cell: &Cell, candidate: &Candidate, scenes: &[Scene], seed
         clear_right += usize::from(is_clear && is_right);
         resolvable += is_resolvable.iter().filter(|r| **r).count();
         bounds.extend_from_slice(&scene.bound_m2);
+        known_bounds.extend_from_slice(&scene.known_bound_m2);
         for &(i, j) in &score.matching.pairs {
             let (t, p) = (scene.positions[i], positions[j]);
             let error = (t[0] - p[0]).powi(2) + (t[1] - p[1]).powi(2);
@@ -111,6 +116,7 @@ pub(super) fn measure(cell: &Cell, candidate: &Candidate, scenes: &[Scene], seed
         median_m2: quantile(&squared, 0.5),
         trimmed_m2: trimmed(&squared),
         bound_median_m2: quantile(&bounds, 0.5),
+        known_bound_mean_m2: mean(&known_bounds),
         bound_ratio: trimmed(&ratios).map(|r| r / TRIMMED_EXPONENTIAL),
         ospa_m: total_ospa / frames.max(1) as f64,
         emitters,
@@ -134,8 +140,8 @@ fn is_resolvable(scene: &Scene, i: usize) -> bool {
     error < RESOLVABLE_SHARE * nearest && error < RESOLVABLE_M
 }
 
-fn mean(sorted: &[f64]) -> Option<f64> {
-    (!sorted.is_empty()).then(|| sorted.iter().sum::<f64>() / sorted.len() as f64)
+fn mean(values: &[f64]) -> Option<f64> {
+    (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
 }
 
 fn trimmed(sorted: &[f64]) -> Option<f64> {
