@@ -12,8 +12,8 @@ const ROUNDS: usize = 6;
 const LENIENCY: f64 = 60.0;
 /// A spot of this many times a known power may be two.
 const TWOFOLD: f64 = 1.4;
-/// Parts of a divided spot stand this far apart, σ.
-const SPACING: f64 = 0.8;
+/// Parts of a divided spot stand this far apart, σ, at least and at most.
+const SPACING: [f64; 2] = [0.1, 0.8];
 const MOST_PARTS: usize = 4;
 /// All the light may be this much more or less, in emitters, than that of as many users as there are spots.
 const SURPLUS: f64 = 0.4;
@@ -111,15 +111,14 @@ impl Search {
         let directions = self.splits(reading, model);
         for (multiple, index) in bright {
             let spot = model.spots[index];
-            let along = directions
-                .iter()
-                .find(|d| d.index == index)
-                .map_or([1.0, 0.0], |d| d.direction);
+            let split = directions.iter().find(|d| d.index == index);
+            let (along, spread) = split.map_or(([1.0, 0.0], 0.0), |d| (d.direction, d.distance * d.distance));
             let parts = (multiple.round() as usize).max(2);
-            for direction in [along, [-along[1], along[0]]] {
+            let across = [-along[1], along[0]];
+            for (direction, spread) in [(along, spread), (along, 1.0), (across, 1.0)] {
                 let mut next = model.clone();
                 next.spots.remove(index);
-                next.spots.extend(divided(spot, parts, direction));
+                next.spots.extend(divided(spot, parts, direction, spread));
                 if self.attempt(reading, model, next) {
                     return;
                 }
@@ -142,12 +141,17 @@ impl Search {
             let [p, q] = [i, j].map(|k| model.spots[k].u);
             let d = [0, 1].map(|k| p[k] - q[k]);
             let length = d[0].hypot(d[1]).max(1e-6);
-            let mut next = merged(model, i, j);
-            let spot = next.spots.remove(j);
+            let [a, b] = [i, j].map(|k| model.spots[k].a);
+            let spread = a * b * (length / (a + b)).powi(2);
+            let mut united = merged(model, i, j);
+            let spot = united.spots.remove(j);
             let parts = (multiple.round() as usize).max(1);
-            next.spots.extend(divided(spot, parts, d.map(|v| v / length)));
-            if self.attempt(reading, model, next) {
-                return;
+            for spread in [spread, 1.0] {
+                let mut next = united.clone();
+                next.spots.extend(divided(spot, parts, d.map(|v| v / length), spread));
+                if self.attempt(reading, model, next) {
+                    return;
+                }
             }
         }
     }
@@ -166,11 +170,14 @@ impl Search {
     }
 }
 
-/// A spot's light in equal parts on a line.
-fn divided(spot: Spot, parts: usize, direction: [f64; 2]) -> impl Iterator<Item = Spot> {
+/// A spot's light in equal parts on a line, with that second moment, σ², as far as parts may be near and apart.
+fn divided(spot: Spot, parts: usize, direction: [f64; 2], spread: f64) -> impl Iterator<Item = Spot> {
     let parts = parts.min(MOST_PARTS);
+    let spacing = (12.0 * spread / (parts * parts - 1).max(1) as f64)
+        .sqrt()
+        .clamp(SPACING[0], SPACING[1]);
     (0..parts).map(move |k| {
-        let shift = SPACING * (k as f64 - 0.5 * (parts - 1) as f64);
+        let shift = spacing * (k as f64 - 0.5 * (parts - 1) as f64);
         let u = [0, 1].map(|axis| spot.u[axis] + shift * direction[axis]);
         Spot::new(u, spot.a / parts as f64)
     })
