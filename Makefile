@@ -101,6 +101,18 @@ test-aarch64: aarch64 build
 	$(call need,command -v qemu-aarch64-static,qemu-user-static)
 	tests/deploy/aarch64.py target/release/oapwatch target/cross/aarch64-unknown-linux-gnu/release/oapwatch
 
+.PHONY: fuzz
+# Coverage-guided fuzzing, FUZZ_S seconds a target: libFuzzer with a stable toolchain. Not in CI: it takes every dependency once more.
+FUZZ_S ?= 60
+FUZZ := npy config calibration scene claims http v4l2 locate onnx
+fuzz: setup
+	$(call need,command -v g++,g++)
+	RUSTC_WRAPPER=$(CURDIR)/fuzz/rustc.sh cargo build --release --locked --manifest-path fuzz/Cargo.toml --target-dir target/fuzz
+	cd fuzz && for each in $(FUZZ); do \
+		mkdir -p corpus/$$each artifacts && \
+		../target/fuzz/release/$$each corpus/$$each $$(test $$each = onnx && echo ../config/models || echo seeds/$$each) \
+			-artifact_prefix=artifacts/$$each- -max_total_time=$(FUZZ_S) -timeout=20 -rss_limit_mb=4096 -print_final_stats=1 || exit 1; done
+
 .PHONY: stability
 # docs/stability/cases.md: every hard case, a thousand frames of each where a frame is cheap; minutes on a machine that does nothing else.
 STABILITY := Sensors:1000 Emitters:1000 Invariance:200 Frames:5 Ladder:3 Optics:1 Assignment:1 Verdicts:1

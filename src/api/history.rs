@@ -1,7 +1,8 @@
 use std::collections::VecDeque;
+use std::sync::Arc;
 
 use jiff::Timestamp;
-use serde::Serialize;
+use serde::{Serialize, Serializer};
 
 use crate::monitor::{PositionStatus, Report};
 
@@ -34,8 +35,14 @@ pub struct PastBeam {
     pub x_m: f32,
     pub y_m: f32,
     pub status: PositionStatus,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub user: Option<String>,
+    /// One name for all moments: thousands of small ones would each hold a page of memory.
+    #[serde(skip_serializing_if = "Option::is_none", serialize_with = "name")]
+    #[schema(value_type = Option<String>)]
+    pub user: Option<Arc<str>>,
+}
+
+fn name<S: Serializer>(user: &Option<Arc<str>>, serializer: S) -> Result<S::Ok, S::Error> {
+    user.as_deref().serialize(serializer)
 }
 
 impl History {
@@ -58,18 +65,27 @@ impl History {
             self.moments.pop_front();
         }
         let centimetres = |x: f64| ((x * 100.0).round() / 100.0) as f32;
+        let known = self.moments.back().map_or(&[][..], |last| &last.emitters);
+        let shared = |user: &str| {
+            let mut names = known.iter().filter_map(|beam| beam.user.as_ref());
+            names
+                .find(|name| &***name == user)
+                .cloned()
+                .unwrap_or_else(|| user.into())
+        };
         let past = report.emitters.iter().take(BEAMS_KEPT).map(|e| PastBeam {
             track: e.track,
             x_m: centimetres(e.x_m),
             y_m: centimetres(e.y_m),
             status: e.status,
-            user: e.user.clone(),
+            user: e.user.as_deref().map(shared),
         });
-        self.moments.push_back(Moment {
+        let moment = Moment {
             time: report.time,
             frame: report.frame,
             emitters: past.collect(),
-        });
+        };
+        self.moments.push_back(moment);
     }
 
     /// The last `limit` moments after `since`, oldest first.

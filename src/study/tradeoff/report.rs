@@ -28,6 +28,11 @@ pub(super) fn front<'a>(rows: &[&'a Row]) -> Vec<&'a Row> {
         .collect()
 }
 
+/// Whether a row's label is of the rung `name`: a network's own name may follow.
+fn is_rung(label: &str, name: &str) -> bool {
+    label.split_whitespace().next() == Some(name)
+}
+
 /// Rows by cell, in the study's order.
 pub(super) fn cells(study: &Study) -> Vec<Vec<&Row>> {
     let mut cells: Vec<Vec<&Row>> = Vec::new();
@@ -56,12 +61,29 @@ pub(super) fn markdown(study: &Study) -> String {
          number of emitters right, of all and of those where every emitter can be resolved. Bold names are on the Pareto front of time \
          and OSPA (order 2, 25 m). Times depend on the machine and on what else it does; everything else only on the seed.\n"
     );
+    let fronts: Vec<Row> = cells(study).iter().flat_map(|rows| front(rows)).cloned().collect();
+    let on_front = |name: &str| {
+        let of = |rows: &[Row]| rows.iter().filter(|r| is_rung(&r.rung, name)).count();
+        format!("on the front in {} of {} cells", of(&fronts), of(&study.rows))
+    };
     for rung in LADDER {
         let default = if rung.name == DEFAULT { " (default)" } else { "" };
-        let _ = writeln!(text, "- `{}`{default}: {}", rung.name, rung.summary);
+        let _ = writeln!(
+            text,
+            "- `{}`{default}: {}; {}",
+            rung.name,
+            rung.summary,
+            on_front(rung.name)
+        );
     }
     for learned in Learned::ALL {
-        let _ = writeln!(text, "- `{}`: {}", learned.name(), learned.summary());
+        let _ = writeln!(
+            text,
+            "- `{}`: {}; {}",
+            learned.name(),
+            learned.summary(),
+            on_front(learned.name())
+        );
     }
     for rows in cells(study) {
         let front = front(&rows);
