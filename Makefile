@@ -125,4 +125,4 @@ stability: build
 # docs/tradeoff: what accuracy costs in time. Some minutes on a machine that does nothing else.
 tradeoff: build
 	rm -f docs/tradeoff/tradeoff.json
-	target/release/oapwatch tradeoff --frames 60 --out docs/tradeoff
+	target/release/oapwatch tradeoff --frames 200 --out docs/tradeoff
