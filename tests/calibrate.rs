@@ -24,14 +24,16 @@ struct Device {
     /// A corner is displaced by this share of its radius: r_d = r·(1 + bend·(r/R)²).
     bend: f64,
     gain: Array2<f64>,
+    /// Even light on all pixels, J.
+    light_j: f64,
 }
 
 impl Device {
-    fn new(bend: f64, width_error: f64, gain_scatter: f64, rng: &mut impl Rng) -> Self {
+    fn new(noise_j: f64, bend: f64, width_error: f64, gain_scatter: f64, rng: &mut impl Rng) -> Self {
         let optics = Config {
             pixels: [N, N],
             spot_sigma_m: Some(SIGMA_M * (1.0 + width_error)),
-            noise_std_j: NOISE_J,
+            noise_std_j: noise_j,
             ..Config::default()
         };
         let scatter = Normal::new(1.0, gain_scatter).unwrap();
@@ -39,6 +41,7 @@ impl Device {
             camera: optics.camera().unwrap(),
             bend,
             gain: Array2::from_shape_simple_fn((N, N), || scatter.sample(rng)),
+            light_j: 0.0,
         }
     }
 
@@ -73,15 +76,18 @@ impl Device {
     }
 
     fn frame(&self, emitters: &Emitters, rng: &mut impl Rng) -> Array2<f64> {
-        let noise = Normal::new(0.0, NOISE_J).unwrap();
-        self.expose(emitters).0.mapv(|v| v + noise.sample(rng))
+        let noise = Normal::new(0.0, self.camera.noise_std_j).unwrap();
+        let light = self.gain.mapv(|g| g * self.light_j);
+        (self.expose(emitters).0 + light).mapv(|v| v + noise.sample(rng))
     }
 
     /// Cramér–Rao bound of each position, both axes summed, m² on the ground of the undistorted scale (the distortion
     /// changes that by a few per cent at most).
     fn bound(&self, emitters: &Emitters) -> Vec<f64> {
         let (_, columns) = self.expose(emitters);
-        let j = DMatrix::from_fn(N * N, columns.len(), |p, k| columns[k][[p / N, p % N]] / NOISE_J);
+        let j = DMatrix::from_fn(N * N, columns.len(), |p, k| {
+            columns[k][[p / N, p % N]] / self.camera.noise_std_j
+        });
         // Columns in m and in J differ by orders of magnitude: scale them before inverting.
         let scale: Vec<f64> = j.column_iter().map(|c| 1.0 / c.norm()).collect();
         let scaled = DMatrix::from_fn(j.nrows(), j.ncols(), |r, c| j[(r, c)] * scale[c]);
@@ -133,11 +139,11 @@ fn write_truth(path: &Path, scenes: &[Emitters], shift: impl Fn(usize, usize) ->
     std::fs::write(path, lines.collect::<String>()).unwrap();
 }
 
-fn write_config(path: &Path, calibration: Option<&str>) {
+fn write_config(path: &Path, noise_j: f64, calibration: Option<&str>) {
     let line = calibration
         .map(|c| format!("calibration = \"{c}\"\n"))
         .unwrap_or_default();
-    let text = format!("[optics]\npixels = [{N}, {N}]\nspot_sigma_m = {SIGMA_M}\nnoise_std_j = {NOISE_J}\n{line}");
+    let text = format!("[optics]\npixels = [{N}, {N}]\nspot_sigma_m = {SIGMA_M}\nnoise_std_j = {noise_j}\n{line}");
     std::fs::write(path, text).unwrap();
 }
 
@@ -193,7 +199,7 @@ fn a_bent_lens_a_wrong_width_and_uneven_pixels_are_calibrated_away() {
     let dir = tempfile::tempdir().unwrap();
     let at = |name: &str| dir.path().join(name);
     let mut rng = ChaCha8Rng::seed_from_u64(5);
-    let device = Device::new(0.02, 0.05, 0.01, &mut rng);
+    let device = Device::new(NOISE_J, 0.02, 0.05, 0.01, &mut rng);
     let (frames, scenes) = record(dir.path(), "beacons.npy", &device, 80, &mut rng);
     // One row in twenty is wrong by 30 m, and a few by a metre and a half.
     write_truth(&at("truth.ndjson"), &scenes, |frame, k| match (7 * frame + k) % 40 {
@@ -201,9 +207,9 @@ fn a_bent_lens_a_wrong_width_and_uneven_pixels_are_calibrated_away() {
         5 => -1.5,
         _ => 0.0,
     });
-    write_config(&at("plain.toml"), None);
+    write_config(&at("plain.toml"), NOISE_J, None);
     // The config may name the calibration before it is there.
-    write_config(&at("calibrated.toml"), Some("calibration.toml"));
+    write_config(&at("calibrated.toml"), NOISE_J, Some("calibration.toml"));
     let out = calibrate(
         &at("calibrated.toml"),
         &at("truth.ndjson"),
@@ -229,14 +235,79 @@ fn a_bent_lens_a_wrong_width_and_uneven_pixels_are_calibrated_away() {
     assert!(found > 0.99, "{found}");
 }
 
+/// A device, beams of which a few are surveyed wrongly, and what `locate` makes of fresh frames: error over bound before and after.
+fn before_and_after(noise_j: f64, frames: usize, seed: u64) -> (f64, f64) {
+    let dir = tempfile::tempdir().unwrap();
+    let at = |name: &str| dir.path().join(name);
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    let device = Device::new(noise_j, 0.02, 0.05, 0.01, &mut rng);
+    let (recorded, scenes) = record(dir.path(), "beacons.npy", &device, frames, &mut rng);
+    write_truth(&at("truth.ndjson"), &scenes, |frame, k| match (7 * frame + k) % 20 {
+        0 => 30.0,
+        _ => 0.0,
+    });
+    write_config(&at("plain.toml"), noise_j, None);
+    write_config(&at("calibrated.toml"), noise_j, Some("calibration.toml"));
+    let out = calibrate(
+        &at("calibrated.toml"),
+        &at("truth.ndjson"),
+        &at("calibration.toml"),
+        &recorded,
+    );
+    assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
+    let (fresh, scenes) = record(dir.path(), "fresh.npy", &device, 100, &mut rng);
+    let ratio = |config: &str| error_over_bound(&at(config), &fresh, &device, &scenes).0;
+    (ratio("plain.toml"), ratio("calibrated.toml"))
+}
+
+/// The table of docs/calibration.md: `cargo test --release --test calibrate -- --ignored --nocapture`.
+#[test]
+#[ignore = "minutes; a measurement"]
+fn what_is_left_of_the_error() {
+    println!("| noise of a pixel, µJ | frames | over the bound before | after, five devices |\n|---|---|---|---|");
+    for noise_j in [5e-6, 1e-6] {
+        for frames in [80, 200] {
+            let ratios: Vec<_> = (100..105).map(|seed| before_and_after(noise_j, frames, seed)).collect();
+            let before = ratios.iter().map(|r| r.0).sum::<f64>() / ratios.len() as f64;
+            let after: Vec<String> = ratios.iter().map(|r| format!("{:.2}", r.1)).collect();
+            println!("| {} | {frames} | {before:.0} | {} |", noise_j * 1e6, after.join(", "));
+        }
+    }
+}
+
+#[test]
+fn even_light_on_all_frames_is_not_taken_for_the_device() {
+    let dir = tempfile::tempdir().unwrap();
+    let at = |name: &str| dir.path().join(name);
+    let mut rng = ChaCha8Rng::seed_from_u64(7);
+    let mut device = Device::new(NOISE_J, 0.02, 0.05, 0.0, &mut rng);
+    // A third of a spot's brightest pixel.
+    device.light_j = 1e-4;
+    let (frames, scenes) = record(dir.path(), "beacons.npy", &device, 40, &mut rng);
+    write_truth(&at("truth.ndjson"), &scenes, |_, _| 0.0);
+    write_config(&at("calibrated.toml"), NOISE_J, Some("calibration.toml"));
+    let out = calibrate(
+        &at("calibrated.toml"),
+        &at("truth.ndjson"),
+        &at("calibration.toml"),
+        &frames,
+    );
+    let text = String::from_utf8_lossy(&out.stdout).into_owned() + &String::from_utf8_lossy(&out.stderr);
+    assert!(out.status.success(), "{text}");
+    let (fresh, scenes) = record(dir.path(), "fresh.npy", &device, 40, &mut rng);
+    let (after, found) = error_over_bound(&at("calibrated.toml"), &fresh, &device, &scenes);
+    // The bound does not count what the unknown light costs; the ratio scatters by 6 %.
+    assert!(after < 1.5 && found > 0.99, "{after} {found}\n{text}");
+}
+
 #[test]
 fn a_calibration_that_helps_nobody_is_not_written() {
     let dir = tempfile::tempdir().unwrap();
     let at = |name: &str| dir.path().join(name);
     let mut rng = ChaCha8Rng::seed_from_u64(6);
-    let device = Device::new(0.0, 0.0, 0.0, &mut rng);
+    let device = Device::new(NOISE_J, 0.0, 0.0, 0.0, &mut rng);
     let (frames, scenes) = record(dir.path(), "beacons.npy", &device, 15, &mut rng);
-    write_config(&at("plain.toml"), None);
+    write_config(&at("plain.toml"), NOISE_J, None);
     // Rows that belong to other frames.
     let shuffled: Vec<Emitters> = (0..scenes.len())
         .map(|k| scenes[(k + 4) % scenes.len()].clone())
@@ -254,9 +325,9 @@ fn input_that_cannot_be_used_is_named() {
     let dir = tempfile::tempdir().unwrap();
     let at = |name: &str| dir.path().join(name);
     let mut rng = ChaCha8Rng::seed_from_u64(8);
-    let device = Device::new(0.0, 0.0, 0.0, &mut rng);
+    let device = Device::new(NOISE_J, 0.0, 0.0, 0.0, &mut rng);
     let (frames, scenes) = record(dir.path(), "beacons.npy", &device, 6, &mut rng);
-    write_config(&at("plain.toml"), None);
+    write_config(&at("plain.toml"), NOISE_J, None);
     let says = |truth: &str, code: i32, expected: &str| {
         std::fs::write(at("truth.ndjson"), truth).unwrap();
         let out = calibrate(&at("plain.toml"), &at("truth.ndjson"), &at("calibration.toml"), &frames);
@@ -276,7 +347,7 @@ fn input_that_cannot_be_used_is_named() {
     std::fs::write(at("other.toml"), "[optics]\npixels = [32, 32]\n").unwrap();
     let out = calibrate(&at("other.toml"), &at("good.ndjson"), &at("calibration.toml"), &frames);
     assert_eq!(out.status.code(), Some(2));
-    write_config(&at("broken.toml"), Some("broken-calibration.toml"));
+    write_config(&at("broken.toml"), NOISE_J, Some("broken-calibration.toml"));
     std::fs::write(at("broken-calibration.toml"), "version = 2").unwrap();
     let out = oapwatch(&[&"locate", &"--config", &at("broken.toml"), &frames]);
     assert_eq!(out.status.code(), Some(64), "{}", String::from_utf8_lossy(&out.stderr));

@@ -8,7 +8,7 @@ use super::believe::{Displacement, displacements, excess_variance, median};
 use super::device::{DEVICE, Prior, device_of, set_device};
 use super::maps;
 use super::shot::{Normal, PER_SPOT, Scaled, Shot, Spot};
-use super::sources::{add_missing, drop_dark, solve_energies};
+use super::sources::{add_missing, background_strength, drop_dark, solve_energies};
 use super::truth::Beacon;
 use crate::optics::{Camera, Distortion};
 
@@ -16,6 +16,8 @@ use crate::optics::{Camera, Distortion};
 const REJECT: f64 = 5.0;
 /// A beacon is absent, and a source that nobody surveyed is modelled, below and above this share of the median energy.
 const NOTABLE: f64 = 0.15;
+/// Median over the frames of the background's χ² of three degrees of freedom from which one is modelled; 1 % exceed it by chance.
+const BACKGROUND: f64 = 11.3;
 const MAX_ROUNDS: usize = 24;
 
 /// The fit's state.
@@ -67,6 +69,7 @@ impl<'a> Fit<'a> {
         let camera = &self.camera;
         self.shots.par_iter_mut().for_each(|shot| solve_energies(shot, camera));
         self.fit_shots(12);
+        self.judge_background();
         self.update_noise();
         self.tidy_spots();
         let mut quiet = 0;
@@ -270,6 +273,18 @@ impl<'a> Fit<'a> {
                 spot.trusted = d.is_some_and(|d| d.mahalanobis2(tether) < REJECT * REJECT);
             }
         }
+    }
+
+    /// Leaves the background out of all frames unless most show one: under melted spots it costs accuracy.
+    fn judge_background(&mut self) {
+        let tether = self.tether_m2;
+        let strengths = self.shots.par_iter().zip(&self.normals);
+        let strengths = strengths.filter_map(|(shot, normal)| background_strength(shot, normal, tether));
+        if median(strengths.collect()).is_some_and(|s| s > BACKGROUND) {
+            return;
+        }
+        self.shots.iter_mut().for_each(|shot| shot.background = None);
+        self.fit_shots(4);
     }
 
     /// A frame that is explained far worse than most has something in it that the fit does not know.

@@ -130,7 +130,7 @@ pub fn fit(
             pixels: pixels.iter().map(|v| if v.is_finite() { *v } else { 0.0 }).collect(),
             valid: pixels.iter().map(|v| v.is_finite() && *v < saturated).collect(),
             spots: Vec::new(),
-            background: None,
+            background: Some([0.0; 3]),
             chi2: 0.0,
             trusted: true,
         })

@@ -28,6 +28,19 @@ pub(super) fn solve_energies(shot: &mut Shot, camera: &Camera) {
     }
 }
 
+/// χ² of a frame's background against none, everything else of the frame fitted with it.
+pub(super) fn background_strength(shot: &Shot, normal: &Normal, tether_m2: f64) -> Option<f64> {
+    let background = shot.background?;
+    let (h, _) = shot.tethered(normal, tether_m2);
+    let inverse = Scaled::new(&h, 1e-12)?.solve_many(&Mat::identity(h.nrows(), h.nrows()));
+    let first = 3 * shot.spots.len();
+    let covariance = Mat::from_fn(background.len(), background.len(), |a, b| {
+        inverse[(first + a, first + b)]
+    });
+    let weighted = Scaled::new(&covariance, 0.0)?.solve(&background);
+    Some(background.iter().zip(weighted).map(|(b, w)| b * w).sum())
+}
+
 /// Drops the spots that surely have less energy than `least_j`: two that overlap may share theirs out at will.
 pub(super) fn drop_dark(shot: &mut Shot, normal: &Normal, tether_m2: f64, least_j: f64) {
     let (h, _) = shot.tethered(normal, tether_m2);

@@ -58,16 +58,13 @@ pub fn run(args: Args) -> Outcome {
                 return Err(Failure::input(e));
             }
         };
-        let mut frame = Frame {
+        let frame = Frame {
             index: index as u64,
             time: start,
             pixels,
             masked: None,
         };
         let clock = Instant::now();
-        if let Some(maps) = &camera.pixels {
-            maps.correct(&mut frame, camera.saturation_j);
-        }
         let estimate = estimator.estimate(&frame);
         let latency_us = clock.elapsed().as_micros() as u64;
         let (emitters, error) = match &estimate {
