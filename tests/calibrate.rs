@@ -14,7 +14,7 @@ use rand_distr::{Distribution, Normal};
 
 const N: usize = 20;
 const SIGMA_M: f64 = 2e-3;
-const NOISE_J: f64 = 5e-6;
+const NOISE_J: f64 = 1e-6;
 
 type Emitters = Vec<([f64; 2], f64)>;
 
