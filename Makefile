@@ -122,6 +122,12 @@ stability: build
 	for each in $(STABILITY); do \
 		target/release/oapwatch stability --only "$${each%:*}" --frames "$${each#*:}" | grep -v '^All ' >> docs/stability/cases.md; done
 
+.PHONY: native
+# What a build for this very processor gains over the packaged one. Takes every dependency once more.
+native: build
+	RUSTFLAGS="-C target-cpu=native" cargo build --release --locked --bin oapwatch --target-dir target/native
+	benches/native.py target/release/oapwatch target/native/release/oapwatch
+
 .PHONY: tradeoff
 # docs/tradeoff: what accuracy costs in time. Some minutes on a machine that does nothing else.
 tradeoff: build
