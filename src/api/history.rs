@@ -35,7 +35,7 @@ pub struct PastBeam {
     pub x_m: f32,
     pub y_m: f32,
     pub status: PositionStatus,
-    /// One name for all moments: thousands of small ones would each hold a page of memory.
+    /// One name for all moments.
     #[serde(skip_serializing_if = "Option::is_none", serialize_with = "name")]
     #[schema(value_type = Option<String>)]
     pub user: Option<Arc<str>>,

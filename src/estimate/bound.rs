@@ -15,7 +15,7 @@ pub struct Beside<'a> {
     /// Pixels (Ny × Nx, row-major) that tell nothing.
     pub unusable: Option<&'a [bool]>,
     /// Standard deviation of each emitter's energy, J, where it is known beforehand as well as that; every emitter is then
-    /// known to be in view too.
+    /// known to be in view too. Good while errors are small: an estimator may go below where a position is hardly known.
     pub known: Option<&'a [f64]>,
 }
 

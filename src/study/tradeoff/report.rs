@@ -57,7 +57,7 @@ pub(super) fn markdown(study: &Study) -> String {
         "{frames} frames a cell, seed {seed}; one thread. A cell is the reading of the noise (E energy, P paper), σ_eff in mm, and pixels \
          a side; 5 to 9 emitters unless it says otherwise. Squared errors are over matched pairs, both axes summed; r is the trimmed \
          ratio to the Cramér–Rao bound among resolvable emitters, 1 being at the bound. The bound with powers known is for `map`, over all \
-         emitters; N right is the share of frames with the \
+         emitters, and no strict one where positions are hardly known; N right is the share of frames with the \
          number of emitters right, of all and of those where every emitter can be resolved. Bold names are on the Pareto front of time \
          and OSPA (order 2, 25 m). Times depend on the machine and on what else it does; everything else only on the seed.\n"
     );
