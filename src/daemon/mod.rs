@@ -2,6 +2,7 @@
 
 mod claims_log;
 mod compute;
+mod intake;
 pub mod logging;
 mod publish;
 mod reload;

@@ -97,5 +97,5 @@ fn a_stranger_anywhere_in_view() {
         within(2.0),
         within(5.0)
     );
-    assert!(within(1.0) as f64 > 0.98 * N as f64);
+    assert!(within(1.0) as f64 > 0.99 * N as f64);
 }

@@ -1,0 +1,103 @@
+//! What reaches the compute thread beside the frames: claims of the log and by POST, acknowledgements.
+
+use std::time::{Duration, Instant};
+
+use super::compute::Compute;
+use crate::api::{Acknowledged, Command};
+use crate::claims::{Outcome, Refused};
+use crate::metric;
+use crate::monitor::AlertState;
+
+/// How often lines of the claims log that are no claims are logged.
+const COMPLAIN_EVERY: Duration = Duration::from_secs(10);
+
+impl Compute {
+    /// Claims by POST and acknowledgements.
+    pub(super) fn obey(&mut self) {
+        while let Ok(command) = self.commands.try_recv() {
+            match command {
+                Command::Claims { claims, reply } => {
+                    let now = self.now();
+                    let mut refused = Vec::new();
+                    for (index, claim) in claims.into_iter().enumerate() {
+                        if self.recorder.is_some() {
+                            self.unrecorded.push(claim.clone());
+                        }
+                        let reason = match self.pipeline.claims.insert(claim, now) {
+                            Outcome::Full => "the store of claims is full",
+                            Outcome::Conflicting => "another position was claimed for this user and time",
+                            Outcome::TooLate => "older than all that is kept of this user",
+                            Outcome::Accepted | Outcome::Ahead | Outcome::Late | Outcome::Duplicate => continue,
+                        };
+                        refused.push((index, reason.to_owned()));
+                    }
+                    // A client that has gone away needs no answer.
+                    let _ = reply.send(refused);
+                }
+                Command::Acknowledge { id, reply } => {
+                    let outcome = match self.pipeline.monitor.acknowledge(&id, self.now()) {
+                        Some(event) => {
+                            let alert = event.alert.clone();
+                            self.outlet.events(vec![event], self.now());
+                            Acknowledged::Done(Box::new(alert))
+                        }
+                        None => match self.journal.alert(&id) {
+                            Ok(Some(alert)) if alert.state == AlertState::Cleared => Acknowledged::AlreadyCleared,
+                            Ok(Some(alert)) => Acknowledged::Done(Box::new(alert)),
+                            Ok(None) | Err(_) => Acknowledged::Unknown,
+                        },
+                    };
+                    self.outlet.acknowledged(reply, outcome);
+                }
+            }
+        }
+    }
+
+    /// Takes in what the claims log has gained.
+    pub(super) fn follow_log(&mut self) {
+        let mut again = false;
+        while let Some(poll) = self.follower.as_mut().and_then(|log| log.next(again)) {
+            let poll = match poll {
+                Ok(poll) => poll,
+                Err(error) => {
+                    if !self.state.log_broken {
+                        tracing::warn!(%error, "the claims log cannot be read");
+                    }
+                    self.state.log_broken = true;
+                    return;
+                }
+            };
+            self.state.log_broken = false;
+            if poll.restarted {
+                tracing::info!("the claims log was replaced; reading it from its start");
+            }
+            if let Some(first) = poll.refused.first() {
+                let count = poll.refused_count;
+                self.state.malformed += count;
+                metrics::counter!(metric::CLAIMS, "outcome" => "malformed").increment(count);
+                self.complain(first, count);
+            }
+            if self.is_replay {
+                self.pipeline.claim(poll.claims, self.state.clock);
+            } else {
+                self.fresh.extend(poll.claims);
+            }
+            // A recording's first frame waits until the whole log has been read, so that no claim comes late.
+            again = self.is_replay && self.state.counts.captured == 0;
+            if !(poll.more && again) {
+                return;
+            }
+        }
+    }
+
+    /// Names a line that is no claim, unless one was named a moment ago: a log of nothing else must not fill ours.
+    fn complain(&mut self, first: &Refused, count: u64) {
+        self.state.unnamed += count;
+        if self.state.complained.is_some_and(|t| t.elapsed() < COMPLAIN_EVERY) {
+            return;
+        }
+        let count = std::mem::take(&mut self.state.unnamed);
+        self.state.complained = Some(Instant::now());
+        tracing::warn!(line = first.line, error = %first.error, count, "lines of the claims log are no claims");
+    }
+}
