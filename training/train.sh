@@ -7,6 +7,7 @@ cd "$(dirname "$0")/.."
 minutes=${1:-60}
 samples=${2:-500000}
 sizes=${SIZES:-10 20 40 60 64 80 100}
+readings=${READINGS:-energy-1mm paper-8mm}
 networks=${NETWORKS:-cnn16 cnn16-separable unet}
 python=${PYTHON:-training/.venv/bin/python}
 program=${PROGRAM:-target/release/oapwatch}
@@ -17,7 +18,7 @@ fi
 if [ ! -x "$program" ]; then cargo build --release --locked; fi
 mkdir -p training/runs training/models
 for pixels in $sizes; do
-  for reading in energy-1mm paper-8mm; do
+  for reading in $readings; do
     scene=training/runs/$reading-$pixels.toml
     sed "s/^pixels = .*/pixels = [$pixels, $pixels]/" "training/scenes/$reading.toml" > "$scene"
     # Where spots melt into each other, a network learns from whitened frames what it does not from plain ones.

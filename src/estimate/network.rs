@@ -14,8 +14,8 @@ use tract_onnx::prelude::*;
 /// What the program carries with it: 64 × 64 pixels, σ_eff 1 mm.
 const EMBEDDED: (&str, &[u8], &str) = (
     "the embedded network",
-    include_bytes!("../../config/models/cnn16-energy-1mm-64.onnx"),
-    include_str!("../../config/models/cnn16-energy-1mm-64.toml"),
+    include_bytes!("../../config/models/cnn16-separable-energy-1mm-64.onnx"),
+    include_str!("../../config/models/cnn16-separable-energy-1mm-64.toml"),
 );
 /// Least height of a maximum that counts.
 const THRESHOLD: f32 = 0.3;
@@ -251,7 +251,7 @@ mod tests {
 
     /// A validation frame as the network takes it and onnxruntime's heatmap of it, two arrays of (64, 64) f4;
     /// `training/export.py --reference` wrote them.
-    const REFERENCE: &[u8] = include_bytes!("../../tests/reference/cnn16-energy-1mm-64.npy");
+    const REFERENCE: &[u8] = include_bytes!("../../tests/reference/cnn16-separable-energy-1mm-64.npy");
 
     fn reference() -> (Vec<f32>, Vec<f32>) {
         let data = &REFERENCE[REFERENCE.len() - 2 * 4 * 4096..];
