@@ -29,6 +29,10 @@ pub fn run(args: Args) -> Outcome {
         config.api.listen = listen;
     }
     let logging = logging::install(&config.log).map_err(Failure::config)?;
+    // The kernel would round a few megabytes in use up to tens, more of them the longer it runs.
+    if let Err(refused) = rustix::thread::disable_transparent_huge_pages(true) {
+        tracing::warn!(%refused, "transparent huge pages stay on: more memory than need be");
+    }
     let daemon = Daemon::new(config, args.config).map_err(Failure::Config)?;
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .enable_all()
