@@ -19,6 +19,10 @@ pub struct Claim {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schema(minimum = 0)]
     pub sigma_m: Option<f64>,
+    /// Power that the user reports to send; evidence only.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schema(minimum = 0)]
+    pub power_w: Option<f64>,
     #[serde(default)]
     #[schema(nullable)]
     pub state: ClaimState,

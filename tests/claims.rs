@@ -5,7 +5,7 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use jiff::{SignedDuration, Timestamp};
-use oapwatch::claims::{Claim, ClaimState, Config, Follower, LONGEST_LINE, Outcome, Poll, Store, read_log};
+use oapwatch::claims::{Claim, ClaimState, Config, Follower, LONGEST_LINE, Outcome, Poll, Store, parse_line, read_log};
 
 fn at(s: f64) -> Timestamp {
     let start: Timestamp = "2026-11-21T08:00:00Z".parse().unwrap();
@@ -23,6 +23,7 @@ fn claim(user: &str, s: f64, x_m: f64) -> Claim {
         x_m,
         y_m: 0.0,
         sigma_m: None,
+        power_w: None,
         state: ClaimState::Active,
     }
 }
@@ -233,4 +234,17 @@ fn a_flood_of_users_pushes_nobody_out() {
     store.insert(claim("b", 1000.0, 0.0), at(1000.0));
     assert_eq!(store.insert(claim("new", 1000.0, 0.0), at(1000.0)), Outcome::Accepted);
     assert!(store.user("b").is_some() && store.len() == 3);
+}
+
+#[test]
+fn a_reported_power_is_read_and_a_wrong_one_is_told() {
+    let read = |text: &str| parse_line(text.as_bytes(), &Config::default());
+    let line = |power: &str| format!("{{\"time\":1,\"user\":\"u\",\"x_m\":0,\"y_m\":0,\"power_w\":{power}}}");
+    assert_eq!(read(&line("0.25")).unwrap().power_w, Some(0.25));
+    assert_eq!(read(&line("null")).unwrap().power_w, None);
+    assert_eq!(read(&line("0")).unwrap().power_w, Some(0.0));
+    for wrong in ["-1", "\"1\""] {
+        let error = read(&line(wrong)).unwrap_err().to_string();
+        assert!(error.contains("power_w") && error.contains("watts"), "{error}");
+    }
 }

@@ -35,6 +35,7 @@ fn claim(k: u64) -> Claim {
         x_m: 100.0 * (k as f64 + 0.1).sin(),
         y_m: -80.0 / 3.0,
         sigma_m: Some(1.0),
+        power_w: None,
         state: ClaimState::Active,
     }
 }

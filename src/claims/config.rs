@@ -29,6 +29,7 @@ pub struct Fields {
     pub x_m: String,
     pub y_m: String,
     pub sigma_m: String,
+    pub power_w: String,
     pub state: String,
     /// Read instead of `x_m` and `y_m` when `[claims.origin]` is given.
     pub latitude_deg: String,
@@ -79,6 +80,7 @@ impl Default for Fields {
             x_m: "x_m".into(),
             y_m: "y_m".into(),
             sigma_m: "sigma_m".into(),
+            power_w: "power_w".into(),
             state: "state".into(),
             latitude_deg: "latitude_deg".into(),
             longitude_deg: "longitude_deg".into(),

@@ -26,7 +26,7 @@ pub enum LineError {
 }
 
 /// Reads one line of the network's log: a JSON object with the fields that `config` names, by default
-/// `{"time", "user", "x_m", "y_m", "sigma_m"?, "state"?}`. Other fields are ignored.
+/// `{"time", "user", "x_m", "y_m", "sigma_m"?, "power_w"?, "state"?}`. Other fields are ignored.
 pub fn parse_line(line: &[u8], config: &Config) -> Result<Claim, LineError> {
     let object: Value = serde_json::from_slice(line)?;
     if !object.is_object() {
@@ -54,6 +54,10 @@ pub fn parse_line(line: &[u8], config: &Config) -> Result<Claim, LineError> {
         None => None,
         Some(_) => Some(number(&object, &names.sigma_m, SIGMA, |s| s >= 0.0)?),
     };
+    let power_w = match optional(&object, &names.power_w) {
+        None => None,
+        Some(_) => Some(number(&object, &names.power_w, POWER, |p| p >= 0.0)?),
+    };
     let state = match optional(&object, &names.state) {
         None => ClaimState::Active,
         Some(value) => match value.as_str() {
@@ -68,6 +72,7 @@ pub fn parse_line(line: &[u8], config: &Config) -> Result<Claim, LineError> {
         x_m,
         y_m,
         sigma_m,
+        power_w,
         state,
     })
 }
@@ -78,6 +83,7 @@ const METRES: &str = "metres within 10000 km of the nadir";
 const LATITUDE: &str = "degrees between -90 and 90";
 const LONGITUDE: &str = "degrees between -180 and 180";
 const SIGMA: &str = "metres, zero or more";
+const POWER: &str = "watts, zero or more";
 
 fn optional<'a>(object: &'a Value, name: &str) -> Option<&'a Value> {
     let value = if name.starts_with('/') {

@@ -133,6 +133,7 @@ mod tests {
             x_m: 0.0,
             y_m: 0.0,
             sigma_m: None,
+            power_w: None,
             state: ClaimState::Active,
         };
         let frame = Frame {

@@ -6,6 +6,7 @@ use nalgebra::{Matrix2, Vector2};
 use super::bends::{Bends, Common};
 use super::detection::Detection;
 use super::motion::mahalanobis2;
+use super::steps::{Stepped, Steps};
 
 use crate::claims::seconds;
 use crate::estimate::Flags;
@@ -13,6 +14,8 @@ use crate::estimate::Flags;
 /// Newest frames that a test looks at.
 const WINDOWS: [usize; 4] = [10, 20, 40, 80];
 const LONGEST: usize = WINDOWS[WINDOWS.len() - 1];
+/// Frames since a step that a test looks at at least.
+const FEWEST_AFTER: usize = 3;
 /// Frames of a block of history, and blocks kept: two minutes at 10 frames/s.
 const BLOCK: u32 = 30;
 const BLOCKS: usize = 40;
@@ -33,8 +36,6 @@ const MOST_UNREST: f64 = 8.0;
 /// Honest unrest against its own past, and against the other users' median.
 const HONEST_UNREST: f64 = 1.5;
 const UNLIKE_OTHERS: f64 = 4.0;
-/// Share of the chance of a false alert that is for the test with the width: where that says anything it says much.
-const FOR_WIDTH: f64 = 0.1;
 /// Squared sums of second differences of white noise scatter as if only this share of them were independent:
 /// 1/(1 + 2(ρ₁² + ρ₂²)), ρ₁ = −2/3, ρ₂ = 1/6.
 const INDEPENDENT: f64 = 0.514;
@@ -44,14 +45,17 @@ const INDEPENDENT: f64 = 0.514;
 /// brighter than before and wanders between the two from frame to frame; and it is spread along the line between them.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Blend {
-    energies: VecDeque<f64>,
+    /// With the time of each.
+    energies: VecDeque<(Timestamp, f64)>,
     filling: Block,
     blocks: VecDeque<Block>,
-    unrest: VecDeque<f64>,
+    /// Each with the time of the first of its three positions.
+    unrest: VecDeque<(Timestamp, f64)>,
     /// Mean unrest before the newest frames, and how many it is of.
     rest: f64,
     rested: u32,
     last: VecDeque<(Timestamp, Vector2<f64>, Matrix2<f64>)>,
+    pub steps: Steps,
     pub bends: Bends,
 }
 
@@ -61,6 +65,23 @@ struct Block {
     mean: f64,
     /// Sum of squared deviations (Welford, 1962).
     squares: f64,
+}
+
+/// A second difference of positions.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Jump {
+    since: Timestamp,
+    pub by: Vector2<f64>,
+    cov: Matrix2<f64>,
+}
+
+impl Jump {
+    pub fn less(self, common: Vector2<f64>) -> Self {
+        Self {
+            by: self.by - common,
+            ..self
+        }
+    }
 }
 
 /// Sum of squared deviations and its degrees of freedom.
@@ -90,22 +111,42 @@ pub(super) struct Suspicion {
     /// Frame-to-frame unrest over what is expected.
     pub restless: f64,
     pub unrest_surprise: f64,
+    pub stepped: Stepped,
+    /// Of energy and unrest since the step.
+    pub energy_after: f64,
+    pub unrest_after: f64,
     /// Second moment beyond one spot's, σ².
     pub wider: f64,
     pub width_surprise: f64,
 }
 
 impl Suspicion {
-    /// All at once. With P(Sᵢ > s) ≤ e⁻ˢ and independent energies, positions and shapes, P(S₁ + S₂ > s) ≤ (1 + s)·e⁻ˢ and
-    /// P(S₁ + S₂ + S₃ > s) ≤ (1 + s + s²/2)·e⁻ˢ. Two beams on top of each other have the shape of one, so that both are asked, the
-    /// latter with a smaller share of the chance.
+    /// All at once: energies, positions and shapes are independent, and several sums of them are asked, each with its share of the
+    /// chance of a false alert. Two beams on top of each other have the shape of one; who was there from the start made no step.
     pub fn surprise(&self) -> f64 {
-        let two = self.energy_surprise + self.unrest_surprise;
-        let three = two + self.width_surprise;
-        let of_two = two - two.ln_1p() + (1.0 - FOR_WIDTH).ln();
-        let of_three = three - (three + 0.5 * three * three).ln_1p() + FOR_WIDTH.ln();
-        of_two.max(of_three).max(0.0)
+        let (energy, unrest, width) = (self.energy_surprise, self.unrest_surprise, self.width_surprise);
+        let (step, brighter, restless) = (self.stepped.surprise, self.energy_after, self.unrest_after);
+        let sums = [
+            (0.6, together(&[energy, unrest])),
+            (0.05, together(&[energy, unrest, width])),
+            (0.25, together(&[step, brighter])),
+            (0.05, together(&[step, brighter, width])),
+            (0.05, together(&[step, brighter, restless, width])),
+        ];
+        sums.into_iter()
+            .fold(0.0, |most, (share, sum)| most.max(sum + f64::ln(share)))
     }
+}
+
+/// The surprise of the sum of k independent ones, each with P(S > s) ≤ e⁻ˢ: P(ΣS > s) ≤ e⁻ˢ·Σ sʲ/j! over j < k (Erlang).
+fn together(of: &[f64]) -> f64 {
+    let sum: f64 = of.iter().sum();
+    let (mut term, mut series) = (1.0, 0.0);
+    for j in 1..=of.len() {
+        series += term;
+        term *= sum / j as f64;
+    }
+    sum - series.ln()
 }
 
 impl Scatter {
@@ -155,7 +196,7 @@ impl Blend {
     }
 
     /// Second difference of the newest three positions and its covariance, where they are from frames in a row.
-    pub fn jump(&mut self, time: Timestamp, detection: &Detection) -> Option<(Vector2<f64>, Matrix2<f64>)> {
+    pub fn jump(&mut self, time: Timestamp, detection: &Detection) -> Option<Jump> {
         self.last.push_back((time, detection.position, detection.cov));
         if self.last.len() > 3 {
             self.last.pop_front();
@@ -164,7 +205,11 @@ impl Blend {
         let (first, second) = (seconds(t0, t1), seconds(t1, t2));
         let even = first > 0.0 && (second / first - 1.0).abs() < 0.2 && second < 0.5;
         let motion = Matrix2::identity() * (ACCELERATION * first * second).powi(2);
-        even.then(|| (p2 - p1 * 2.0 + p0, c2 + c1 * 4.0 + c0 + motion))
+        even.then(|| Jump {
+            since: t0,
+            by: p2 - p1 * 2.0 + p0,
+            cov: c2 + c1 * 4.0 + c0 + motion,
+        })
     }
 
     /// Frames in which the spot is explained otherwise are no evidence.
@@ -173,13 +218,13 @@ impl Blend {
     }
 
     /// Takes a frame: the spot's energy, and its jump less what all beams have in common. `learn` adds what grows old to the past.
-    pub fn note(&mut self, detection: &Detection, jump: Option<(Vector2<f64>, Matrix2<f64>)>, learn: bool) {
+    pub fn note(&mut self, time: Timestamp, detection: &Detection, jump: Option<Jump>, learn: bool) {
         let spoilt = Flags::SATURATED | Flags::MASKED | Flags::NEAR_EDGE | Flags::OUT_OF_TIME;
         if detection.energy_j > 0.0 && !detection.flags.intersects(spoilt) {
             self.bends.note(&detection.moments, learn);
-            self.energies.push_back(detection.energy_j.ln());
+            self.energies.push_back((time, detection.energy_j.ln()));
             if self.energies.len() > LONGEST
-                && let Some(old) = self.energies.pop_front()
+                && let Some((_, old)) = self.energies.pop_front()
                 && learn
             {
                 self.filling.add(old);
@@ -191,10 +236,11 @@ impl Blend {
                 }
             }
         }
-        if let Some((d, cov)) = jump {
-            self.unrest.push_back((0.5 * mahalanobis2(d, cov)).min(MOST_UNREST));
+        if let Some(Jump { since, by, cov }) = jump {
+            self.unrest
+                .push_back((since, (0.5 * mahalanobis2(by, cov)).min(MOST_UNREST)));
             if self.unrest.len() > LONGEST
-                && let Some(old) = self.unrest.pop_front()
+                && let Some((_, old)) = self.unrest.pop_front()
                 && learn
             {
                 self.rested = (self.rested + 1).min(BLOCK * BLOCKS as u32);
@@ -241,6 +287,13 @@ impl Blend {
             {
                 (worst.restless, worst.unrest_surprise) = (restless, s);
             }
+        }
+        worst.stepped = self.steps.most().unwrap_or_default();
+        if let Some(since) = worst.stepped.since {
+            let energy = after(&self.energies, since).and_then(|n| self.energy_surprise(n, honest, company.scatter));
+            let unrest = after(&self.unrest, since).and_then(|n| self.unrest_surprise(n, company.unrest));
+            worst.energy_after = energy.map_or(0.0, |(_, s)| s);
+            worst.unrest_after = unrest.map_or(0.0, |(_, s)| s);
         }
         (worst.wider, worst.width_surprise) = self.bends.surprise(&company.moments);
         worst
@@ -302,6 +355,12 @@ impl Blend {
 }
 
 /// Mean of the newest `n`.
-fn newest(values: &VecDeque<f64>, n: usize) -> f64 {
-    values.iter().rev().take(n).sum::<f64>() / n as f64
+fn newest(values: &VecDeque<(Timestamp, f64)>, n: usize) -> f64 {
+    values.iter().rev().take(n).map(|(_, v)| v).sum::<f64>() / n as f64
+}
+
+/// How many there are from `since` on, where there are enough.
+fn after(values: &VecDeque<(Timestamp, f64)>, since: Timestamp) -> Option<usize> {
+    let n = values.iter().rev().take_while(|(t, _)| *t >= since).count();
+    (n >= FEWEST_AFTER).then_some(n)
 }

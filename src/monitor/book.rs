@@ -33,10 +33,17 @@ struct Open {
     alert: Alert,
     /// Since when the cause has been absent.
     quiet_since: Option<Timestamp>,
-    /// How often the cause came back after it had been absent.
+    /// How often the cause came back after it had been absent for half of what clears it.
     recurrences: u32,
     /// Taken over from an earlier run and not seen in this one.
     is_unseen: bool,
+}
+
+impl Open {
+    /// Absence that clears, s.
+    fn hold_s(&self, cool_down_s: f64) -> f64 {
+        (CLEAR_S * 2f64.powi(self.recurrences.min(20) as i32)).min(cool_down_s)
+    }
 }
 
 /// A cause that cleared lately.
@@ -157,7 +164,9 @@ impl Book {
     pub fn report(&mut self, cause: &Cause, finding: Finding, now: Timestamp, frame: u64) {
         if let Some(open) = self.open.get_mut(cause) {
             open.is_unseen = false;
-            if open.quiet_since.take().is_some() {
+            let hold_s = open.hold_s(self.cool_down_s);
+            let quiet_since = open.quiet_since.take();
+            if quiet_since.is_some_and(|since| seconds(since, now) >= 0.5 * hold_s) {
                 open.recurrences += 1;
             }
             let alert = &mut open.alert;
@@ -231,8 +240,8 @@ impl Book {
         self.cleared.remove(&same?).filter(is_recent).map(|c| c.recurrences)
     }
 
-    /// The cause is absent. Its alert clears after a second of that; twice as long each time it comes back within the
-    /// cool-down, so that a flapping cause stays one open alert.
+    /// The cause is absent. Its alert clears after a second of that; twice as long each time it comes back from half of that or
+    /// within the cool-down, so that a flapping cause stays one open alert.
     pub fn absent(&mut self, cause: &Cause, now: Timestamp) {
         let Some(open) = self.open.get_mut(cause) else {
             return;
@@ -241,8 +250,7 @@ impl Book {
             return;
         }
         let since = *open.quiet_since.get_or_insert(now);
-        let hold = (CLEAR_S * 2f64.powi(open.recurrences.min(20) as i32)).min(self.cool_down_s);
-        if seconds(since, now) >= hold {
+        if seconds(since, now) >= open.hold_s(self.cool_down_s) {
             self.clear(cause, now);
         }
     }

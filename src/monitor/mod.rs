@@ -14,6 +14,7 @@ mod report;
 mod residuals;
 mod sight;
 mod source;
+mod steps;
 mod thresholds;
 mod tracks;
 mod users;

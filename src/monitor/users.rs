@@ -100,4 +100,6 @@ pub(super) struct User {
     pub blend: Blend,
     /// Since when there are signs that it is: the present is not taken for the past.
     pub suspected_since: Option<Timestamp>,
+    /// When an emitter that had its own alert was last beside the beam.
+    pub accompanied: Option<Timestamp>,
 }

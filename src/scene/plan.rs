@@ -168,6 +168,7 @@ impl Plan {
             x_m: s.at_m[0],
             y_m: s.at_m[1],
             sigma_m: self.network.sigma_m(),
+            power_w: None,
             state: s.state,
         };
         arrivals.into_iter().map(claim).collect()

@@ -15,6 +15,7 @@ fn forged(user: &str, made: f64, x_m: f64, y_m: f64) -> Claim {
         x_m,
         y_m,
         sigma_m: Some(0.3),
+        power_w: None,
         state: ClaimState::Active,
     }
 }
@@ -300,4 +301,26 @@ fn ever_new_names_raise_a_bounded_number_of_alerts() {
     let told = tell_with(&story, false);
     // Ten within a minute, and one for all others.
     assert_eq!(told.raised().len(), 11, "{:?}", told.raised());
+}
+
+#[test]
+fn light_that_does_not_fit_the_reported_power_is_evidence() {
+    let mut actors = crowd();
+    // u-1 reports half of the others' power and sends it; who answers u-0's claim from 20 m off is a sixth as bright as u-0 reports.
+    actors.iter_mut().for_each(|a| a.reports_w = Some(1.0));
+    actors[1].reports_w = Some(0.5);
+    actors[1].energy_j *= 0.5;
+    actors[0] =
+        Actor::new("u-0", |_| [-80.0, -50.0]).beam(|t| Some(if t < 10.0 { [-80.0, -50.0] } else { [-80.0, -30.0] }));
+    actors[0].reports_w = Some(6.0);
+    let mut story = Story::new(3, actors);
+    story.seconds = 15.0;
+    let told = tell(&story);
+    let alert = &told.events[0].alert;
+    assert_eq!((alert.kind, alert.user.as_deref()), (PositionMismatch, Some("u-0")));
+    let power = &alert.evidence["power_against_reported"];
+    assert_eq!(power["reported_w"], 6.0);
+    let ratio = power["ratio"].as_f64().unwrap();
+    assert!((0.08..0.35).contains(&ratio), "{ratio}");
+    assert!(power["likelihood_ratio"].as_f64().unwrap() > 10.0, "{power}");
 }

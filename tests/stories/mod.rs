@@ -30,6 +30,8 @@ pub struct Actor {
     pub states_sigma: bool,
     pub ended_at: Option<f64>,
     pub energy_j: f64,
+    /// Power that the claims state.
+    pub reports_w: Option<f64>,
 }
 
 impl Actor {
@@ -45,6 +47,7 @@ impl Actor {
             states_sigma: true,
             ended_at: None,
             energy_j: 0.007,
+            reports_w: None,
         }
     }
 
@@ -59,6 +62,7 @@ impl Actor {
             states_sigma: true,
             ended_at: None,
             energy_j: 0.007,
+            reports_w: None,
         }
     }
 

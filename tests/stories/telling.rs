@@ -180,6 +180,7 @@ pub fn claims(story: &Story) -> Vec<(f64, Claim)> {
                         x_m: x + ex,
                         y_m: y + ey,
                         sigma_m: actor.states_sigma.then_some(actor.sigma_m),
+                        power_w: actor.reports_w,
                         state: if over { ClaimState::Ended } else { ClaimState::Active },
                     },
                 ));

@@ -3,6 +3,7 @@
 mod answers;
 pub(super) mod habits;
 mod inputs;
+mod power;
 mod spots;
 mod summary;
 mod unclaimed;

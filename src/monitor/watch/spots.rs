@@ -11,6 +11,7 @@ use crate::monitor::bends::Common;
 use crate::monitor::blend::{Blend, Company, Scatter};
 use crate::monitor::book::{Cause, Finding};
 use crate::monitor::motion::largest_eigenvalue;
+use crate::monitor::steps::{TRIED, Tried};
 use crate::monitor::thresholds::Family;
 use crate::monitor::tracks::Track;
 use crate::monitor::users::Asserted;
@@ -40,10 +41,19 @@ impl Monitor {
             let name = &asserted[*i].claim.user;
             let cause = Cause::Spot(name.clone());
             let company = self.company(name, asserted, &watched);
+            let is_accompanied = self.is_beside_unclaimed(track);
             let Some(user) = self.users.get_mut(name) else { continue };
+            if is_accompanied {
+                user.accompanied = Some(now);
+            }
+            let accompanied = user.accompanied;
             let seen = user.blend.suspicion(brightening, &company);
             let is_suspect = seen.surprise() > SUSPECT * level;
-            user.suspected_since = is_suspect.then(|| user.suspected_since.unwrap_or(now));
+            let began = match seen.stepped.surprise > SUSPECT * level {
+                true => seen.stepped.since.unwrap_or(now),
+                false => now,
+            };
+            user.suspected_since = is_suspect.then(|| user.suspected_since.unwrap_or(now).min(began));
             let Some(suspected) = user.suspected_since else {
                 continue;
             };
@@ -53,7 +63,8 @@ impl Monitor {
                 continue;
             }
             let past = user.blend.past_energy();
-            if !open && self.is_beside_unclaimed(track) {
+            // One detection that goes astray does not part the two.
+            if !open && accompanied.is_some_and(|t| seconds(t, now) < patience_s) {
                 continue;
             }
             suspects.insert(name.clone());
@@ -76,7 +87,15 @@ impl Monitor {
                     "past_ln_j": past.map(|p| p.0),
                     "past_ln_std": past.map(|p| p.1),
                 },
+                "power_against_reported": self.against_reported(asserted, answers, *i),
                 "unrest_over_the_expected": { "ratio": seen.restless, "surprise": seen.unrest_surprise },
+                "step_aside": {
+                    "length_m": seen.stepped.length_m,
+                    "surprise": seen.stepped.surprise,
+                    "since": seen.stepped.since,
+                    "energy_surprise": seen.energy_after,
+                    "unrest_surprise": seen.unrest_after,
+                },
                 "width_over_the_expected": { "moment_in_sigma2": seen.wider, "surprise": seen.width_surprise },
                 "surprise": seen.surprise(),
                 "threshold": level,
@@ -151,17 +170,22 @@ impl Monitor {
                 user.blend.jump(track.last_hit, &track.detection)
             })
             .collect();
-        let known: Vec<Vector2<f64>> = jumps.iter().flatten().map(|(d, _)| *d).collect();
-        let common = if known.len() > FEWEST_OTHERS {
-            let axis = |k: usize| median(known.iter().map(|d| d[k])).unwrap_or(0.0);
-            Vector2::new(axis(0), axis(1))
-        } else {
-            Vector2::zeros()
-        };
-        for ((i, track), jump) in watched.iter().zip(jumps) {
+        let steps: Vec<Tried> = watched
+            .iter()
+            .map(|(i, track)| {
+                let user = self.users.get_mut(&asserted[*i].claim.user);
+                user.map_or_else(Tried::default, |u| u.blend.steps.look(track.last_hit, &track.detection))
+            })
+            .collect();
+        let common_jump = common(jumps.iter().flatten().map(|jump| jump.by));
+        let common_steps =
+            std::array::from_fn::<_, { TRIED }, _>(|k| common(steps.iter().filter_map(|s| Some(s[k]?.aside))));
+        for (((i, track), jump), steps) in watched.iter().zip(jumps).zip(steps) {
             if let Some(user) = self.users.get_mut(&asserted[*i].claim.user) {
-                let jump = jump.map(|(d, cov)| (d - common, cov));
-                user.blend.note(&track.detection, jump, user.suspected_since.is_none());
+                let jump = jump.map(|jump| jump.less(common_jump));
+                let learn = user.suspected_since.is_none();
+                user.blend.note(track.last_hit, &track.detection, jump, learn);
+                user.blend.steps.note(&steps, &common_steps, learn);
             }
         }
     }
@@ -211,5 +235,15 @@ impl Monitor {
             let lost = self.tracks.get(*id).is_none_or(|t| !t.hit);
             (lost && away < BESIDE * track.detection.resolution_m).then(|| cause.clone())
         })
+    }
+}
+
+/// What displacements have in common: nothing, where too few are known.
+fn common(displacements: impl Iterator<Item = Vector2<f64>>) -> Vector2<f64> {
+    let known: Vec<_> = displacements.collect();
+    let axis = |k: usize| median(known.iter().map(|d| d[k])).unwrap_or(0.0);
+    match known.len() > FEWEST_OTHERS {
+        true => Vector2::new(axis(0), axis(1)),
+        false => Vector2::zeros(),
     }
 }

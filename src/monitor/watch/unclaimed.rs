@@ -3,6 +3,7 @@ use nalgebra::Vector2;
 use serde_json::{Value, json};
 
 use super::habits::median;
+use super::power::likelihood_ratio;
 use super::{COINCIDENCE_S, ESCALATE_S, Monitor};
 use crate::claims::seconds;
 use crate::monitor::alert::SAME_PLACE_M;
@@ -197,10 +198,8 @@ impl Monitor {
                 .filter_map(|u| Some(self.tracks.get(u.track?)?.detection.energy_j)),
         );
         let energy = usual.map(|usual| {
-            // ln energies of honest users scatter by about 0.3 (ten coherence times a frame); a stranger's by any factor of ten.
-            let z = (track.detection.energy_j.max(1e-30) / usual.max(1e-30)).ln() / 0.3;
-            let (honest, stranger) = ((-0.5 * z * z).exp() / 0.3, (-0.5 * (0.3 * z / 2.3).powi(2)).exp() / 2.3);
-            json!({ "users_median_j": usual, "likelihood_ratio": (stranger / honest.max(1e-12)).min(1e9) })
+            let off = (track.detection.energy_j.max(1e-30) / usual.max(1e-30)).ln();
+            json!({ "users_median_j": usual, "likelihood_ratio": likelihood_ratio(off) })
         });
         let severity = if lasted >= ESCALATE_S {
             Severity::Critical

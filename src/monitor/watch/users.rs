@@ -104,8 +104,8 @@ impl Monitor {
             .level_every(self.period_s.unwrap_or(0.0), Family::Mismatch, each);
         let level_unseen = self.thresholds.level(Family::Unseen, asserted.len() as f64);
         let mut strangers = Strangers::default();
-        for (a, answer) in asserted.iter().zip(answers) {
-            self.decide_mismatch(a, *answer, level, now);
+        for (i, a) in asserted.iter().enumerate() {
+            self.decide_mismatch(asserted, answers, i, level, now);
             self.decide_unseen(a, level_unseen, &mut strangers, now);
         }
         self.decide_strangers(strangers, now);
@@ -121,11 +121,19 @@ impl Monitor {
         }
     }
 
-    fn decide_mismatch(&mut self, a: &Asserted, answer: Option<u64>, level: f64, now: Timestamp) {
+    fn decide_mismatch(
+        &mut self,
+        asserted: &[Asserted],
+        answers: &[Option<u64>],
+        i: usize,
+        level: f64,
+        now: Timestamp,
+    ) {
+        let a = &asserted[i];
         let tolerated = self.config.tolerated_distance_m;
         let floor = self.floor(a.position);
         let cause = Cause::User(AlertKind::PositionMismatch, a.claim.user.clone());
-        let track = answer.and_then(|id| self.tracks.get(id));
+        let track = answers[i].and_then(|id| self.tracks.get(id));
         let unsure_s = self.unsure_of_clock_s(now);
         let settled = self.claims_settled(now);
         let Some(user) = self.users.get_mut(&a.claim.user) else {
@@ -145,7 +153,8 @@ impl Monitor {
             return;
         };
         let distance = (track.motion.position() - a.position).norm();
-        let severity = if user.displaced || distance > 2.0 * tolerated {
+        let (is_displaced, outside) = (user.displaced, user.outside);
+        let severity = if is_displaced || distance > 2.0 * tolerated {
             Severity::Critical
         } else {
             Severity::Warning
@@ -158,9 +167,10 @@ impl Monitor {
             "threshold": level,
             "claims_in_window": excess.window,
             "mean_distance_m": excess.distance_m,
-            "frames_outside": user.outside,
+            "frames_outside": outside,
             "clock_offset_s": self.ahead_s,
-            "answered_from_elsewhere": user.displaced,
+            "answered_from_elsewhere": is_displaced,
+            "power_against_reported": self.against_reported(asserted, answers, i),
         });
         let mut finding = self.at_track(Finding::new(severity, evidence), track);
         finding.claimed = claimed(a);

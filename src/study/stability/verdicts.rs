@@ -124,6 +124,7 @@ fn claim(time: Timestamp) -> Claim {
         x_m: 10.0,
         y_m: -20.0,
         sigma_m: Some(1.0),
+        power_w: None,
         state: ClaimState::Active,
     }
 }
