@@ -22,7 +22,7 @@ test: setup setup-test
 setup:
 	@command -v cargo >/dev/null || { echo "Rust is missing: install it from https://rustup.rs"; exit 1; }
 	$(call need,command -v cc,build-essential)
-	$(call need,sh -c 'ls /usr/lib/llvm-*/lib/libclang*.so* | grep -q .',libclang-dev)
+	$(call need,sh -c 'ls /usr/lib/llvm-*/lib/ | grep -qE "^libclang(-[0-9.]+)?[.]so"',libclang-dev)
 
 setup-test:
 	$(call need,command -v chromium,chromium chromium-driver)
