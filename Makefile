@@ -35,6 +35,7 @@ setup-test:
 .PHONY: test-licences
 test-licences: setup-test
 	cargo deny --locked check licenses bans sources
+	@cargo metadata --locked --format-version 1 --manifest-path fuzz/Cargo.toml >/dev/null
 
 .PHONY: deb
 # The Debian package, target/oapwatch.deb, linted and measured. PROFILE=release builds what the tests have built already.

@@ -19,6 +19,8 @@ pub enum Error {
     Hung,
     #[error("the journal's disk thread ended")]
     Closed,
+    #[error("reading the journal broke off inside oapwatch")]
+    Panicked,
     #[error("the journal cannot be read: {0}")]
     Read(#[from] rusqlite::Error),
     #[error("`{0}` is not a cursor of this list")]

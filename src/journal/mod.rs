@@ -255,7 +255,7 @@ impl Journal {
 
     /// Events of every alert after a sequence number, oldest first.
     pub fn events_after(&self, seq: u64, limit: usize) -> Result<Vec<Recorded>, Error> {
-        let (held, disk) = self.read(|store| store.events_after(seq, limit))?;
+        let (held, disk) = self.read_after(seq, |store| store.events_after(seq, limit))?;
         let mut events = in_order(held, disk);
         events.truncate(limit);
         Ok(events)
@@ -268,10 +268,19 @@ impl Journal {
 
     /// Deliveries to an endpoint that are still to be made, for events after a sequence number.
     pub fn waiting(&self, endpoint: &str, after: u64) -> Result<Vec<Waiting>, Error> {
-        let (held, disk) = self.read(|store| store.waiting(endpoint, after))?;
+        let (held, disk) = self.read_after(after, |store| store.waiting(endpoint, after))?;
         let all = disk.into_iter().chain(held).flatten();
         let by_seq: BTreeMap<u64, Waiting> = all.map(|w| (w.seq, w)).collect();
         Ok(by_seq.into_values().collect())
+    }
+
+    /// Those of [`Journal::waiting`] that memory knows of, without a look at the disk, and whether they are all.
+    pub fn waiting_in_memory(&self, endpoint: &str, after: u64) -> Result<(Vec<Waiting>, bool), Error> {
+        let overlay = lock(&self.shared.overlay);
+        let Some(since) = overlay.since else {
+            return Ok((Vec::new(), false));
+        };
+        Ok((overlay.store.waiting(endpoint, after)?, since <= after))
     }
 
     pub fn dead_letters(&self, endpoint: &str, limit: usize) -> Result<Vec<DeadLetter>, Error> {
@@ -318,9 +327,9 @@ impl Journal {
 
     fn held_ids(&self) -> Result<std::collections::HashSet<String>, Error> {
         let overlay = lock(&self.shared.overlay);
-        match overlay.in_use {
-            true => Ok(overlay.store.alert_ids()?),
-            false => Ok(Default::default()),
+        match overlay.since {
+            Some(_) => Ok(overlay.store.alert_ids()?),
+            None => Ok(Default::default()),
         }
     }
 
@@ -329,31 +338,51 @@ impl Journal {
     fn read<T>(&self, ask: impl Fn(&Store) -> Result<T, rusqlite::Error>) -> Result<(Option<T>, Option<T>), Error> {
         let held = {
             let overlay = lock(&self.shared.overlay);
-            overlay.in_use.then(|| ask(&overlay.store)).transpose()?
+            overlay.since.map(|_| ask(&overlay.store)).transpose()?
         };
-        let Some(path) = &self.shared.path else {
-            return Ok((held, None));
-        };
-        let reader = lock(&self.readers).pop();
-        let answer = match reader {
-            Some(reader) => Ok(reader),
-            None => Store::open_readable(path),
-        }
-        .and_then(|reader| Ok((ask(&reader)?, reader)));
-        match answer {
-            Ok((found, reader)) => {
-                let mut readers = lock(&self.readers);
-                if readers.len() < READERS {
-                    readers.push(reader);
-                }
-                Ok((held, Some(found)))
-            }
+        match self.read_disk(ask) {
             Err(error) if held.is_some() => {
                 tracing::warn!(%error, "the journal's disk cannot be read; only what memory holds is shown");
                 Ok((held, None))
             }
-            Err(error) => Err(error.into()),
+            disk => Ok((held, disk?)),
         }
+    }
+
+    /// As [`Journal::read`], for what came after an event. Memory answers alone where it holds all of that: a disk that
+    /// hangs keeps nobody from hearing of it. Elsewhere a disk that cannot be read is an error, not a gap.
+    fn read_after<T>(
+        &self,
+        seq: u64,
+        ask: impl Fn(&Store) -> Result<T, rusqlite::Error>,
+    ) -> Result<(Option<T>, Option<T>), Error> {
+        let held = {
+            let overlay = lock(&self.shared.overlay);
+            let held = overlay.since.map(|_| ask(&overlay.store)).transpose()?;
+            if overlay.since.is_some_and(|since| since <= seq) {
+                return Ok((held, None));
+            }
+            held
+        };
+        Ok((held, self.read_disk(ask)?))
+    }
+
+    /// `None` for a journal in memory.
+    fn read_disk<T>(&self, ask: impl Fn(&Store) -> Result<T, rusqlite::Error>) -> Result<Option<T>, Error> {
+        let Some(path) = &self.shared.path else {
+            return Ok(None);
+        };
+        let reader = lock(&self.readers).pop();
+        let reader = match reader {
+            Some(reader) => reader,
+            None => Store::open_readable(path)?,
+        };
+        let found = ask(&reader)?;
+        let mut readers = lock(&self.readers);
+        if readers.len() < READERS {
+            readers.push(reader);
+        }
+        Ok(Some(found))
     }
 }
 

@@ -42,7 +42,8 @@ pub(super) struct Shared {
 
 pub(super) struct Overlay {
     pub(super) store: Store,
-    pub(super) in_use: bool,
+    /// While it is in use: every event after this one, and what became of its deliveries, is here.
+    pub(super) since: Option<u64>,
 }
 
 struct Queue {
@@ -71,7 +72,7 @@ impl Shared {
         Self {
             overlay: Mutex::new(Overlay {
                 store: overlay,
-                in_use: path.is_none(),
+                since: path.is_none().then_some(0),
             }),
             path,
             subscriptions,
@@ -254,7 +255,7 @@ impl Writer {
         let progress = self.try_disk();
         if !self.deferred.is_empty() {
             self.hold(writes);
-        } else if lock(&self.shared.overlay).in_use {
+        } else if lock(&self.shared.overlay).since.is_some() {
             tracing::info!("the journal's disk is back; all that waited is written");
             self.clear_overlay();
         }
@@ -309,7 +310,7 @@ impl Writer {
 
     fn hold(&self, writes: &[Write]) {
         let mut overlay = lock(&self.shared.overlay);
-        overlay.in_use = true;
+        overlay.since.get_or_insert(*self.shared.heard.borrow());
         let mut held = overlay.store.apply(writes);
         if self.disk.is_none()
             && let Some(now) = writes.iter().rev().find_map(Write::now)
@@ -324,7 +325,7 @@ impl Writer {
     fn clear_overlay(&self) {
         let mut overlay = lock(&self.shared.overlay);
         match Store::open(None, self.shared.subscriptions.clone()) {
-            Ok(store) => *overlay = Overlay { store, in_use: false },
+            Ok(store) => *overlay = Overlay { store, since: None },
             // What it holds is on disk as well, and readers know a record when they see it twice.
             Err(error) => tracing::warn!(%error, "the journal's memory cannot be cleared"),
         }

@@ -1,6 +1,7 @@
 //! Webhooks against real receivers on the loopback address. The worker's clock runs fast where a test spans hours.
 
 mod config;
+mod disk;
 mod receiver;
 mod sender;
 mod trouble;

@@ -1,6 +1,6 @@
 mod intake;
 
-use std::collections::HashMap;
+use std::collections::{BTreeSet, HashMap};
 use std::pin::pin;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
@@ -18,12 +18,10 @@ use super::status::{EndpointState, EndpointStatus};
 use super::{Clock, Endpoint};
 use crate::journal::{self, Attempt, Journal, Outcome};
 use crate::metric;
+use intake::Found;
 
 /// How long requests that are under way may still take when the daemon stops.
 const GRACE: Duration = Duration::from_secs(3);
-
-/// How soon a journal that could not be read is read again.
-const REREAD: Duration = Duration::from_secs(1);
 
 /// How often the age of the oldest delivery is brought up to date.
 const TICK: Duration = Duration::from_secs(10);
@@ -46,8 +44,14 @@ struct Lane {
     endpoint: Arc<Endpoint>,
     queue: Queue,
     cool_down: CoolDown,
+    /// Whether what an earlier run left behind has been taken up.
+    is_known: bool,
+    /// Whether the disk has been asked and has not answered.
+    is_reading: bool,
     /// Events up to this one are in the queue, or done with.
     read_to: u64,
+    /// Events after that one of which the same is true, from memory while the disk does not answer.
+    ahead: BTreeSet<u64>,
     status: EndpointStatus,
 }
 
@@ -58,6 +62,8 @@ pub(super) struct Worker {
     rng: ChaCha8Rng,
     commands: mpsc::Receiver<Command>,
     shown: Arc<Mutex<Vec<EndpointStatus>>>,
+    /// Looks at the disk.
+    reads: JoinSet<Found>,
     requests: JoinSet<Verdict>,
     /// Lane and event of each request.
     under_way: HashMap<Id, (usize, u64)>,
@@ -77,7 +83,10 @@ impl Worker {
             cool_down: CoolDown::new(endpoint.cool_down),
             endpoint,
             queue: Queue::default(),
+            is_known: false,
+            is_reading: false,
             read_to: 0,
+            ahead: BTreeSet::new(),
         };
         Self {
             lanes: endpoints.into_iter().map(lane).collect(),
@@ -86,6 +95,7 @@ impl Worker {
             rng,
             commands,
             shown,
+            reads: JoinSet::new(),
             requests: JoinSet::new(),
             under_way: HashMap::new(),
         }
@@ -94,19 +104,10 @@ impl Worker {
     pub(super) async fn run(mut self, shutdown: impl Future<Output = ()>) {
         let mut shutdown = pin!(shutdown);
         let mut heard = self.journal.heard();
-        let mut known = vec![false; self.lanes.len()];
         loop {
             heard.mark_unchanged();
-            let mut readable = true;
-            for (k, known) in known.iter_mut().enumerate() {
-                let read = match *known {
-                    true => self.read_new(k).await,
-                    false => self.resume(k).await.inspect(|()| *known = true),
-                };
-                if let Err(error) = read {
-                    tracing::warn!(%error, "the webhook outbox cannot be read");
-                    readable = false;
-                }
+            for k in 0..self.lanes.len() {
+                self.look(k);
             }
             let now = self.clock.uptime();
             self.release_held(now);
@@ -126,10 +127,10 @@ impl Worker {
             tokio::select! {
                 () = &mut shutdown => break,
                 Some(ended) = self.requests.join_next_with_id(), if !self.requests.is_empty() => self.settle(ended),
+                Some(Ok(found)) = self.reads.join_next(), if !self.reads.is_empty() => self.found(found),
                 Ok(()) = heard.changed() => {}
                 Some(command) = self.commands.recv() => self.obey(command).await,
                 () = self.clock.sleep_until(wake) => {}
-                () = tokio::time::sleep(REREAD), if !readable => {}
             }
         }
         // What is cut off here stays in the outbox and goes out after the next start.
@@ -142,30 +143,6 @@ impl Worker {
             }
         }
         self.journal.settled().await;
-    }
-
-    /// Takes up what an earlier run left behind.
-    async fn resume(&mut self, k: usize) -> Result<(), journal::Error> {
-        let name = self.lanes[k].endpoint.name().to_owned();
-        let record = self.ask(move |journal| journal.endpoint(&name)).await?;
-        self.read_new(k).await?;
-        let now = self.clock.uptime();
-        let lane = &mut self.lanes[k];
-        lane.status.sent = record.sent;
-        lane.status.failed = record.dead;
-        lane.status.last_success = record.last_success;
-        lane.status.last_failure = record.last_failure;
-        lane.status.last_error = record.last_error;
-        if record.disabled_at.is_some() {
-            tracing::warn!(
-                endpoint = lane.endpoint.name(),
-                "this webhook's receiver answered 410 Gone; nothing is sent until it is enabled"
-            );
-            lane.queue.disable();
-        } else if lane.queue.len() > 0 {
-            lane.queue.probe_first(now);
-        }
-        Ok(())
     }
 
     async fn ask<T: Send + 'static>(
