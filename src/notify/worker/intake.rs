@@ -46,8 +46,7 @@ impl Worker {
                 self.take_in(k, rows);
                 let lane = &mut self.lanes[k];
                 if is_all && lane.is_known && !lane.is_reading {
-                    lane.read_to = read_to;
-                    lane.ahead.clear();
+                    lane.advance(read_to);
                     return;
                 }
             }
@@ -85,8 +84,7 @@ impl Worker {
         rows.retain(|(_, row)| !self.lanes[k].ahead.contains(&row.seq));
         self.take_in(k, rows);
         let lane = &mut self.lanes[k];
-        lane.read_to = read_to;
-        lane.ahead.retain(|&seq| seq > read_to);
+        lane.advance(read_to);
         if !std::mem::replace(&mut lane.is_known, true) {
             self.resume(k, record);
         }

@@ -55,6 +55,13 @@ struct Lane {
     status: EndpointStatus,
 }
 
+impl Lane {
+    fn advance(&mut self, read_to: u64) {
+        self.read_to = read_to;
+        self.ahead.retain(|&seq| seq > read_to);
+    }
+}
+
 pub(super) struct Worker {
     lanes: Vec<Lane>,
     journal: Journal,
