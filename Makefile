@@ -103,17 +103,27 @@ test-aarch64: aarch64 build
 	tests/deploy/aarch64.py target/release/oapwatch target/cross/aarch64-unknown-linux-gnu/release/oapwatch
 
 .PHONY: fuzz
-# Coverage-guided fuzzing, FUZZ_S seconds a target: libFuzzer with a stable toolchain. Not in CI: it takes every dependency once more.
+# Coverage-guided fuzzing, FUZZ_S seconds a target: libFuzzer with the address sanitizer, which a stable toolchain has too when told
+# that it is another one. Not in CI: it takes every dependency once more.
 FUZZ_S ?= 60
 FUZZ := npy config calibration scene claims http v4l2 locate onnx
+HOST = $(shell rustc -vV | sed -n 's/^host: //p')
+SANITIZED = RUSTC_BOOTSTRAP=1 RUSTFLAGS="-Zsanitizer=address" RUSTC_WRAPPER=$(CURDIR)/fuzz/rustc.sh
 fuzz: setup
 	$(call need,command -v g++,g++)
-	RUSTC_WRAPPER=$(CURDIR)/fuzz/rustc.sh cargo build --release --locked --manifest-path fuzz/Cargo.toml --target-dir target/fuzz
+	$(SANITIZED) cargo build --release --locked --manifest-path fuzz/Cargo.toml --target-dir target/fuzz --target $(HOST)
 	# A socket that is closed while it is written to is an error here as in the program, not the end.
 	cd fuzz && trap '' PIPE && for each in $(FUZZ); do \
 		mkdir -p corpus/$$each artifacts && \
-		../target/fuzz/release/$$each corpus/$$each $$(test $$each = onnx && echo ../config/models || echo seeds/$$each) \
+		../target/fuzz/$(HOST)/release/$$each corpus/$$each $$(test $$each = onnx && echo ../config/models || echo seeds/$$each) \
 			-artifact_prefix=artifacts/$$each- -max_total_time=$(FUZZ_S) -timeout=20 -rss_limit_mb=4096 -print_final_stats=1 || exit 1; done
+
+.PHONY: test-v4l2-sanitized
+# What test-v4l2 does, every read and write of memory checked. Three scenarios want more speed than that leaves.
+UNHURRIED := bit-exact devices dropped error failed fatal disconnect unplug starvation stamps busy format gain exposure
+test-v4l2-sanitized: build
+	$(SANITIZED) cargo build --release --locked --manifest-path fuzz/Cargo.toml --target-dir target/fuzz --target $(HOST) --bin v4l2_guest
+	MEMORY_MB=2048 tests/v4l2/run.sh target/fuzz/$(HOST)/release/v4l2_guest target/release/oapwatch $(UNHURRIED)
 
 .PHONY: stability
 # docs/stability/cases.md: every hard case, a thousand frames of each where a frame is cheap; minutes on a machine that does nothing else.

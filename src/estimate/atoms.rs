@@ -124,7 +124,10 @@ impl Atoms {
             let rows = axes[1].atom(s.u[1], self.width[1], reading.reach, my, scratch, y);
             // Whole vectors of four: padding holds zeros.
             let span = |r: Range<usize>, m: usize| [r.start & !3, r.end.next_multiple_of(4).min(m)];
-            self.spans.push([span(columns, mx), [rows.start, rows.end]]);
+            self.spans.push(match columns.is_empty() || rows.is_empty() {
+                true => [[0; 2]; 2],
+                false => [span(columns, mx), [rows.start, rows.end]],
+            });
         }
         for b in 0..nuisances.background_atoms() {
             let x = &mut self.x[(n + b) * 3 * mx..(n + b + 1) * 3 * mx];

@@ -13,6 +13,7 @@ use super::atoms::{self, Atoms};
 use super::basis::Basis;
 use super::linear::{axpy, dot};
 use super::model::{Model, Nuisances, pull};
+use super::part;
 use super::reading::Reading;
 use super::unusable::BadPixel;
 
@@ -27,6 +28,17 @@ const NO_DROP: f64 = 1e-4;
 const OVERLAP: f64 = 3.0;
 /// A bar is out of reach when this many times the drop that a quadratic promises does not get there.
 const HOPE: f64 = 5.0;
+/// A deviance of this many times its expectation says that emitters are missing: their absence, not the last digits of the
+/// others, is what matters. Such a fit ends after so many steps in a row that bring less than this share of it, and goes on past
+/// its steps while each brings more than that one.
+const FAR_OFF: f64 = 100.0;
+const IDLE: f64 = 1e-2;
+const IDLE_STEPS: usize = 3;
+const BRISK: f64 = 0.2;
+const MOST_STEPS: usize = 8;
+/// Steps of all emitters together before those that still move are fitted alone, and how often.
+const TOGETHER: usize = 2;
+const PARTINGS: usize = 2;
 /// Multiplications that a frame of a few emitters may cost: the same for every run, unlike a clock.
 const MOST_WORK: f64 = 1e8;
 /// Emitters from which on a frame may cost more, with the square of their number, and up to how many times as many.
@@ -126,6 +138,31 @@ impl Fitter {
 
     /// The same, given up as soon as a deviance below `bar` is out of reach.
     pub fn fit_below(&mut self, reading: &Reading, model: &mut Model, steps: usize, bar: f64) {
+        let last = self.steps + steps as u64;
+        for _ in 0..if steps > TOGETHER { PARTINGS } else { 0 } {
+            let Some(groups) = model.groups() else { break };
+            if !self.dispatch(reading, model, TOGETHER, bar) || model.converged {
+                return;
+            }
+            let Some(moving) = self.moving(&groups) else { break };
+            let rest = self.part(reading, &moving);
+            let mut part = part::only(model, &moving);
+            let left = last.saturating_sub(self.steps) as usize;
+            let goes_on = self.dispatch(&rest, &mut part, left, bar);
+            for (&i, spot) in moving.iter().zip(&part.spots) {
+                model.spots[i] = *spot;
+            }
+            if !goes_on {
+                model.deviance = part.deviance;
+                return;
+            }
+        }
+        let left = last.saturating_sub(self.steps) as usize;
+        self.dispatch(reading, model, left, bar);
+    }
+
+    /// `false` where the fit is given up.
+    fn dispatch(&mut self, reading: &Reading, model: &mut Model, steps: usize, bar: f64) -> bool {
         pulp::Arch::new().dispatch(Job {
             fitter: self,
             reading,
@@ -133,7 +170,7 @@ impl Fitter {
             steps,
             bar,
             wants_information: false,
-        });
+        })
     }
 
     /// Sets the information matrix at `model` over (x, y, energy) of each spot, then nuisances; units σ and noise. Row-major,
@@ -177,8 +214,9 @@ impl Fitter {
         }
     }
 
+    /// `false` where it is given up.
     #[inline(always)]
-    fn run(&mut self, reading: &Reading, model: &mut Model, steps: usize, bar: f64) {
+    fn run(&mut self, reading: &Reading, model: &mut Model, steps: usize, bar: f64) -> bool {
         let nuisances = model.nuisances;
         self.now.spots.clone_from(&model.spots);
         self.now.background = model.background;
@@ -198,8 +236,15 @@ impl Fitter {
                 .iter()
                 .any(|t| (s.u[0] - t.u[0]).abs() < OVERLAP && (s.u[1] - t.u[1]).abs() < OVERLAP)
         });
-        for _ in 0..steps {
-            if converged || self.work > BEYOND * self.most_work() {
+        let mut goes_on = true;
+        let mut is_brisk = false;
+        let mut idle = 0;
+        for k in 0..MOST_STEPS * steps {
+            if converged || k >= steps && !is_brisk || idle >= IDLE_STEPS {
+                break;
+            }
+            if self.work > BEYOND * self.most_work() {
+                goes_on = false;
                 break;
             }
             self.most_sources = self.most_sources.max(self.now.sources() as f64);
@@ -217,6 +262,7 @@ impl Fitter {
                     break;
                 }
                 if deviance - HOPE * expected > bar {
+                    goes_on = false;
                     break;
                 }
             }
@@ -229,6 +275,9 @@ impl Fitter {
                     } else {
                         0
                     };
+                    let is_far = next > FAR_OFF * reading.numbers;
+                    is_brisk = drop > BRISK * deviance;
+                    idle = if is_far && drop < IDLE * deviance { idle + 1 } else { 0 };
                     deviance = next;
                 }
                 drop >= 0.0
@@ -253,6 +302,7 @@ impl Fitter {
         model.deviance = deviance - pull(&model.spots);
         // A fit of no steps only evaluates: it says nothing new about convergence.
         model.converged = converged || steps == 0 && model.converged;
+        goes_on
     }
 
     /// Multiplications that one step costs.
@@ -329,14 +379,16 @@ struct Job<'a> {
 }
 
 impl pulp::NullaryFnOnce for Job<'_> {
-    type Output = ();
+    /// `false` where the fit was given up.
+    type Output = bool;
 
     #[inline(always)]
-    fn call(self) {
-        self.fitter.run(self.reading, self.model, self.steps, self.bar);
+    fn call(self) -> bool {
+        let goes_on = self.fitter.run(self.reading, self.model, self.steps, self.bar);
         if self.wants_information {
             self.fitter.work += self.fitter.step_work(self.reading);
             self.fitter.linearise(self.reading, self.model.nuisances);
         }
+        goes_on
     }
 }

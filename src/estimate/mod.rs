@@ -24,6 +24,7 @@ mod moves;
 mod network;
 mod noise;
 mod otherwise;
+mod part;
 mod pencil;
 mod posterior;
 mod power;

@@ -51,7 +51,7 @@ impl Search {
             self.take_better(model, next);
         }
         if !reading.is_explained(model)
-            && let Some(wider) = self.widened(reading, model)
+            && let Some(wider) = self.widened(reading, model, model)
         {
             *model = wider;
         }
@@ -76,8 +76,8 @@ impl Search {
         }
     }
 
-    /// `model` with those further nuisances that explain the frame best, if any do.
-    pub(super) fn widened(&mut self, reading: &Reading, model: &Model) -> Option<Model> {
+    /// `model` with those further nuisances that explain the frame best, if any do, and better than `rival`.
+    pub(super) fn widened(&mut self, reading: &Reading, model: &Model, rival: &Model) -> Option<Model> {
         if model.spots.is_empty() {
             return None;
         }
@@ -92,7 +92,8 @@ impl Search {
             }
             let mut next = best.clone().unwrap_or_else(|| model.clone());
             next.nuisances = nuisances;
-            self.fitter.fit(reading, &mut next, TRIAL_STEPS);
+            let bar = self.bar(rival, &next);
+            self.fitter.fit_below(reading, &mut next, TRIAL_STEPS, bar);
             if self.score(&next) < best.as_ref().map_or(self.score(model), |b| self.score(b)) {
                 let is_explained = reading.is_explained(&next);
                 best = Some(next);

@@ -14,7 +14,7 @@ use super::unusable::{self, BadPixel};
 const LOSS: f64 = 0.02;
 
 /// Coefficients of a screened frame and what the rest of it says about the noise.
-#[derive(Default)]
+#[derive(Clone, Default)]
 pub(super) struct Reading {
     /// Columns in use along each axis, and their next multiples of 4.
     pub rank: [usize; 2],

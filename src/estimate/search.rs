@@ -207,7 +207,7 @@ impl Search {
             self.fitter.fit(reading, &mut next, TRIAL_STEPS);
             // What looks like more emitters may be a background or another width: the better explanation stands.
             if !reading.is_explained(&next) || next.spots.len() > model.spots.len() + FEW {
-                let wider = self.widened(reading, &model);
+                let wider = self.widened(reading, &model, &next);
                 if let Some(wider) = wider.filter(|w| self.score(w) < self.score(&next)) {
                     next = wider;
                 }
@@ -297,7 +297,7 @@ impl Search {
     pub fn settle(&mut self, reading: &Reading, model: &mut Model, rounds: usize) {
         self.fitter.fit(reading, model, TRIAL_STEPS);
         if !reading.is_explained(model)
-            && let Some(wider) = self.widened(reading, model)
+            && let Some(wider) = self.widened(reading, model, model)
         {
             *model = wider;
         }

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Boots Debian's kernel with its virtual camera (vivid) under QEMU's software emulation and runs our programs in it,
 # on a real V4L2 device. Usage: run.sh GUEST_BINARY OAPWATCH_BINARY [SCENARIO...]. What it fetches and makes is kept
-# under target/v4l2 for the next run.
+# under target/v4l2 for the next run. MEMORY_MB is the machine's memory: a sanitizer wants more.
 # Needs: qemu-system-x86 busybox-static kmod cpio v4l-utils xz-utils, and a Debian package source for the kernel.
 set -euo pipefail
 cd "$(dirname "$0")/../.."
@@ -67,7 +67,7 @@ echo "$*" > "$root/scenarios"
 
 # isa-debug-exit turns a value written to its port into QEMU's exit code, (value << 1) | 1.
 set +e
-timeout 300 qemu-system-x86_64 -accel tcg -cpu qemu64 -smp 1 -m 512 -nodefaults -no-user-config -display none \
+timeout 300 qemu-system-x86_64 -accel tcg -cpu qemu64 -smp 1 -m "${MEMORY_MB:-512}" -nodefaults -no-user-config -display none \
     -serial stdio -monitor none -no-reboot -icount shift=auto,sleep=off \
     -device isa-debug-exit,iobase=0xf4,iosize=0x04 \
     -kernel "$work/vmlinux" -initrd "$work/initramfs.gz" \
