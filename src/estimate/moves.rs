@@ -104,6 +104,7 @@ impl Search {
 
     /// Merges and drops.
     pub fn shrink(&mut self, reading: &Reading, model: &mut Model) {
+        while self.merge_several(reading, model) {}
         loop {
             let n = model.spots.len();
             let mut has_shrunk = false;
@@ -111,7 +112,7 @@ impl Search {
                 if self.separation(reading, model, i, j) > 8.0 * self.factor * self.price {
                     continue;
                 }
-                let next = merged(model, i, j);
+                let next = merged(model, &[(i, j)]);
                 if self.consider(reading, model, next) {
                     has_shrunk = true;
                     break;
@@ -136,6 +137,20 @@ impl Search {
                 break;
             }
         }
+    }
+
+    /// Merges all pairs at once that the frame does not tell apart, where there are several.
+    fn merge_several(&mut self, reading: &Reading, model: &mut Model) -> bool {
+        let mut chosen: Vec<(usize, usize)> = Vec::new();
+        for (_, i, j) in pairs(model, MERGE) {
+            let is_free = chosen
+                .iter()
+                .all(|&(a, b)| ![a, b].contains(&i) && ![a, b].contains(&j));
+            if is_free && self.separation(reading, model, i, j) < self.factor * self.price {
+                chosen.push((i, j));
+            }
+        }
+        chosen.len() > 1 && self.consider(reading, model, merged(model, &chosen))
     }
 
     /// Squared amplitude over its variance, for each spot (Wald's test).
@@ -246,12 +261,18 @@ pub(super) fn pairs(model: &Model, limit: f64) -> Vec<(f64, usize, usize)> {
     pairs
 }
 
-/// `model` with spot j < i where the light of both is centred, and without i.
-pub(super) fn merged(model: &Model, i: usize, j: usize) -> Model {
-    let (p, q) = (model.spots[i], model.spots[j]);
-    let total = p.a + q.a;
+/// `model` with spot j < i of each pair where the light of both is centred, and without i.
+pub(super) fn merged(model: &Model, pairs: &[(usize, usize)]) -> Model {
     let mut next = model.clone();
-    next.spots[j] = Spot::new([0, 1].map(|k| (p.a * p.u[k] + q.a * q.u[k]) / total), total);
-    next.spots.remove(i);
+    for &(i, j) in pairs {
+        let (p, q) = (model.spots[i], model.spots[j]);
+        let total = p.a + q.a;
+        next.spots[j] = Spot::new([0, 1].map(|k| (p.a * p.u[k] + q.a * q.u[k]) / total), total);
+    }
+    let mut k = 0;
+    next.spots.retain(|_| {
+        k += 1;
+        pairs.iter().all(|&(i, _)| i != k - 1)
+    });
     next
 }

@@ -135,7 +135,7 @@ impl Search {
             .iter()
             .filter(is_odd)
             .take(PAIRS)
-            .map(|&(_, i, j)| (i, j, prior.multiple(&merged(model, i, j).spots[j])))
+            .map(|&(_, i, j)| (i, j, prior.multiple(&merged(model, &[(i, j)]).spots[j])))
             .collect();
         for (i, j, multiple) in odd {
             let [p, q] = [i, j].map(|k| model.spots[k].u);
@@ -143,7 +143,7 @@ impl Search {
             let length = d[0].hypot(d[1]).max(1e-6);
             let [a, b] = [i, j].map(|k| model.spots[k].a);
             let spread = a * b * (length / (a + b)).powi(2);
-            let mut united = merged(model, i, j);
+            let mut united = merged(model, &[(i, j)]);
             let spot = united.spots.remove(j);
             let parts = (multiple.round() as usize).max(1);
             for spread in [spread, 1.0] {
@@ -162,7 +162,7 @@ impl Search {
             return;
         }
         for (_, i, j) in pairs(model, NEIGHBOURS).into_iter().take(PAIRS) {
-            let next = merged(model, i, j);
+            let next = merged(model, &[(i, j)]);
             if self.attempt(reading, model, next) {
                 return;
             }
