@@ -25,6 +25,9 @@ impl Search {
     /// Takes another explanation of the frame than more emitters: a background, another width, or both, where one scores
     /// better than `model`.
     pub(super) fn explain_otherwise(&mut self, reading: &Reading, frame: &Screened, model: &mut Model) {
+        if model.nuisances == WIDE && reading.is_explained(model) && !self.is_odd(model) {
+            return;
+        }
         let lit = Nuisances {
             background: true,
             width: Width::Known,

@@ -152,13 +152,16 @@ impl Search {
     }
 
     /// Another way to the frame from where a first start ended: nuisances free it from a false minimum and are taken out again,
-    /// then moves. What needs more emitters than a few beyond the first start's is not a matter of moves.
+    /// then moves. What needs more emitters than a few beyond the first start's is not a matter of moves. Where none of that
+    /// explains the frame and the nuisances alone did, they stay.
     fn start_anew(&mut self, reading: &Reading, model: &mut Model) {
         let first = model.clone();
+        let mut wide = None;
         if self.sampler.is_some() {
             let mut free = first.clone();
             free.nuisances = WIDE;
             self.fitter.fit(reading, &mut free, TRIAL_STEPS);
+            wide = Some(free.clone()).filter(|w| reading.is_explained(w));
             free.confine(first.nuisances);
             self.fitter.fit(reading, &mut free, TRIAL_STEPS);
             if self.score(&free) < self.score(model) {
@@ -170,6 +173,12 @@ impl Search {
         }
         if model.spots.len() > first.spots.len() + 1 {
             *model = first;
+        }
+        if let Some(mut wide) = wide.filter(|_| !reading.is_explained(model)) {
+            self.refine(reading, &mut wide, EARLY_ROUNDS);
+            if !self.is_odd(&wide) && self.score(&wide) < self.score(model) {
+                *model = wide;
+            }
         }
     }
 
