@@ -35,9 +35,9 @@ const FAR_OFF: f64 = 100.0;
 const IDLE: f64 = 1e-2;
 const IDLE_STEPS: usize = 3;
 const BRISK: f64 = 0.2;
-const MOST_STEPS: usize = 8;
+pub(super) const MOST_STEPS: usize = 8;
 /// Steps of all emitters together before those that still move are fitted alone, and how often.
-const TOGETHER: usize = 2;
+pub(super) const TOGETHER: usize = 2;
 const PARTINGS: usize = 2;
 /// Multiplications that a frame of a few emitters may cost: the same for every run, unlike a clock.
 const MOST_WORK: f64 = 1e8;
@@ -131,7 +131,7 @@ impl Fitter {
         self.work > self.most_work() || self.deadline.is_some_and(|d| Instant::now() >= d)
     }
 
-    /// Fits `model` from where it stands, at most `steps` steps.
+    /// Fits `model` from where it stands, at most `steps` steps, and up to [`MOST_STEPS`] times as many while each brings much.
     pub fn fit(&mut self, reading: &Reading, model: &mut Model, steps: usize) {
         self.fit_below(reading, model, steps, f64::INFINITY);
     }
@@ -139,7 +139,10 @@ impl Fitter {
     /// The same, given up as soon as a deviance below `bar` is out of reach.
     pub fn fit_below(&mut self, reading: &Reading, model: &mut Model, steps: usize, bar: f64) {
         let last = self.steps + steps as u64;
-        for _ in 0..if steps > TOGETHER { PARTINGS } else { 0 } {
+        for _ in 0..PARTINGS {
+            if self.steps + TOGETHER as u64 >= last {
+                break;
+            }
             let Some(groups) = model.groups() else { break };
             if !self.dispatch(reading, model, TOGETHER, bar) || model.converged {
                 return;

@@ -4,7 +4,7 @@ use super::fit::Fitter;
 use super::model::{Model, Nuisances, Spot};
 use super::reading::Reading;
 
-/// A spot is at rest when a step would move it by less than this share of its variance, squared.
+/// A spot is at rest when the square of a step, over its variance, is below this.
 const REST: f64 = 1e-2;
 /// Emitters from which on a fit is worth parting.
 const FEWEST: usize = 4;
