@@ -138,7 +138,8 @@ pub(super) fn locate(
                 y_m,
                 cov_m2: camera.cov_to_ground(sensor_m, own.map(|r| r.map(|c| c * scale))),
                 energy_j: spot.a * noise_j,
-                energy_std_j: (energy_variance * inflation).max(0.0).sqrt() * noise_j,
+                // The product of the two variances may leave the range of f64.
+                energy_std_j: energy_variance.max(0.0).sqrt() * inflation.sqrt() * noise_j,
                 sensor_m,
                 bend: bends[i],
                 flags,
