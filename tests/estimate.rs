@@ -119,6 +119,44 @@ fn separated_and_melted_spots_reach_the_bound_with_an_honest_covariance() {
     }
 }
 
+/// A lens that draws spots a tenth longer than wide, along the array's diagonal, which the config knows nothing of.
+#[test]
+fn a_turned_ellipse_is_one_emitter() {
+    for (sigma_m, pixels) in [(2e-3, 64), (4e-3, 20)] {
+        let camera = camera(sigma_m, pixels, 1e-6);
+        let mut lens = camera.clone();
+        lens.spot_sigma_m *= 0.95;
+        let smear_m = sigma_m * (1.05f64.powi(2) - 0.95f64.powi(2)).sqrt() * std::f64::consts::FRAC_1_SQRT_2;
+        let mut rng = ChaCha8Rng::seed_from_u64(29);
+        let mut estimator = estimator(None, &camera);
+        let (mut squared, mut bounds) = (0.0, 0.0);
+        for _ in 0..10 {
+            let positions = scatter(5, 60.0, &mut rng);
+            // Gaussians half their σ apart are a line of even density to rounding.
+            let parts = (-12..=12).map(|k| 0.5 * f64::from(k));
+            let beams: Vec<_> = parts
+                .flat_map(|t| positions.iter().map(move |&p| (t, p)))
+                .map(|(t, p)| {
+                    let share = 0.5 * (-0.5 * t * t).exp() / std::f64::consts::TAU.sqrt();
+                    (p.map(|v| v + t * smear_m * camera.ground_scale()), share * ENERGY_J)
+                })
+                .collect();
+            let estimate = estimator
+                .estimate(&frame(render_beams(&lens, &beams, &mut rng)))
+                .unwrap();
+            let score = ospa(&positions, &places(&estimate), 25.0);
+            assert_eq!(estimate.emitters.len(), 5, "{sigma_m}: {}", score.distance_m);
+            squared += score.distance_m.powi(2);
+            bounds += position_bound(&camera, &positions, &[ENERGY_J; 5]).iter().sum::<f64>() / 5.0;
+        }
+        assert!(
+            squared < 2.0 * bounds,
+            "{sigma_m}: {} times the bound",
+            squared / bounds
+        );
+    }
+}
+
 #[test]
 fn frames_without_light_hold_no_emitters() {
     for (sigma, pixels) in [(1e-3, 32), (4e-3, 20), (8e-3, 20)] {

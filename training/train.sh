@@ -17,6 +17,8 @@ if [ ! -x "$python" ]; then
 fi
 if [ ! -x "$program" ]; then cargo build --release --locked; fi
 mkdir -p training/runs training/models
+# A U-Net is given fewer samples than it could use: each begins with what the next smaller array's has learned.
+declare -A smaller
 for pixels in $sizes; do
   for reading in $readings; do
     scene=training/runs/$reading-$pixels.toml
@@ -28,7 +30,10 @@ for pixels in $sizes; do
       name=$network$front
       run=training/runs/$name-$reading-$pixels
       share=$(awk "BEGIN { s = $pixels^2 / 64^2; print $minutes * (s < 0.25 ? 0.25 : s > 2 ? 2 : s) }")
-      "$python" training/train.py --program "$program" --network "$name" --scene "$scene" --out "$run" --samples "$samples" --minutes "$share"
+      from=()
+      if [ "$network" = unet ] && [ -n "${smaller[$name-$reading]:-}" ]; then from=(--from-run "${smaller[$name-$reading]}"); fi
+      smaller[$name-$reading]=$run
+      "$python" training/train.py --program "$program" --network "$name" --scene "$scene" --out "$run" --samples "$samples" --minutes "$share" "${from[@]}"
       "$python" training/export.py --program "$program" --run "$run" --scene "$scene" --out "training/models/$name-$reading-$pixels.onnx"
     done
   done

@@ -35,8 +35,7 @@ impl Fitter {
             let values = &mut self.scratch;
             values.resize(values.len().max(sources), 0.0);
             for i in 0..sources {
-                let [x, y] = atoms.at(i, bad.x, bad.y);
-                values[i] = x[0] * y[0];
+                values[i] = atoms.at(i, bad.x, bad.y)[0][0];
                 rhs[i] -= values[i] * bad.value;
             }
             for i in (0..sources).filter(|&i| values[i] != 0.0) {

@@ -1,11 +1,22 @@
-//! The atoms of a hypothesis: every source's separable profile with its derivatives, kept where they hold anything.
-
-use std::ops::Range;
+//! The sources of a hypothesis: spots, then background atoms, each a sum of separable parts.
+//!
+//! An upright spot is one part. One whose ellipse is turned against the axes is no product of profiles: it is an upright one
+//! smeared along a diagonal, and Gauss–Hermite quadrature (Abramowitz and Stegun, 1964, 25.4.46) makes that a sum of few.
 
 use super::basis::Basis;
-use super::linear::{axpy, combine, dot};
 use super::model::{Nuisances, Spot};
+use super::parts::Parts;
 use super::reading::Reading;
+
+/// Places along the smear, in its σ, and their shares; exact for the first nine moments.
+const SMEAR: [(f64, f64); 5] = [
+    (0.0, 0.533_333_333_333_333_3),
+    (1.355_626_179_974_265_9, 0.222_075_922_005_612_66),
+    (-1.355_626_179_974_265_9, 0.222_075_922_005_612_66),
+    (2.856_970_013_872_805_7, 0.011_257_411_327_720_691),
+    (-2.856_970_013_872_805_7, 0.011_257_411_327_720_691),
+];
+const WHOLE: [(f64, f64); 1] = [(0.0, 1.0)];
 
 /// Sources in the bases. Spots come first, then background atoms.
 #[derive(Default)]
@@ -14,16 +25,10 @@ pub(super) struct Atoms {
     pub background: [f64; 3],
     /// Relative to the configured σ.
     pub width: [f64; 2],
-    mx: usize,
-    my: usize,
-    /// (sources, 3, mx): f, f′, f″.
-    x: Vec<f64>,
-    y: Vec<f64>,
-    /// Columns and rows outside which a source is zero.
-    spans: Vec<[[usize; 2]; 2]>,
-    /// f, f′, f″ at pixels along each axis, (sources, pixels); only at the lines of unusable pixels.
-    at: [Vec<[f64; 3]>; 2],
-    lines: [usize; 2],
+    /// The spots' covariance between the axes, σ².
+    pub turn: f64,
+    sources: usize,
+    parts: Parts,
 }
 
 /// Constant and sloped profiles along one axis, of about a spot's norm, so that the normal equations are well scaled.
@@ -37,13 +42,12 @@ pub(super) fn background(b: &Basis) -> [Vec<f64>; 2] {
 
 impl Atoms {
     pub fn sources(&self) -> usize {
-        self.spans.len()
+        self.sources
     }
 
     /// Numbers that all sources touch together.
     pub fn footprint(&self) -> f64 {
-        let area = |s: &[[usize; 2]; 2]| ((s[0][1] - s[0][0]) * (s[1][1] - s[1][0])) as f64;
-        self.spans.iter().map(area).sum()
+        self.parts.footprint()
     }
 
     /// Amplitude of a source.
@@ -53,54 +57,7 @@ impl Atoms {
         if i < n { self.spots[i].a } else { self.background[i - n] }
     }
 
-    /// Profile `d` (0 to 2: f, f′, f″) of source `i` along x within its span.
-    #[inline(always)]
-    pub fn x(&self, i: usize, d: usize) -> &[f64] {
-        let [lo, hi] = self.spans[i][0];
-        let start = (3 * i + d) * self.mx;
-        &self.x[start + lo..start + hi]
-    }
-
-    #[inline(always)]
-    pub fn y(&self, i: usize, d: usize) -> &[f64] {
-        let [lo, hi] = self.spans[i][1];
-        let start = (3 * i + d) * self.my;
-        &self.y[start + lo..start + hi]
-    }
-
-    /// Values of source `i` at an unusable pixel along each axis: f, f′, f″ each.
-    #[inline(always)]
-    pub fn at(&self, i: usize, x: usize, y: usize) -> [[f64; 3]; 2] {
-        [self.at[0][i * self.lines[0] + x], self.at[1][i * self.lines[1] + y]]
-    }
-
-    #[inline(always)]
-    fn expand(&mut self, axes: [&Basis; 2], lines: &[Vec<usize>; 2]) {
-        for k in 0..2 {
-            let n = if lines[k].is_empty() { 0 } else { axes[k].n };
-            let mut at = std::mem::take(&mut self.at[k]);
-            at.clear();
-            at.resize(self.sources() * n, [0.0; 3]);
-            for i in 0..self.sources() {
-                let [lo, hi] = self.spans[i][k];
-                let profile = |d: usize| if k == 0 { self.x(i, d) } else { self.y(i, d) };
-                for &line in &lines[k] {
-                    at[i * n + line] = if !axes[k].is_pixels {
-                        let row = &axes[k].row(line)[lo..hi];
-                        [0, 1, 2].map(|d| dot(row, profile(d)))
-                    } else if (lo..hi).contains(&line) {
-                        [0, 1, 2].map(|d| profile(d)[line - lo])
-                    } else {
-                        [0.0; 3]
-                    };
-                }
-            }
-            self.at[k] = at;
-            self.lines[k] = n;
-        }
-    }
-
-    /// Fills the atoms for the present spots, width and kinds of background.
+    /// Fills the atoms for the present spots, shape and kinds of background.
     #[inline(always)]
     pub fn place(
         &mut self,
@@ -110,120 +67,96 @@ impl Atoms {
         nuisances: Nuisances,
         scratch: &mut [f64],
     ) {
-        let (mx, my) = (reading.mx, reading.my);
-        (self.mx, self.my) = (mx, my);
         let n = self.spots.len();
-        let sources = n + nuisances.background_atoms();
-        self.x.resize(sources * 3 * mx, 0.0);
-        self.y.resize(sources * 3 * my, 0.0);
-        self.spans.clear();
-        for (i, s) in self.spots.iter().enumerate() {
-            let x = &mut self.x[i * 3 * mx..(i + 1) * 3 * mx];
-            let columns = axes[0].atom(s.u[0], self.width[0], reading.reach, mx, scratch, x);
-            let y = &mut self.y[i * 3 * my..(i + 1) * 3 * my];
-            let rows = axes[1].atom(s.u[1], self.width[1], reading.reach, my, scratch, y);
-            // Whole vectors of four: padding holds zeros.
-            let span = |r: Range<usize>, m: usize| [r.start & !3, r.end.next_multiple_of(4).min(m)];
-            self.spans.push(match columns.is_empty() || rows.is_empty() {
-                true => [[0; 2]; 2],
-                false => [span(columns, mx), [rows.start, rows.end]],
-            });
+        let smear = self.smear(0);
+        self.sources = n + nuisances.background_atoms();
+        let count = n * smear.len() + nuisances.background_atoms();
+        self.parts.clear(count, reading.mx, reading.my);
+        let along = self.turn.abs().sqrt();
+        let width = self.width.map(|w| (w * w - self.turn.abs()).max(0.0).sqrt());
+        for s in &self.spots {
+            for (t, _) in smear {
+                let u = [s.u[0] + t * along, s.u[1] + t * along * self.turn.signum()];
+                self.parts.push(axes, u, width, reading.reach, scratch);
+            }
         }
         for b in 0..nuisances.background_atoms() {
-            let x = &mut self.x[(n + b) * 3 * mx..(n + b + 1) * 3 * mx];
-            x.fill(0.0);
-            x[..mx].copy_from_slice(&backgrounds[0][usize::from(b == 1)][..mx]);
-            let y = &mut self.y[(n + b) * 3 * my..(n + b + 1) * 3 * my];
-            y.fill(0.0);
-            y[..my].copy_from_slice(&backgrounds[1][usize::from(b == 2)][..my]);
-            self.spans.push([[0, mx], [0, my]]);
+            let kinds = [usize::from(b == 1), usize::from(b == 2)];
+            self.parts
+                .push_flat([0, 1].map(|k| backgrounds[k][kinds[k]].as_slice()));
         }
-        self.expand(axes, &reading.bad_lines);
+        self.parts.expand(axes, &reading.bad_lines);
+    }
+
+    /// The parts' places and shares in a source.
+    #[inline(always)]
+    fn smear(&self, i: usize) -> &'static [(f64, f64)] {
+        if self.turn != 0.0 && i < self.spots.len() {
+            &SMEAR
+        } else {
+            &WHOLE
+        }
+    }
+
+    /// A source's parts and their shares in it.
+    #[inline(always)]
+    fn parts(&self, i: usize) -> impl Iterator<Item = (usize, f64)> + use<> {
+        let n = self.spots.len();
+        let smear = self.smear(i);
+        let each = self.smear(0).len();
+        let first = if i < n { i * each } else { n * each + i - n };
+        smear.iter().enumerate().map(move |(k, (_, share))| (first + k, *share))
+    }
+
+    /// Values of source `i` at an unusable pixel: `[a][b]` derived a times along x and b times along y.
+    #[inline(always)]
+    pub fn at(&self, i: usize, x: usize, y: usize) -> [[f64; 3]; 3] {
+        let mut sum = [[0.0; 3]; 3];
+        for (k, share) in self.parts(i) {
+            let [fx, fy] = self.parts.at(k, x, y);
+            for a in 0..3 {
+                for b in 0..3 {
+                    sum[a][b] += share * fx[a] * fy[b];
+                }
+            }
+        }
+        sum
     }
 
     /// Adds `scale`·f_y⁽ᵇ⁾⊗f_x⁽ᵃ⁾ of source `i` to a matrix (my, mx).
     #[inline(always)]
     pub fn add(&self, i: usize, a: usize, b: usize, scale: f64, matrix: &mut [f64]) {
-        let [[x0, x1], [y0, _]] = self.spans[i];
-        let fx = self.x(i, a);
-        for (c, &w) in self.y(i, b).iter().enumerate() {
-            let start = (y0 + c) * self.mx;
-            axpy(scale * w, fx, &mut matrix[start + x0..start + x1]);
+        for (k, share) in self.parts(i) {
+            self.parts.add(k, a, b, share * scale, matrix);
         }
     }
 
     /// Adds `f_y⊗(q0[0] f″_x + q0[1] f′_x) + f′_y⊗(q1[0] f′_x + q1[1] f_x) + q2 f″_y⊗f_x` of source `i` to a matrix (my, mx).
     #[inline(always)]
     pub fn add_bent(&self, i: usize, q0: [f64; 2], q1: [f64; 2], q2: f64, scratch: &mut Vec<f64>, matrix: &mut [f64]) {
-        let [[x0, x1], [y0, _]] = self.spans[i];
-        let m = x1 - x0;
-        scratch.resize(scratch.len().max(3 * m), 0.0);
-        let (s0, rest) = scratch.split_at_mut(m);
-        let (s1, rest) = rest.split_at_mut(m);
-        let s2 = &mut rest[..m];
-        let (f, f1, f2) = (self.x(i, 0), self.x(i, 1), self.x(i, 2));
-        for c in 0..m {
-            s0[c] = q0[0] * f2[c] + q0[1] * f1[c];
-            s1[c] = q1[0] * f1[c] + q1[1] * f[c];
-            s2[c] = q2 * f[c];
-        }
-        let (g, g1, g2) = (self.y(i, 0), self.y(i, 1), self.y(i, 2));
-        for c in 0..g.len() {
-            let start = (y0 + c) * self.mx;
-            let row = &mut matrix[start + x0..start + x1];
-            for k in 0..m {
-                row[k] += g[c] * s0[k] + g1[c] * s1[k] + g2[c] * s2[k];
-            }
+        for (k, share) in self.parts(i) {
+            let [q0, q1] = [q0, q1].map(|q| q.map(|v| share * v));
+            self.parts.add_bent(k, q0, q1, share * q2, scratch, matrix);
         }
     }
 
     /// Inner products of a matrix (my, mx) with f_y⊗f_x, f_y⊗f′_x and f′_y⊗f_x of source `i`.
     #[inline(always)]
     pub fn project(&self, i: usize, matrix: &[f64], scratch: &mut Vec<f64>) -> [f64; 3] {
-        let [t, t1] = self.fold(i, [0, 1], matrix, scratch);
-        [dot(t, self.x(i, 0)), dot(t, self.x(i, 1)), dot(t1, self.x(i, 0))]
+        self.sum(i, |k| self.parts.project(k, matrix, scratch))
     }
 
     /// The first of these alone.
     #[inline(always)]
     pub fn project_value(&self, i: usize, matrix: &[f64], scratch: &mut Vec<f64>) -> f64 {
-        let [t] = self.fold(i, [0], matrix, scratch);
-        dot(t, self.x(i, 0))
+        let [value] = self.sum(i, |k| [self.parts.project_value(k, matrix, scratch)]);
+        value
     }
 
     /// Inner products with the second derivatives: xx, xy, yy.
     #[inline(always)]
     pub fn bend(&self, i: usize, matrix: &[f64], scratch: &mut Vec<f64>) -> [f64; 3] {
-        let [t, t1] = self.fold(i, [0, 1], matrix, scratch);
-        let (xx, xy) = (dot(t, self.x(i, 2)), dot(t1, self.x(i, 1)));
-        let [t2] = self.fold(i, [2], matrix, scratch);
-        [xx, xy, dot(t2, self.x(i, 0))]
-    }
-
-    /// Rows of a matrix (my, mx) summed under profiles along y of source `i`, over its columns.
-    #[inline(always)]
-    fn fold<'a, const K: usize>(
-        &self,
-        i: usize,
-        profiles: [usize; K],
-        matrix: &[f64],
-        scratch: &'a mut Vec<f64>,
-    ) -> [&'a [f64]; K] {
-        let [[x0, x1], [y0, _]] = self.spans[i];
-        let m = x1 - x0;
-        scratch.resize(scratch.len().max(K * m), 0.0);
-        let weights = profiles.map(|d| self.y(i, d));
-        if m > 0 {
-            combine(weights, 1, &matrix[y0 * self.mx + x0..], self.mx, m, scratch);
-        }
-        let mut parts = scratch.chunks_exact(m.max(1));
-        std::array::from_fn(|_| parts.next().unwrap_or_default())
-    }
-
-    #[inline(always)]
-    fn shared(&self, i: usize, j: usize) -> [[usize; 2]; 2] {
-        let (p, q) = (&self.spans[i], &self.spans[j]);
-        [0, 1].map(|k| [p[k][0].max(q[k][0]), p[k][1].min(q[k][1])])
+        self.sum(i, |k| self.parts.bend(k, matrix, scratch))
     }
 
     /// Inner product of source `i`'s derivative, `a[0]` times along x and `a[1]` times along y, with source `j`'s under `weights`
@@ -238,98 +171,31 @@ impl Atoms {
         weights: &[f64],
         scratch: &mut Vec<f64>,
     ) -> f64 {
-        let [[x0, x1], [y0, y1]] = self.shared(i, j);
-        if x0 >= x1 || y0 >= y1 {
-            return 0.0;
-        }
-        let (mx, my) = (self.mx, self.my);
-        let x = |i: usize, d: usize| &self.x[(3 * i + d) * mx + x0..(3 * i + d) * mx + x1];
-        let y = |i: usize, d: usize| &self.y[(3 * i + d) * my + y0..(3 * i + d) * my + y1];
-        if weights.is_empty() {
-            return dot(x(i, a[0]), x(j, b[0])) * dot(y(i, a[1]), y(j, b[1]));
-        }
-        scratch.clear();
-        scratch.resize(x1 - x0, 0.0);
-        for (c, (v, w)) in y(i, a[1]).iter().zip(y(j, b[1])).enumerate() {
-            let start = (y0 + c) * mx;
-            axpy(v * w, &weights[start + x0..start + x1], scratch);
-        }
-        triple(scratch, x(i, a[0]), x(j, b[0]))
+        let [value] = self.sum(i, |k| self.sum(j, |l| [self.parts.inner(k, a, l, b, weights, scratch)]));
+        value
     }
 
-    /// Inner products along x and along y of source `i`'s f, f′ and f″ with source `j`'s f and f′; `None` where they share nothing.
+    /// Inner products along x and along y of source `i`'s f, f′ and f″ with source `j`'s f and f′; `None` where they share nothing
+    /// or are turned.
     #[inline(always)]
     pub fn grams(&self, i: usize, j: usize) -> Option<[[[f64; 2]; 3]; 2]> {
-        let [[x0, x1], [y0, y1]] = self.shared(i, j);
-        if x0 >= x1 || y0 >= y1 {
-            return None;
-        }
-        let (mx, my) = (self.mx, self.my);
-        let x = |i: usize, d: usize| &self.x[(3 * i + d) * mx + x0..(3 * i + d) * mx + x1];
-        let y = |i: usize, d: usize| &self.y[(3 * i + d) * my + y0..(3 * i + d) * my + y1];
-        Some([
-            [0, 1, 2].map(|a| [0, 1].map(|b| dot(x(i, a), x(j, b)))),
-            [0, 1, 2].map(|a| [0, 1].map(|b| dot(y(i, a), y(j, b)))),
-        ])
+        self.parts.grams(i, j)
     }
 
     /// Inner products of (f′_x f_y, f_x f′_y, f_x f_y) of source `i` with those of source `j`, 3 × 3 row-major.
     #[inline(always)]
     pub fn couple(&self, i: usize, j: usize, weights: &[f64], scratch: &mut Vec<f64>) -> [f64; 9] {
-        let [[x0, x1], [y0, y1]] = self.shared(i, j);
-        if x0 >= x1 || y0 >= y1 {
-            return [0.0; 9];
-        }
-        let (mx, my) = (self.mx, self.my);
-        let x = |i: usize, d: usize| &self.x[(3 * i + d) * mx + x0..(3 * i + d) * mx + x1];
-        let y = |i: usize, d: usize| &self.y[(3 * i + d) * my + y0..(3 * i + d) * my + y1];
-        // Which derivative of i and of j, along x and along y, makes each of the nine.
-        const ALONG_X: [[usize; 2]; 9] = [[1, 1], [1, 0], [1, 0], [0, 1], [0, 0], [0, 0], [0, 1], [0, 0], [0, 0]];
-        const ALONG_Y: [[usize; 2]; 9] = [[0, 0], [0, 1], [0, 0], [1, 0], [1, 1], [1, 0], [0, 0], [0, 1], [0, 0]];
-        if weights.is_empty() {
-            let pairs = [(0, 0), (0, 1), (1, 0), (1, 1)];
-            let tx = pairs.map(|(a, b)| dot(x(i, a), x(j, b)));
-            let ty = pairs.map(|(a, b)| dot(y(i, a), y(j, b)));
-            return std::array::from_fn(|k| {
-                let ([a, b], [c, d]) = (ALONG_X[k], ALONG_Y[k]);
-                tx[2 * a + b] * ty[2 * c + d]
-            });
-        }
-        let m = x1 - x0;
-        scratch.clear();
-        scratch.resize(4 * m, 0.0);
-        let (t00, rest) = scratch.split_at_mut(m);
-        let (t01, rest) = rest.split_at_mut(m);
-        let (t10, t11) = rest.split_at_mut(m);
-        for c in 0..y1 - y0 {
-            let start = (y0 + c) * mx;
-            let w = &weights[start + x0..start + x1];
-            let [a, a1, b, b1] = [y(i, 0)[c], y(i, 1)[c], y(j, 0)[c], y(j, 1)[c]];
-            let v = [a * b, a * b1, a1 * b, a1 * b1];
-            for k in 0..m {
-                t00[k] += v[0] * w[k];
-                t01[k] += v[1] * w[k];
-                t10[k] += v[2] * w[k];
-                t11[k] += v[3] * w[k];
+        self.sum(i, |k| self.sum(j, |l| self.parts.couple(k, l, weights, scratch)))
+    }
+
+    #[inline(always)]
+    fn sum<const N: usize>(&self, i: usize, mut of: impl FnMut(usize) -> [f64; N]) -> [f64; N] {
+        let mut sum = [0.0; N];
+        for (k, share) in self.parts(i) {
+            for (s, v) in sum.iter_mut().zip(of(k)) {
+                *s += share * v;
             }
         }
-        let t: [&[f64]; 4] = [t00, t01, t10, t11];
-        std::array::from_fn(|k| {
-            let ([a, b], [c, d]) = (ALONG_X[k], ALONG_Y[k]);
-            triple(t[2 * c + d], x(i, a), x(j, b))
-        })
+        sum
     }
-}
-
-/// Σ w a b; lengths are multiples of 4.
-#[inline(always)]
-fn triple(w: &[f64], a: &[f64], b: &[f64]) -> f64 {
-    let mut lanes = [0.0; 4];
-    let chunks = w.chunks_exact(4).zip(a.chunks_exact(4)).zip(b.chunks_exact(4));
-    for ((w, a), b) in chunks {
-        for l in 0..4 {
-            lanes[l] += w[l] * a[l] * b[l];
-        }
-    }
-    (lanes[0] + lanes[2]) + (lanes[1] + lanes[3])
 }

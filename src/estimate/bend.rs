@@ -84,7 +84,7 @@ impl Fitter {
                 let atoms = &self.now;
                 for (k, bad) in reading.bad.iter().enumerate() {
                     let at = atoms.at(i, bad.x, bad.y);
-                    let own = SECOND.map(|([a, b], f)| f * atoms.amplitude(i) * at[0][a] * at[1][b]);
+                    let own = SECOND.map(|([a, b], f)| f * atoms.amplitude(i) * at[a][b]);
                     if own == [0.0; 3] {
                         continue;
                     }
@@ -134,7 +134,7 @@ impl Fitter {
             None => atoms.inner(i, a, j, b, &reading.weights, strip),
         };
         for j in 0..atoms.sources() {
-            if reading.weights.is_empty() {
+            if reading.weights.is_empty() && atoms.turn == 0.0 {
                 grams = atoms.grams(i, j);
                 if grams.is_none() {
                     continue;

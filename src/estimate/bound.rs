@@ -8,8 +8,7 @@ use crate::optics::{Camera, psf};
 /// What is fitted, and what cannot be used, beside positions and energies.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Beside<'a> {
-    /// A width common to all spots.
-    pub width: bool,
+    pub shape: Shape,
     /// A constant and two slopes.
     pub background: bool,
     /// Pixels (Ny × Nx, row-major) that tell nothing.
@@ -17,6 +16,17 @@ pub struct Beside<'a> {
     /// Standard deviation of each emitter's energy, J, where it is known beforehand as well as that; every emitter is then
     /// known to be in view too. Good while errors are small: an estimator may go below where a position is hardly known.
     pub known: Option<&'a [f64]>,
+}
+
+/// What is unknown of the spots' common shape.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Shape {
+    #[default]
+    Known,
+    /// A width.
+    Width,
+    /// Widths along both axes and the covariance between them.
+    Ellipse,
 }
 
 const DARK: PixelResponse = PixelResponse {
@@ -70,9 +80,13 @@ pub fn position_bound_beside(camera: &Camera, positions: &[[f64; 2]], energies: 
 fn jacobian(camera: &Camera, positions: &[[f64; 2]], energies: &[f64], beside: Beside) -> Mat<f64> {
     let n = positions.len();
     let sigma = camera.spot_sigma_m;
-    let width = usize::from(beside.width);
+    let shape = match beside.shape {
+        Shape::Known => 0,
+        Shape::Width => 1,
+        Shape::Ellipse => 3,
+    };
     let background = if beside.background { 3 } else { 0 };
-    let mut jacobian = Mat::<f64>::zeros(camera.x.n * camera.y.n, 3 * n + width + background);
+    let mut jacobian = Mat::<f64>::zeros(camera.x.n * camera.y.n, 3 * n + shape + background);
     let (mut row, mut column) = (vec![DARK; camera.x.n], vec![DARK; camera.y.n]);
     let is_usable = |pixel: usize| beside.unusable.is_none_or(|bad| !bad[pixel]);
     for (i, &p) in positions.iter().enumerate() {
@@ -89,9 +103,15 @@ fn jacobian(camera: &Camera, positions: &[[f64; 2]], energies: &[f64], beside: B
                 jacobian[(pixel, 3 * i)] = signal * sigma * fx.d_centre * fy.fraction;
                 jacobian[(pixel, 3 * i + 1)] = signal * sigma * fx.fraction * fy.d_centre;
                 jacobian[(pixel, 3 * i + 2)] = fx.fraction * fy.fraction;
-                if beside.width {
-                    let broadening = fx.d_sigma * fy.fraction + fx.fraction * fy.d_sigma;
-                    jacobian[(pixel, 3 * n)] += signal * sigma * broadening;
+                let along = [fx.d_sigma * fy.fraction, fx.fraction * fy.d_sigma];
+                match beside.shape {
+                    Shape::Known => {}
+                    Shape::Width => jacobian[(pixel, 3 * n)] += signal * sigma * (along[0] + along[1]),
+                    Shape::Ellipse => {
+                        jacobian[(pixel, 3 * n)] += signal * sigma * along[0];
+                        jacobian[(pixel, 3 * n + 1)] += signal * sigma * along[1];
+                        jacobian[(pixel, 3 * n + 2)] += signal * sigma * sigma * fx.d_centre * fy.d_centre;
+                    }
                 }
             }
         }
@@ -99,9 +119,9 @@ fn jacobian(camera: &Camera, positions: &[[f64; 2]], energies: &[f64], beside: B
     if beside.background {
         for pixel in (0..jacobian.nrows()).filter(|&k| is_usable(k)) {
             let (a, b) = (pixel % camera.x.n, pixel / camera.x.n);
-            jacobian[(pixel, 3 * n + width)] = 1.0;
-            jacobian[(pixel, 3 * n + width + 1)] = camera.x.centre(a) / camera.x.half_width();
-            jacobian[(pixel, 3 * n + width + 2)] = camera.y.centre(b) / camera.y.half_width();
+            jacobian[(pixel, 3 * n + shape)] = 1.0;
+            jacobian[(pixel, 3 * n + shape + 1)] = camera.x.centre(a) / camera.x.half_width();
+            jacobian[(pixel, 3 * n + shape + 2)] = camera.y.centre(b) / camera.y.half_width();
         }
     }
     jacobian

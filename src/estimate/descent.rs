@@ -24,7 +24,7 @@ proptest! {
         start in prop::collection::vec((-1.2f64..1.2, -1.2f64..1.2, 0.0f64..6.0), 1..7),
         steps in 1usize..40,
         holes in prop::collection::vec(0usize..256, 0..20),
-        (background, width) in (any::<bool>(), 0u8..3),
+        (background, width) in (any::<bool>(), 0u8..4),
         seed in any::<u64>(),
     ) {
         let camera = Config { pixels: [16, 16], spot_sigma_m: Some(sigma), ..Config::default() }.camera().expect("a camera");
@@ -52,7 +52,7 @@ proptest! {
         let mut fitter = Fitter::new(bx, by);
         let mut model = Model::empty(Nuisances {
             background,
-            width: [Width::Known, Width::Common, Width::PerAxis][usize::from(width)],
+            width: [Width::Known, Width::Common, Width::PerAxis, Width::Turned][usize::from(width)],
         });
         model.spots = start.iter().map(|(x, y, e)| Spot::new([x * half / sigma, y * half / sigma], 10f64.powf(*e))).collect();
         fitter.restart(None);

@@ -28,12 +28,12 @@ const NO_DROP: f64 = 1e-4;
 const OVERLAP: f64 = 3.0;
 /// A bar is out of reach when this many times the drop that a quadratic promises does not get there.
 const HOPE: f64 = 5.0;
-/// A deviance of this many times its expectation says that emitters are missing: their absence, not the last digits of the
-/// others, is what matters. Such a fit ends after so many steps in a row that bring less than this share of it, and goes on past
-/// its steps while each brings more than that one.
+/// A deviance of this many times its expectation says that emitters are missing; the last digits of the others matter little then.
 const FAR_OFF: f64 = 100.0;
+/// So far off, a fit ends after so many steps in a row that each bring less than this share of the deviance.
 const IDLE: f64 = 1e-2;
 const IDLE_STEPS: usize = 3;
+/// A fit goes on past its steps, up to so many times as many, while the last one taken brought more than this share.
 const BRISK: f64 = 0.2;
 pub(super) const MOST_STEPS: usize = 8;
 /// Steps of all emitters together before those that still move are fitted alone, and how often.
@@ -57,8 +57,8 @@ pub(super) struct Fitter {
     /// Weighted residual, (my, mx).
     pub(super) residual: Vec<f64>,
     trial_residual: Vec<f64>,
-    /// The frame's derivatives in the widths, (my, mx), plain and weighted.
-    pub(super) broadening: [Vec<f64>; 2],
+    /// The frame's derivatives in the widths and the turn, (my, mx), plain and weighted.
+    pub(super) broadening: [Vec<f64>; 3],
     pub(super) weighted: Vec<f64>,
     pub(super) hessian: Vec<f64>,
     pub(super) factor: Vec<f64>,
@@ -224,6 +224,7 @@ impl Fitter {
         self.now.spots.clone_from(&model.spots);
         self.now.background = model.background;
         self.now.width = model.width;
+        self.now.turn = model.turn;
         for s in &mut self.now.spots {
             s.u[0] = s.u[0].clamp(self.bx.lowest(), self.bx.highest());
             s.u[1] = s.u[1].clamp(self.by.lowest(), self.by.highest());
@@ -302,6 +303,7 @@ impl Fitter {
         model.spots.clone_from(&self.now.spots);
         model.background = self.now.background;
         model.width = self.now.width;
+        model.turn = self.now.turn;
         model.deviance = deviance - pull(&model.spots);
         // A fit of no steps only evaluates: it says nothing new about convergence.
         model.converged = converged || steps == 0 && model.converged;
@@ -366,8 +368,7 @@ impl Fitter {
 fn residual_at(bad: &BadPixel, atoms: &Atoms) -> f64 {
     let mut left = bad.value;
     for i in 0..atoms.sources() {
-        let [x, y] = atoms.at(i, bad.x, bad.y);
-        left -= atoms.amplitude(i) * x[0] * y[0];
+        left -= atoms.amplitude(i) * atoms.at(i, bad.x, bad.y)[0][0];
     }
     left
 }

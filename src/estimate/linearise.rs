@@ -70,7 +70,10 @@ impl Fitter {
         for i in 0..if widths > 0 { n } else { 0 } {
             let [ax, ay] = atoms.width.map(|w| atoms.spots[i].a * w * w);
             atoms.add(i, 2, 0, ax, &mut self.broadening[0]);
-            atoms.add(i, 0, 2, ay, &mut self.broadening[widths - 1]);
+            atoms.add(i, 0, 2, ay, &mut self.broadening[(widths - 1).min(1)]);
+            if widths > 2 {
+                atoms.add(i, 1, 1, atoms.spots[i].a, &mut self.broadening[2]);
+            }
         }
         for w in 0..widths {
             let weighted = &mut self.weighted;
@@ -115,17 +118,20 @@ pub(super) fn slope_at(bad: &BadPixel, atoms: &Atoms, widths: usize, row: &mut [
     row[p - widths..].fill(0.0);
     let mut left = bad.value;
     for i in 0..atoms.sources() {
-        let [[x0, x1, x2], [y0, y1, y2]] = atoms.at(i, bad.x, bad.y);
+        let at = atoms.at(i, bad.x, bad.y);
         let a = atoms.amplitude(i);
-        left -= a * x0 * y0;
+        left -= a * at[0][0];
         if i >= n {
-            row[2 * n + i] = x0 * y0;
+            row[2 * n + i] = at[0][0];
             continue;
         }
-        (row[3 * i], row[3 * i + 1], row[3 * i + 2]) = (a * x1 * y0, a * x0 * y1, x0 * y0);
+        (row[3 * i], row[3 * i + 1], row[3 * i + 2]) = (a * at[1][0], a * at[0][1], at[0][0]);
         if widths > 0 {
-            row[p - widths] += a * atoms.width[0].powi(2) * x2 * y0;
-            row[p - 1] += a * atoms.width[1].powi(2) * x0 * y2;
+            row[p - widths] += a * atoms.width[0].powi(2) * at[2][0];
+            row[p - widths + (widths - 1).min(1)] += a * atoms.width[1].powi(2) * at[0][2];
+        }
+        if widths > 2 {
+            row[p - 1] += a * at[1][1];
         }
     }
     left

@@ -25,6 +25,7 @@ mod network;
 mod noise;
 mod otherwise;
 mod part;
+mod parts;
 mod pencil;
 mod posterior;
 mod power;
@@ -40,7 +41,7 @@ mod straight;
 mod unusable;
 mod weigh;
 
-pub use bound::{Beside, position_bound, position_bound_beside};
+pub use bound::{Beside, Shape, position_bound, position_bound_beside};
 pub use config::Config;
 pub use emitter::{Bend, Emitter, Estimate, Flags};
 pub use ladder::{ConfigError, DEFAULT, LADDER, Rung, build, rung};

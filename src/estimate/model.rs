@@ -32,6 +32,8 @@ pub(super) enum Width {
     Known,
     Common,
     PerAxis,
+    /// The same with a covariance between the axes: an ellipse that is turned against them.
+    Turned,
 }
 
 impl Nuisances {
@@ -44,6 +46,7 @@ impl Nuisances {
             Width::Known => 0,
             Width::Common => 1,
             Width::PerAxis => 2,
+            Width::Turned => 3,
         }
     }
 
@@ -59,6 +62,8 @@ pub(super) struct Model {
     pub background: [f64; 3],
     /// Relative to the configured σ.
     pub width: [f64; 2],
+    /// The spot's covariance between the axes, σ².
+    pub turn: f64,
     /// Squared residual over the usable numbers, in units of the noise.
     pub deviance: f64,
     /// What the number of emitters costs where known powers are weighed in.
@@ -73,6 +78,7 @@ impl Model {
             nuisances,
             background: [0.0; 3],
             width: [1.0; 2],
+            turn: 0.0,
             deviance: f64::INFINITY,
             occam: 0.0,
             converged: false,
@@ -84,6 +90,9 @@ impl Model {
         self.nuisances = nuisances;
         if nuisances.width == Width::Known {
             self.width = [1.0; 2];
+        }
+        if nuisances.width != Width::Turned {
+            self.turn = 0.0;
         }
         if !nuisances.background {
             self.background = [0.0; 3];

@@ -16,6 +16,12 @@ pub(super) const WIDE: Nuisances = Nuisances {
     background: true,
     width: Width::Common,
 };
+const TURNED: Nuisances = Nuisances {
+    background: true,
+    width: Width::Turned,
+};
+/// Share of the misfit that turning the spots must promise to be tried.
+const PROMISE: f64 = 0.02;
 /// Emitters of less than this many prices' significance may be a background's or a width's.
 const DOUBT: f64 = 4.0;
 /// Steps that the pencil's seeds are polished by where more is fitted beside.
@@ -85,7 +91,10 @@ impl Search {
             return None;
         }
         let mut best: Option<Model> = None;
-        for width in [Width::Known, Width::Common, Width::PerAxis] {
+        for width in [Width::Known, Width::Common, Width::PerAxis, Width::Turned] {
+            if width == Width::Turned && !self.promises_a_turn(reading, best.as_ref().unwrap_or(model)) {
+                break;
+            }
             let nuisances = Nuisances {
                 background: true,
                 width,
@@ -106,6 +115,40 @@ impl Search {
             }
         }
         best
+    }
+
+    /// Takes turned spots where they explain the frame: from where the `first` look ended, or from seeds of their own.
+    pub(super) fn turn(&mut self, reading: &Reading, frame: &Screened, first: Model, model: &mut Model) {
+        if self.is_torn(reading) {
+            return;
+        }
+        let mut next = first;
+        for nuisances in [WIDE, TURNED] {
+            next.nuisances = nuisances;
+            self.fitter.fit(reading, &mut next, LONG_POLISH);
+        }
+        if reading.is_explained(&next) {
+            self.refine(reading, &mut next, EARLY_ROUNDS);
+        }
+        self.take_better(model, next);
+        if !reading.is_explained(model) || self.is_odd(model) {
+            let next = self.start(reading, frame, TURNED, LONG_POLISH);
+            self.take_better(model, next);
+        }
+    }
+
+    /// Whether turning the spots of `model`, all else as it is, explains a good part of what it leaves (Rao's score test). Only for
+    /// spots that stand apart: of melted ones it says nothing.
+    fn promises_a_turn(&mut self, reading: &Reading, model: &Model) -> bool {
+        if self.sampler.is_some() || self.is_torn(reading) {
+            return false;
+        }
+        let mut next = model.clone();
+        next.nuisances = TURNED;
+        self.fitter.information(reading, &mut next);
+        let (p, last) = (next.parameters(), next.parameters() - 1);
+        let gain = self.fitter.gradient[last].powi(2) / self.fitter.hessian[last * p + last].max(1e-300);
+        gain > PROMISE * (model.deviance - reading.numbers)
     }
 
     /// Takes out nuisances that the frame can do without.

@@ -37,9 +37,12 @@ impl Model {
 }
 
 impl Fitter {
-    /// The spots of groups that the last step moved, where they are no more than half of all.
+    /// The spots of groups that the last step moved, where they are no more than half of all; `None` also without a step.
     pub(super) fn moving(&self, groups: &[Vec<usize>]) -> Option<Vec<usize>> {
         let n = self.now.spots.len();
+        if self.velocity.len() != 3 * n {
+            return None;
+        }
         let is_moving = |i: usize| {
             let along = |k: usize| self.hessian[(3 * i + k) * (3 * n + 1)] * self.velocity[3 * i + k].powi(2);
             !(along(0) + along(1) < REST)
@@ -60,8 +63,7 @@ impl Fitter {
             let amplitude = self.now.amplitude(i);
             self.now.add(i, 0, 0, -amplitude, &mut part.z);
             for bad in &mut part.bad {
-                let [x, y] = self.now.at(i, bad.x, bad.y);
-                bad.value -= amplitude * x[0] * y[0];
+                bad.value -= amplitude * self.now.at(i, bad.x, bad.y)[0][0];
             }
         }
         part

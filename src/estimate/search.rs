@@ -31,7 +31,7 @@ const FAR: f64 = 5.0;
 const CHEAPER: f64 = 30.0;
 /// More overlapping emitters than these are first taken for something else.
 const BLOB: usize = 10;
-/// Where more than this share of the pixels is unusable, the pencil would see what was filled in.
+/// Where more than this share of the pixels is unusable, the pencil would see what was filled in, and turned spots cost too much.
 const TORN: f64 = 0.03;
 /// Least drop of the deviance that a nuisance parameter must bring.
 pub(super) const NUISANCE_PRICE: f64 = 5.0;
@@ -112,7 +112,9 @@ impl Search {
             return self.factor * model.occam;
         }
         let nuisances = NUISANCE_PRICE * model.nuisances.count() as f64;
-        self.factor * (self.price * model.spots.len() as f64 + nuisances)
+        // A pair makes a turned ellipse of one spot, and is likelier than a lens that makes one of all.
+        let priced = model.spots.len() + usize::from(model.nuisances.width == Width::Turned);
+        self.factor * (self.price * priced as f64 + nuisances)
     }
 
     /// Maximum likelihood with the number of emitters unknown. Nuisances are fitted only where the frame cannot be
@@ -120,6 +122,7 @@ impl Search {
     pub fn maximum_likelihood(&mut self, reading: &Reading, frame: &Screened, look: Model) -> Model {
         self.factor = reading.lit_variance;
         let plain = look.nuisances;
+        let first = look.clone();
         let mut model = if self.sampler.is_some() {
             look
         } else {
@@ -137,6 +140,9 @@ impl Search {
         let is_far = reading.misfit(&model) > 1.0 + FAR * (2.0 / reading.numbers).sqrt();
         if is_far || model.nuisances != plain || self.is_odd(&model) && self.would_do_otherwise(reading, &model) {
             self.explain_otherwise(reading, frame, &mut model);
+            if !reading.is_explained(&model) || self.is_odd(&model) {
+                self.turn(reading, frame, first, &mut model);
+            }
             is_settled = false;
         }
         if !is_settled {
@@ -235,10 +241,14 @@ impl Search {
         model
     }
 
+    pub(super) fn is_torn(&self, reading: &Reading) -> bool {
+        reading.bad.len() as f64 > TORN * (self.fitter.bx.n * self.fitter.by.n) as f64
+    }
+
     /// Seeds by the pencil for rising N until the frame is explained: as configured first, then with a background and
     /// another width, both of which have singular values of their own.
     fn pencil(&mut self, reading: &Reading, nuisances: Nuisances, polish: usize) -> Option<Model> {
-        if reading.bad.len() as f64 > TORN * (self.fitter.bx.n * self.fitter.by.n) as f64 {
+        if self.is_torn(reading) {
             return None;
         }
         let pencil = self

@@ -8,12 +8,17 @@ use super::reading::Reading;
 /// |acceleration|² over |velocity|² above which a step is not trusted (Transtrum and Sethna, 2012, eq. 15).
 const LARGEST_ACCELERATION: f64 = 0.56 / 4.0;
 
+/// Largest correlation between the axes: an ellipse 1.7 times as long as wide.
+const MOST_TURN: f64 = 0.5;
+
 impl Fitter {
     /// Sets the trial hypothesis one damped, accelerated step away. `false` where no step could be had.
     #[inline(always)]
     pub(super) fn step(&mut self, reading: &Reading, nuisances: Nuisances, lambda: f64, overlap: bool) -> bool {
         let n = self.now.spots.len();
         let p = 3 * n + nuisances.count();
+        // Without a step there is no velocity, nor an earlier fit's.
+        self.velocity.clear();
         self.factor.clear();
         self.factor.extend_from_slice(&self.hessian[..p * p]);
         for i in 0..p {
@@ -22,7 +27,6 @@ impl Fitter {
         if !cholesky(&mut self.factor, p) {
             return false;
         }
-        self.velocity.clear();
         self.velocity.extend_from_slice(&self.gradient[..p]);
         solve(&self.factor, p, &mut self.velocity);
         if overlap {
@@ -54,6 +58,11 @@ impl Fitter {
         for w in 0..if widths > 0 { 2 } else { 0 } {
             let d = delta(p - widths + w.min(widths - 1)).clamp(-0.1, 0.1);
             trial.width[w] = (self.now.width[w] * d.exp()).clamp(0.5, 2.0);
+        }
+        trial.turn = self.now.turn;
+        if widths > 2 {
+            let room = MOST_TURN * trial.width[0].min(trial.width[1]).powi(2);
+            trial.turn = (trial.turn + delta(p - 1).clamp(-0.1, 0.1)).clamp(-room, room);
         }
         true
     }

@@ -3,9 +3,10 @@
 use ndarray::Array2;
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
+use rand_distr::{Distribution, StandardNormal};
 use serde::{Deserialize, Serialize};
 
-use crate::estimate::{Beside, position_bound_beside};
+use crate::estimate::{Beside, Shape, position_bound_beside};
 use crate::optics::{Axis, Camera, psf};
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -13,6 +14,8 @@ use crate::optics::{Axis, Camera, psf};
 pub enum Condition {
     /// Spots 5 % wider than configured.
     Width,
+    /// Spots 5 % longer along the array's diagonal and 5 % narrower across it.
+    Ellipse,
     /// Even light, a fifth of a typical peak.
     Background,
     /// 12 bits up to twice a typical peak.
@@ -21,31 +24,39 @@ pub enum Condition {
     Saturated,
     /// One pixel in a hundred reads nothing.
     Dead,
+    /// One pixel in a hundred is off by a normal variate of thirty times the noise, another one in every frame.
+    Spikes,
 }
 
 const WIDER: f64 = 1.05;
+const ELLIPSE: [f64; 2] = [1.05, 0.95];
 const LIGHT: f64 = 0.2;
 const LEVELS: f64 = 4095.0;
 const HEADROOM: f64 = 2.0;
 const CLIP: f64 = 0.6;
 const DEAD: f64 = 0.01;
+const SPIKE: f64 = 30.0;
 
 impl Condition {
-    pub const ALL: [Self; 5] = [
+    pub const ALL: [Self; 7] = [
         Self::Width,
+        Self::Ellipse,
         Self::Background,
         Self::Quantised,
         Self::Saturated,
         Self::Dead,
+        Self::Spikes,
     ];
 
     pub fn name(self) -> &'static str {
         match self {
             Self::Width => "width+5%",
+            Self::Ellipse => "ellipse",
             Self::Background => "background",
             Self::Quantised => "12-bit",
             Self::Saturated => "saturated",
             Self::Dead => "dead",
+            Self::Spikes => "spikes",
         }
     }
 
@@ -59,10 +70,28 @@ impl Condition {
     /// The camera that frames are made with.
     pub(super) fn lens(condition: Option<Self>, camera: &Camera) -> Camera {
         let mut truth = camera.clone();
-        if condition == Some(Self::Width) {
-            truth.spot_sigma_m *= WIDER;
-        }
+        truth.spot_sigma_m *= match condition {
+            Some(Self::Width) => WIDER,
+            Some(Self::Ellipse) => ELLIPSE[1],
+            _ => 1.0,
+        };
         truth
+    }
+
+    /// What a spot consists of: offsets of its parts, the same in x and in y, and their shares.
+    pub(super) fn parts(condition: Option<Self>, camera: &Camera) -> Vec<(f64, f64)> {
+        if condition != Some(Self::Ellipse) {
+            return vec![(0.0, 1.0)];
+        }
+        // A round spot smeared by a Gaussian along the diagonal; sums of Gaussians half their σ apart are exact to rounding.
+        let smear = camera.spot_sigma_m * (ELLIPSE[0].powi(2) - ELLIPSE[1].powi(2)).sqrt();
+        (-12..=12)
+            .map(|k| 0.5 * f64::from(k))
+            .map(|t| {
+                let share = 0.5 * (-0.5 * t * t).exp() / std::f64::consts::TAU.sqrt();
+                (t * smear * std::f64::consts::FRAC_1_SQRT_2, share)
+            })
+            .collect()
     }
 
     /// Does to a frame what the condition does; returns each emitter's bound, m², with what is to be estimated under it, and the
@@ -83,7 +112,11 @@ impl Condition {
         let mut unusable = vec![false; pixels.len()];
         match condition {
             None => {}
-            Some(Self::Width) => beside.width = true,
+            Some(Self::Width) => beside.shape = Shape::Width,
+            Some(Self::Ellipse) => {
+                beside.shape = Shape::Ellipse;
+                camera.spot_sigma_m /= ELLIPSE[1];
+            }
             Some(Self::Background) => {
                 beside.background = true;
                 *pixels += LIGHT * peak;
@@ -104,6 +137,15 @@ impl Condition {
                 for (pixel, bad) in pixels.iter_mut().zip(&mut unusable) {
                     if rng.random_bool(DEAD) {
                         (*pixel, *bad) = (0.0, true);
+                    }
+                }
+            }
+            Some(Self::Spikes) => {
+                for (pixel, bad) in pixels.iter_mut().zip(&mut unusable) {
+                    if rng.random_bool(DEAD) {
+                        let spike: f64 = StandardNormal.sample(rng);
+                        *pixel += SPIKE * truth.noise_std_j * spike;
+                        *bad = true;
                     }
                 }
             }

@@ -155,13 +155,16 @@ impl Cell {
         let noise = Normal::new(0.0, camera.noise_std_j).expect("a camera's noise is positive and finite");
         let mut pixels = ndarray::Array2::from_shape_simple_fn(camera.shape(), || noise.sample(rng));
         let truth = Condition::lens(self.condition, camera);
+        let parts = Condition::parts(self.condition, camera);
         let (mut row, mut column) = (vec![0.0; camera.x.n], vec![0.0; camera.y.n]);
         for (&p, &e) in positions.iter().zip(&energies) {
             let [x, y] = truth.to_sensor(p);
-            psf::profile(&camera.x, x, truth.spot_sigma_m, &mut row);
-            psf::profile(&camera.y, y, truth.spot_sigma_m, &mut column);
-            for ((b, a), pixel) in pixels.indexed_iter_mut() {
-                *pixel += e * column[b] * row[a];
+            for &(offset, share) in &parts {
+                psf::profile(&camera.x, x + offset, truth.spot_sigma_m, &mut row);
+                psf::profile(&camera.y, y + offset, truth.spot_sigma_m, &mut column);
+                for ((b, a), pixel) in pixels.indexed_iter_mut() {
+                    *pixel += share * e * column[b] * row[a];
+                }
             }
         }
         let relative_std = self.known_power(camera).relative_std;
