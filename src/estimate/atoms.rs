@@ -50,6 +50,11 @@ impl Atoms {
         self.parts.footprint()
     }
 
+    /// Products that a spot is a sum of.
+    pub fn parts_a_spot(&self) -> f64 {
+        self.smear(0).len() as f64
+    }
+
     /// Amplitude of a source.
     #[inline(always)]
     pub fn amplitude(&self, i: usize) -> f64 {
@@ -98,22 +103,21 @@ impl Atoms {
         }
     }
 
-    /// A source's parts and their shares in it.
+    /// A source's first part, and the shares of all of them in it.
     #[inline(always)]
-    fn parts(&self, i: usize) -> impl Iterator<Item = (usize, f64)> + use<> {
+    fn parts(&self, i: usize) -> (usize, &'static [(f64, f64)]) {
         let n = self.spots.len();
-        let smear = self.smear(i);
         let each = self.smear(0).len();
-        let first = if i < n { i * each } else { n * each + i - n };
-        smear.iter().enumerate().map(move |(k, (_, share))| (first + k, *share))
+        (if i < n { i * each } else { n * each + i - n }, self.smear(i))
     }
 
     /// Values of source `i` at an unusable pixel: `[a][b]` derived a times along x and b times along y.
     #[inline(always)]
     pub fn at(&self, i: usize, x: usize, y: usize) -> [[f64; 3]; 3] {
         let mut sum = [[0.0; 3]; 3];
-        for (k, share) in self.parts(i) {
-            let [fx, fy] = self.parts.at(k, x, y);
+        let (first, shares) = self.parts(i);
+        for (k, (_, share)) in shares.iter().enumerate() {
+            let [fx, fy] = self.parts.at(first + k, x, y);
             for a in 0..3 {
                 for b in 0..3 {
                     sum[a][b] += share * fx[a] * fy[b];
@@ -126,37 +130,53 @@ impl Atoms {
     /// Adds `scale`·f_y⁽ᵇ⁾⊗f_x⁽ᵃ⁾ of source `i` to a matrix (my, mx).
     #[inline(always)]
     pub fn add(&self, i: usize, a: usize, b: usize, scale: f64, matrix: &mut [f64]) {
-        for (k, share) in self.parts(i) {
-            self.parts.add(k, a, b, share * scale, matrix);
+        let (first, shares) = self.parts(i);
+        for (k, (_, share)) in shares.iter().enumerate() {
+            self.parts.add(first + k, a, b, share * scale, matrix);
         }
     }
 
     /// Adds `f_y⊗(q0[0] f″_x + q0[1] f′_x) + f′_y⊗(q1[0] f′_x + q1[1] f_x) + q2 f″_y⊗f_x` of source `i` to a matrix (my, mx).
     #[inline(always)]
     pub fn add_bent(&self, i: usize, q0: [f64; 2], q1: [f64; 2], q2: f64, scratch: &mut Vec<f64>, matrix: &mut [f64]) {
-        for (k, share) in self.parts(i) {
-            let [q0, q1] = [q0, q1].map(|q| q.map(|v| share * v));
-            self.parts.add_bent(k, q0, q1, share * q2, scratch, matrix);
+        let (first, shares) = self.parts(i);
+        for (k, (_, share)) in shares.iter().enumerate() {
+            let (q0, q1) = ([share * q0[0], share * q0[1]], [share * q1[0], share * q1[1]]);
+            self.parts.add_bent(first + k, q0, q1, share * q2, scratch, matrix);
         }
     }
 
     /// Inner products of a matrix (my, mx) with f_y⊗f_x, f_y⊗f′_x and f′_y⊗f_x of source `i`.
     #[inline(always)]
     pub fn project(&self, i: usize, matrix: &[f64], scratch: &mut Vec<f64>) -> [f64; 3] {
-        self.sum(i, |k| self.parts.project(k, matrix, scratch))
+        let (first, shares) = self.parts(i);
+        let mut sum = [0.0; 3];
+        for (k, (_, share)) in shares.iter().enumerate() {
+            add(&mut sum, *share, self.parts.project(first + k, matrix, scratch));
+        }
+        sum
     }
 
     /// The first of these alone.
     #[inline(always)]
     pub fn project_value(&self, i: usize, matrix: &[f64], scratch: &mut Vec<f64>) -> f64 {
-        let [value] = self.sum(i, |k| [self.parts.project_value(k, matrix, scratch)]);
-        value
+        let (first, shares) = self.parts(i);
+        let mut sum = 0.0;
+        for (k, (_, share)) in shares.iter().enumerate() {
+            sum += share * self.parts.project_value(first + k, matrix, scratch);
+        }
+        sum
     }
 
     /// Inner products with the second derivatives: xx, xy, yy.
     #[inline(always)]
     pub fn bend(&self, i: usize, matrix: &[f64], scratch: &mut Vec<f64>) -> [f64; 3] {
-        self.sum(i, |k| self.parts.bend(k, matrix, scratch))
+        let (first, shares) = self.parts(i);
+        let mut sum = [0.0; 3];
+        for (k, (_, share)) in shares.iter().enumerate() {
+            add(&mut sum, *share, self.parts.bend(first + k, matrix, scratch));
+        }
+        sum
     }
 
     /// Inner product of source `i`'s derivative, `a[0]` times along x and `a[1]` times along y, with source `j`'s under `weights`
@@ -171,12 +191,18 @@ impl Atoms {
         weights: &[f64],
         scratch: &mut Vec<f64>,
     ) -> f64 {
-        let [value] = self.sum(i, |k| self.sum(j, |l| [self.parts.inner(k, a, l, b, weights, scratch)]));
-        value
+        let ((first, shares), (other, others)) = (self.parts(i), self.parts(j));
+        let mut sum = 0.0;
+        for (k, (_, share)) in shares.iter().enumerate() {
+            for (l, (_, of)) in others.iter().enumerate() {
+                sum += share * of * self.parts.inner(first + k, a, other + l, b, weights, scratch);
+            }
+        }
+        sum
     }
 
-    /// Inner products along x and along y of source `i`'s f, f′ and f″ with source `j`'s f and f′; `None` where they share nothing
-    /// or are turned.
+    /// Inner products along x and along y of source `i`'s f, f′ and f″ with source `j`'s f and f′; `None` where they share nothing.
+    /// Only of spots that are upright.
     #[inline(always)]
     pub fn grams(&self, i: usize, j: usize) -> Option<[[[f64; 2]; 3]; 2]> {
         self.parts.grams(i, j)
@@ -185,17 +211,24 @@ impl Atoms {
     /// Inner products of (f′_x f_y, f_x f′_y, f_x f_y) of source `i` with those of source `j`, 3 × 3 row-major.
     #[inline(always)]
     pub fn couple(&self, i: usize, j: usize, weights: &[f64], scratch: &mut Vec<f64>) -> [f64; 9] {
-        self.sum(i, |k| self.sum(j, |l| self.parts.couple(k, l, weights, scratch)))
-    }
-
-    #[inline(always)]
-    fn sum<const N: usize>(&self, i: usize, mut of: impl FnMut(usize) -> [f64; N]) -> [f64; N] {
-        let mut sum = [0.0; N];
-        for (k, share) in self.parts(i) {
-            for (s, v) in sum.iter_mut().zip(of(k)) {
-                *s += share * v;
+        let ((first, shares), (other, others)) = (self.parts(i), self.parts(j));
+        let mut sum = [0.0; 9];
+        for (k, (_, share)) in shares.iter().enumerate() {
+            for (l, (_, of)) in others.iter().enumerate() {
+                add(
+                    &mut sum,
+                    share * of,
+                    self.parts.couple(first + k, other + l, weights, scratch),
+                );
             }
         }
         sum
+    }
+}
+
+#[inline(always)]
+fn add<const N: usize>(sum: &mut [f64; N], share: f64, values: [f64; N]) {
+    for k in 0..N {
+        sum[k] += share * values[k];
     }
 }

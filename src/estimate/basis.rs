@@ -20,6 +20,7 @@ const WIDEST: f64 = 120.0;
 const WIDTHS: [f64; 5] = [0.85, 0.93, 1.0, 1.08, 1.18];
 
 /// An axis in units of σ, with its basis.
+#[derive(Clone)]
 pub(super) struct Basis {
     pub n: usize,
     /// Pixel edges, σ.

@@ -72,6 +72,8 @@ pub(super) struct Fitter {
     pub(super) active: Vec<bool>,
     /// Multiplications since the last frame, and the time it must be done by.
     pub(super) work: f64,
+    /// Work that must not be exceeded, whatever the hypotheses.
+    limit: f64,
     /// Sources of the largest hypothesis since.
     most_sources: f64,
     /// Steps since.
@@ -103,6 +105,7 @@ impl Fitter {
             small: Vec::new(),
             active: Vec::new(),
             work: 0.0,
+            limit: f64::INFINITY,
             most_sources: 0.0,
             steps: 0,
             deadline: None,
@@ -112,6 +115,7 @@ impl Fitter {
     /// Forgets the work done for the last frame.
     pub fn restart(&mut self, deadline: Option<Instant>) {
         self.work = 0.0;
+        self.limit = f64::INFINITY;
         self.most_sources = 0.0;
         self.steps = 0;
         self.deadline = deadline;
@@ -122,8 +126,13 @@ impl Fitter {
         self.work = self.work.min((1.0 - share) * self.most_work());
     }
 
+    /// Allows what comes no more than this share of the work on a frame of a few emitters, or as much as is usual.
+    pub fn allow(&mut self, share: Option<f64>) {
+        self.limit = share.map_or(f64::INFINITY, |share| self.work + share * MOST_WORK);
+    }
+
     fn most_work(&self) -> f64 {
-        MOST_WORK * (self.most_sources / MANY).clamp(1.0, MOST_TIMES).powi(2)
+        (MOST_WORK * (self.most_sources / MANY).clamp(1.0, MOST_TIMES).powi(2)).min(self.limit)
     }
 
     /// Whether the frame has had its share of work, or of time where a budget is set.
@@ -316,7 +325,14 @@ impl Fitter {
         let parameters = 3.0 * sources;
         let unusable = reading.bad.len() as f64 * (2.0 * parameters + 0.5 * parameters * parameters);
         let pairs = if reading.weights.is_empty() { 0.0 } else { 3.0 * sources };
+        let parts = self.now.parts_a_spot();
+        let products = if parts > 1.0 {
+            8.0 * (parts * sources).powi(2) * (reading.mx + reading.my) as f64
+        } else {
+            0.0
+        };
         unusable
+            + products
             + (9.0 + pairs) * self.now.footprint()
             + 40.0 * sources * (reading.mx + reading.my) as f64
             + 9.0 * sources.powi(3)

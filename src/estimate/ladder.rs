@@ -89,6 +89,9 @@ pub const DEFAULT: &str = "ml";
 const REACH: f64 = 5.3;
 const TYPICAL: f64 = 1e-5;
 
+/// Share of a frame's work that the pencil's look may take where it is not the main way.
+const SHORT: f64 = 0.03;
+
 /// Times that a frame is looked over for pixels that are lit alone.
 const LOOKS: usize = 3;
 
@@ -187,6 +190,9 @@ struct Analytic {
     inspection: Inspection,
     /// The frame in bases that leave room for noise alone, where the search itself leaves none.
     compressed: Option<([Basis; 2], Reading)>,
+    /// For frames that residual peaks do not explain at once, where spots mostly stand apart; in the compressed bases where there
+    /// are any.
+    pencil: Option<Search>,
     budget: Option<Duration>,
     search: Search,
     reading: Reading,
@@ -197,6 +203,9 @@ struct Analytic {
 impl Analytic {
     fn new(rung: &'static Rung, camera: &Camera, budget: Option<Duration>, known: Option<&KnownPower>) -> Self {
         let (bases, compressed) = bases(camera);
+        let pencil = rung
+            .is_ordering()
+            .then(|| Search::for_a_look(compressed.as_ref().unwrap_or(&bases).clone()));
         let search = Search::new(bases);
         let compressed = compressed.map(|bases| (bases, Reading::default()));
         Self {
@@ -205,6 +214,7 @@ impl Analytic {
             frame: Screened::default(),
             inspection: Inspection::default(),
             compressed,
+            pencil: pencil.flatten(),
             budget,
             search,
             reading: Reading::default(),
@@ -239,22 +249,38 @@ impl Analytic {
         }
     }
 
-    /// The emitters that stand out at once, after taking out pixels that are lit alone.
-    fn first_look(&mut self) -> Model {
+    /// What the pencil's seeds lead to, where that soon explains the frame and nothing unusual is about.
+    fn pencil_look(&mut self) -> Option<Model> {
+        let reading = self.compressed.as_ref().map_or(&self.reading, |(_, r)| r);
+        let search = self
+            .pencil
+            .as_mut()
+            .filter(|s| reading.growth.is_flat() && !s.is_torn(reading))?;
+        search.fitter.allow(Some(SHORT));
+        let look = search.first_look(reading, &self.frame);
+        if !reading.is_explained(&look) {
+            return None;
+        }
+        search.fitter.allow(None);
+        let model = search.maximum_likelihood(reading, &self.frame, look);
+        reading.is_explained(&model).then_some(model)
+    }
+
+    /// `look`, taken anew after taking out pixels that are lit alone.
+    fn without_lone_pixels(&mut self, mut look: Model) -> Model {
         let Self { search, reading, .. } = self;
-        let mut model = search.first_look(reading, &self.frame);
         for _ in 0..LOOKS {
-            if reading.is_explained(&model) {
+            if reading.is_explained(&look) {
                 break;
             }
-            let residual = search.fitter.residual_of(reading, &mut model).to_vec();
+            let residual = search.fitter.residual_of(reading, &mut look).to_vec();
             let (bx, by) = (&search.fitter.bx, &search.fitter.by);
             if !self.inspection.reject_lone(&mut self.frame, reading, &residual, bx, by) {
                 break;
             }
-            model = search.first_look(reading, &self.frame);
+            look = search.first_look(reading, &self.frame);
         }
-        model
+        look
     }
 }
 
@@ -269,6 +295,10 @@ impl Estimator for Analytic {
         let scale = self.inspect();
         self.search.restart(deadline);
         self.weighing.search.restart(deadline);
+        if let Some(pencil) = &mut self.pencil {
+            pencil.restart(deadline);
+        }
+        let mut is_by_pencil = false;
         let is_ml = self.rung.is_ordering();
         let mut model = match self.rung.method {
             Method::Peak { is_subpixel } => self.search.peaks(&self.reading, is_subpixel),
@@ -283,11 +313,20 @@ impl Estimator for Analytic {
                 self.search.start(&self.reading, &self.frame, plain, steps)
             }
             Method::MaximumLikelihood | Method::MaximumPosterior => {
-                let look = self.first_look();
-                self.search.maximum_likelihood(&self.reading, &self.frame, look)
+                let look = self.search.first_look(&self.reading, &self.frame);
+                let is_explained = self.reading.is_explained(&look);
+                let by_pencil = if is_explained { None } else { self.pencil_look() };
+                is_by_pencil = by_pencil.is_some();
+                by_pencil.unwrap_or_else(|| {
+                    let look = self.without_lone_pixels(look);
+                    self.search.maximum_likelihood(&self.reading, &self.frame, look)
+                })
             }
         };
-        let Self { search, reading, .. } = self;
+        let (search, reading) = match &mut self.pencil {
+            Some(pencil) if is_by_pencil => (pencil, self.compressed.as_ref().map_or(&self.reading, |(_, r)| r)),
+            _ => (&mut self.search, &self.reading),
+        };
         let known = search
             .suspected
             .or((!reading.growth.is_flat()).then_some(reading.growth));
@@ -297,7 +336,7 @@ impl Estimator for Analytic {
         let (search, reading) = if is_weighted {
             (&mut self.weighing.search, &self.weighing.reading)
         } else {
-            (search, &*reading)
+            (search, reading)
         };
         let noise_j = scale * self.camera.noise_std_j;
         if let Some(mut prior) = self.prior.take() {
@@ -311,7 +350,8 @@ impl Estimator for Analytic {
         let mut estimate = ground::locate(search, reading, &mut model, &self.frame, &self.camera, noise_j);
         estimate.rung = self.rung.name;
         estimate.is_cut_short = is_exhausted;
-        estimate.steps = self.search.fitter.steps + self.weighing.search.fitter.steps;
+        let by_pencil = self.pencil.as_ref().map_or(0, |pencil| pencil.fitter.steps);
+        estimate.steps = by_pencil + self.search.fitter.steps + self.weighing.search.fitter.steps;
         if is_exhausted {
             for emitter in &mut estimate.emitters {
                 emitter.flags |= Flags::OUT_OF_TIME;

@@ -1,6 +1,7 @@
 //! What a frame may show instead of more emitters: a background, another width, noise that grows with the light.
 
 use super::model::{Model, Nuisances, Width};
+use super::moves::{merged, pairs};
 use super::reading::Reading;
 use super::screen::Screened;
 use super::search::{EARLY_ROUNDS, ROUNDS, Search, TRIAL_STEPS};
@@ -20,8 +21,12 @@ const TURNED: Nuisances = Nuisances {
     background: true,
     width: Width::Turned,
 };
-/// Share of the misfit that turning the spots must promise to be tried.
-const PROMISE: f64 = 0.02;
+/// Shares of a frame's work that turned spots may take before and after they have brought what upright ones leave down to a share.
+const TRIAL: f64 = 0.2;
+const TURN: f64 = 0.7;
+const MUCH: f64 = 0.02;
+/// Spots nearer than this, σ, may be a double that the lens makes.
+const DOUBLE: f64 = 1.5;
 /// Emitters of less than this many prices' significance may be a background's or a width's.
 const DOUBT: f64 = 4.0;
 /// Steps that the pencil's seeds are polished by where more is fitted beside.
@@ -91,10 +96,7 @@ impl Search {
             return None;
         }
         let mut best: Option<Model> = None;
-        for width in [Width::Known, Width::Common, Width::PerAxis, Width::Turned] {
-            if width == Width::Turned && !self.promises_a_turn(reading, best.as_ref().unwrap_or(model)) {
-                break;
-            }
+        for width in [Width::Known, Width::Common, Width::PerAxis] {
             let nuisances = Nuisances {
                 background: true,
                 width,
@@ -117,38 +119,41 @@ impl Search {
         best
     }
 
-    /// Takes turned spots where they explain the frame: from where the `first` look ended, or from seeds of their own.
+    /// Takes turned spots where they explain the frame: from `model` with its doubles made one, or where spots melt from where the
+    /// `first` look ended and from seeds of their own.
     pub(super) fn turn(&mut self, reading: &Reading, frame: &Screened, first: Model, model: &mut Model) {
         if self.is_torn(reading) {
             return;
         }
-        let mut next = first;
-        for nuisances in [WIDE, TURNED] {
-            next.nuisances = nuisances;
-            self.fitter.fit(reading, &mut next, LONG_POLISH);
+        let is_melted = self.sampler.is_some();
+        let mut next = if is_melted {
+            first
+        } else {
+            merged(model, &doubles(model))
+        };
+        next.nuisances = WIDE;
+        self.fitter.fit(reading, &mut next, TRIAL_STEPS);
+        if reading.is_explained(&next) {
+            return self.take_better(model, next);
         }
+        let left = next.deviance - reading.numbers;
+        next.nuisances = TURNED;
+        self.fitter.allow(Some(TRIAL));
+        self.fitter.fit(reading, &mut next, TRIAL_STEPS);
+        if !reading.is_explained(&next) && next.deviance - reading.numbers > MUCH * left {
+            return self.fitter.allow(None);
+        }
+        self.fitter.allow(Some(TURN));
+        self.fitter.fit(reading, &mut next, LONG_POLISH);
         if reading.is_explained(&next) {
             self.refine(reading, &mut next, EARLY_ROUNDS);
         }
         self.take_better(model, next);
-        if !reading.is_explained(model) || self.is_odd(model) {
+        if is_melted && (!reading.is_explained(model) || self.is_odd(model)) {
             let next = self.start(reading, frame, TURNED, LONG_POLISH);
             self.take_better(model, next);
         }
-    }
-
-    /// Whether turning the spots of `model`, all else as it is, explains a good part of what it leaves (Rao's score test). Only for
-    /// spots that stand apart: of melted ones it says nothing.
-    fn promises_a_turn(&mut self, reading: &Reading, model: &Model) -> bool {
-        if self.sampler.is_some() || self.is_torn(reading) {
-            return false;
-        }
-        let mut next = model.clone();
-        next.nuisances = TURNED;
-        self.fitter.information(reading, &mut next);
-        let (p, last) = (next.parameters(), next.parameters() - 1);
-        let gain = self.fitter.gradient[last].powi(2) / self.fitter.hessian[last * p + last].max(1e-300);
-        gain > PROMISE * (model.deviance - reading.numbers)
+        self.fitter.allow(None);
     }
 
     /// Takes out nuisances that the frame can do without.
@@ -242,4 +247,24 @@ impl Search {
             }
         }
     }
+}
+
+/// Pairs of near spots, each spot in one at most.
+fn doubles(model: &Model) -> Vec<(usize, usize)> {
+    let mut chosen: Vec<(usize, usize)> = Vec::new();
+    for (_, i, j) in pairs(model, DOUBLE) {
+        if chosen
+            .iter()
+            .all(|&(a, b)| ![a, b].contains(&i) && ![a, b].contains(&j))
+        {
+            chosen.push((i, j));
+        }
+    }
+    chosen
+}
+
+/// Whether so many emitters come in twos that the lens may make two of one.
+pub(super) fn is_doubled(model: &Model) -> bool {
+    let doubles = doubles(model).len();
+    doubles > 1 && 4 * doubles >= model.spots.len()
 }

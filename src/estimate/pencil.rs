@@ -20,8 +20,9 @@ const SAMPLES: [usize; 2] = [11, 15];
 const SPACING: f64 = 0.33;
 /// Centres at which samples are held to the Gaussian, a σ.
 const CENTRES: f64 = 8.0;
-/// Sensors wider than this, σ, are not for the pencil.
-const WIDEST: f64 = 13.0;
+/// Sensors up to so many σ wide are for the pencil, and where they have so many pixels at least, up to the second.
+const WIDEST: [f64; 2] = [13.0, 16.0];
+const FINE: usize = 30;
 /// Where a basis leaves out so few of an array's pixels, its last columns only amplify the noise: samples are held to the
 /// Gaussian no better than that of a bright spot lets them.
 const NEARLY: usize = 4;
@@ -62,9 +63,23 @@ pub(super) struct Pencil {
 impl Sampler {
     /// `None` where spots are too small against the sensor for the pencil to resolve them with few samples.
     pub fn new(bx: &Basis, by: &Basis) -> Option<Self> {
+        Self::up_to(WIDEST[0], 4, bx, by)
+    }
+
+    /// Where spots mostly stand apart, and the pencil is the quickest way only to those that do not.
+    pub fn for_a_look(bx: &Basis, by: &Basis) -> Option<Self> {
+        let melted = Self::new(bx, by);
+        if melted.is_some() {
+            None
+        } else {
+            Self::up_to(WIDEST[1], FINE, bx, by)
+        }
+    }
+
+    fn up_to(widest: f64, fewest: usize, bx: &Basis, by: &Basis) -> Option<Self> {
         if [bx, by]
             .iter()
-            .any(|b| b.n < 4 || b.is_pixels || b.edges[b.n] - b.edges[0] > WIDEST)
+            .any(|b| b.n < fewest || b.is_pixels || b.edges[b.n] - b.edges[0] > widest)
         {
             return None;
         }

@@ -8,7 +8,7 @@ use super::heatmap::Heatmap;
 use super::model::{Model, Nuisances, Spot, Width};
 use super::moves::Certainty;
 use super::noise::Growth;
-use super::otherwise::WIDE;
+use super::otherwise::{WIDE, is_doubled};
 use super::pencil::{Pencil, Sampler};
 use super::power::Prior;
 use super::reading::Reading;
@@ -55,9 +55,18 @@ pub(super) struct Search {
 }
 
 impl Search {
-    pub fn new(bases: [Basis; 2]) -> Self {
-        let [bx, by] = bases;
+    pub fn new([bx, by]: [Basis; 2]) -> Self {
         let sampler = Sampler::new(&bx, &by);
+        Self::with(sampler, bx, by)
+    }
+
+    /// For a first look by the pencil where [`Search::new`] goes by residual peaks.
+    pub fn for_a_look([bx, by]: [Basis; 2]) -> Option<Self> {
+        let sampler = Sampler::for_a_look(&bx, &by)?;
+        Some(Self::with(Some(sampler), bx, by))
+    }
+
+    fn with(sampler: Option<Sampler>, bx: Basis, by: Basis) -> Self {
         let fitter = Fitter::new(bx, by);
         let heatmap = Heatmap::new(&fitter.bx, &fitter.by);
         let area = |b: &Basis| b.edges[b.n] - b.edges[0];
@@ -140,9 +149,12 @@ impl Search {
         let is_far = reading.misfit(&model) > 1.0 + FAR * (2.0 / reading.numbers).sqrt();
         if is_far || model.nuisances != plain || self.is_odd(&model) && self.would_do_otherwise(reading, &model) {
             self.explain_otherwise(reading, frame, &mut model);
-            if !reading.is_explained(&model) || self.is_odd(&model) {
-                self.turn(reading, frame, first, &mut model);
-            }
+            is_settled = false;
+        }
+        let is_melted = self.sampler.is_some();
+        let may_be_turned = is_doubled(&model) && (!is_melted || !is_settled && self.is_odd(&model));
+        if may_be_turned || !is_settled && !reading.is_explained(&model) {
+            self.turn(reading, frame, first, &mut model);
             is_settled = false;
         }
         if !is_settled {
