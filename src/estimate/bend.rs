@@ -77,46 +77,47 @@ impl Fitter {
             lefts.push(slope_at(bad, &self.now, widths, &mut rows[start..]));
         }
         let (mut cross, mut taken) = (vec![0.0; 3 * p], vec![0.0; 3 * p]);
-        (0..model.spots.len())
-            .map(|i| {
-                cross.fill(0.0);
-                let (mut score, mut information) = self.raw_bend(reading, i, widths, &mut cross);
-                let atoms = &self.now;
-                for (k, bad) in reading.bad.iter().enumerate() {
-                    let at = atoms.at(i, bad.x, bad.y);
-                    let own = SECOND.map(|([a, b], f)| f * atoms.amplitude(i) * at[a][b]);
-                    if own == [0.0; 3] {
-                        continue;
-                    }
-                    for r in 0..3 {
-                        score[r] -= own[r] * lefts[k];
-                        axpy(-own[r], &rows[k * p..(k + 1) * p], &mut cross[r * p..(r + 1) * p]);
-                        for c in 0..3 {
-                            information[r][c] -= own[r] * own[c];
-                        }
-                    }
-                }
-                let whole = information;
-                for r in 0..3 {
-                    for k in 0..p {
-                        taken[r * p + k] = dot(&cross[r * p..(r + 1) * p], &covariance[k * p..(k + 1) * p]);
-                    }
+        let mut bends = Vec::with_capacity(model.spots.len());
+        for i in 0..model.spots.len() {
+            cross.fill(0.0);
+            let (mut score, mut information) = self.raw_bend(reading, i, widths, &mut cross);
+            let atoms = &self.now;
+            for (k, bad) in reading.bad.iter().enumerate() {
+                let at = atoms.at(i, bad.x, bad.y);
+                let a = atoms.amplitude(i);
+                let own = [0.5 * a * at[2][0], a * at[1][1], 0.5 * a * at[0][2]];
+                if own == [0.0; 3] {
+                    continue;
                 }
                 for r in 0..3 {
-                    let taken = &taken[r * p..(r + 1) * p];
-                    score[r] -= dot(taken, &self.gradient[..p]);
+                    score[r] -= own[r] * lefts[k];
+                    axpy(-own[r], &rows[k * p..(k + 1) * p], &mut cross[r * p..(r + 1) * p]);
                     for c in 0..3 {
-                        information[r][c] -= dot(taken, &cross[c * p..(c + 1) * p]);
+                        information[r][c] -= own[r] * own[c];
                     }
                 }
-                let is_left = (0..3).all(|r| information[r][r] > LEAST * whole[r][r]);
-                if is_left {
-                    Bend { score, information }
-                } else {
-                    Bend::default()
+            }
+            let whole = information;
+            for r in 0..3 {
+                for k in 0..p {
+                    taken[r * p + k] = dot(&cross[r * p..(r + 1) * p], &covariance[k * p..(k + 1) * p]);
                 }
-            })
-            .collect()
+            }
+            for r in 0..3 {
+                let taken = &taken[r * p..(r + 1) * p];
+                score[r] -= dot(taken, &self.gradient[..p]);
+                for c in 0..3 {
+                    information[r][c] -= dot(taken, &cross[c * p..(c + 1) * p]);
+                }
+            }
+            let is_left = (0..3).all(|r| information[r][r] > LEAST * whole[r][r]);
+            bends.push(if is_left {
+                Bend { score, information }
+            } else {
+                Bend::default()
+            });
+        }
+        bends
     }
 
     /// Score and information of spot `i`'s second moments, and what they share with the model's parameters, (3, p); unusable

@@ -294,31 +294,26 @@ impl Inspection {
     /// Variance in the dark, with its growth with the signal set in `reading`. Medians, so that outliers count for
     /// little: the median of a χ² variate of one degree of freedom is 0.4549.
     fn grow(&mut self, reading: &mut Reading) -> f64 {
-        let mut sorted: Vec<(f64, f64)> = self.squares.iter().copied().filter(|s| !s.1.is_nan()).collect();
-        sorted.sort_by(|a, b| a.0.total_cmp(&b.0));
-        if sorted.len() < 8 * LEVELS {
+        let mut points: Vec<(f64, f64)> = self.squares.iter().copied().filter(|s| !s.1.is_nan()).collect();
+        if points.len() < 8 * LEVELS {
             return 1.0;
         }
         // Half the pixels make the dark level, the rest levels of rising signal and falling number.
         let mut levels = Vec::with_capacity(LEVELS);
-        let mut start = 0;
+        let mut rest = points.as_mut_slice();
         for _ in 0..LEVELS {
-            let remaining = sorted.len() - start;
-            let size = if levels.len() + 1 == LEVELS {
-                remaining
-            } else {
-                remaining / 2
-            };
+            let is_last = levels.len() + 1 == LEVELS;
+            let size = if is_last { rest.len() } else { rest.len() / 2 };
             if size < 30 {
                 break;
             }
-            let part = &sorted[start..start + size];
-            let mut squares: Vec<f64> = part.iter().map(|p| p.1).collect();
-            squares.sort_by(f64::total_cmp);
-            let variance = squares[size / 2] / 0.4549;
+            if !is_last {
+                rest.select_nth_unstable_by(size, |a, b| a.0.total_cmp(&b.0));
+            }
+            let (part, brighter) = rest.split_at_mut(size);
             let signal = part.iter().map(|p| p.0.max(0.0)).sum::<f64>() / size as f64;
-            levels.push((signal, variance, size as f64));
-            start += size;
+            levels.push((signal, median_variance(part), size as f64));
+            rest = brighter;
         }
         let dark = levels.first().map_or(1.0, |l| l.1).max(1e-6);
         // Is the brightest level noisier than the darkest? The median's relative error is about 2.3/√size.
@@ -330,9 +325,7 @@ impl Inspection {
         reading.growth = Growth::default();
         if brightest.0 <= 0.0 || excess < DIFFERENT * 2.3 / (brightest.2).sqrt() {
             // One level: all pixels together say it best.
-            let mut squares: Vec<f64> = sorted.iter().map(|p| p.1).collect();
-            squares.sort_by(f64::total_cmp);
-            return (squares[squares.len() / 2] / 0.4549).max(1e-6);
+            return median_variance(&mut points).max(1e-6);
         }
         let fit = |power: i32| {
             let (mut top, mut bottom) = (0.0, 0.0);
@@ -362,4 +355,10 @@ impl Inspection {
         };
         dark
     }
+}
+
+/// Variance by the median of squares; the points, (signal, square), come back in another order.
+fn median_variance(points: &mut [(f64, f64)]) -> f64 {
+    let middle = points.len() / 2;
+    points.select_nth_unstable_by(middle, |a, b| a.1.total_cmp(&b.1)).1.1 / 0.4549
 }

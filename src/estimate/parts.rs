@@ -20,6 +20,7 @@ pub(super) struct Parts {
     lines: [usize; 2],
 }
 
+// Loops over arrays, not `map` and `from_fn`: a closure is not compiled for the instructions that its caller was dispatched to.
 impl Parts {
     /// Forgets all parts, and makes room for so many in bases of so many columns.
     #[inline(always)]
@@ -101,14 +102,17 @@ impl Parts {
                 let [lo, hi] = self.spans[i][k];
                 let profile = |d: usize| if k == 0 { self.x(i, d) } else { self.y(i, d) };
                 for &line in &lines[k] {
-                    at[i * n + line] = if !axes[k].is_pixels {
+                    let out = &mut at[i * n + line];
+                    if !axes[k].is_pixels {
                         let row = &axes[k].row(line)[lo..hi];
-                        [0, 1, 2].map(|d| dot(row, profile(d)))
+                        for d in 0..3 {
+                            out[d] = dot(row, profile(d));
+                        }
                     } else if (lo..hi).contains(&line) {
-                        [0, 1, 2].map(|d| profile(d)[line - lo])
-                    } else {
-                        [0.0; 3]
-                    };
+                        for d in 0..3 {
+                            out[d] = profile(d)[line - lo];
+                        }
+                    }
                 }
             }
             self.at[k] = at;
@@ -242,10 +246,14 @@ impl Parts {
         let (mx, my) = (self.mx, self.my);
         let x = |i: usize, d: usize| &self.x[(3 * i + d) * mx + x0..(3 * i + d) * mx + x1];
         let y = |i: usize, d: usize| &self.y[(3 * i + d) * my + y0..(3 * i + d) * my + y1];
-        Some([
-            [0, 1, 2].map(|a| [0, 1].map(|b| dot(x(i, a), x(j, b)))),
-            [0, 1, 2].map(|a| [0, 1].map(|b| dot(y(i, a), y(j, b)))),
-        ])
+        let mut grams = [[[0.0; 2]; 3]; 2];
+        for a in 0..3 {
+            for b in 0..2 {
+                grams[0][a][b] = dot(x(i, a), x(j, b));
+                grams[1][a][b] = dot(y(i, a), y(j, b));
+            }
+        }
+        Some(grams)
     }
 
     /// Inner products of (f′_x f_y, f_x f′_y, f_x f_y) of part `i` with those of part `j`, 3 × 3 row-major.
@@ -255,6 +263,7 @@ impl Parts {
         if x0 >= x1 || y0 >= y1 {
             return [0.0; 9];
         }
+        let mut out = [0.0; 9];
         let (mx, my) = (self.mx, self.my);
         let x = |i: usize, d: usize| &self.x[(3 * i + d) * mx + x0..(3 * i + d) * mx + x1];
         let y = |i: usize, d: usize| &self.y[(3 * i + d) * my + y0..(3 * i + d) * my + y1];
@@ -262,13 +271,16 @@ impl Parts {
         const ALONG_X: [[usize; 2]; 9] = [[1, 1], [1, 0], [1, 0], [0, 1], [0, 0], [0, 0], [0, 1], [0, 0], [0, 0]];
         const ALONG_Y: [[usize; 2]; 9] = [[0, 0], [0, 1], [0, 0], [1, 0], [1, 1], [1, 0], [0, 0], [0, 1], [0, 0]];
         if weights.is_empty() {
-            let pairs = [(0, 0), (0, 1), (1, 0), (1, 1)];
-            let tx = pairs.map(|(a, b)| dot(x(i, a), x(j, b)));
-            let ty = pairs.map(|(a, b)| dot(y(i, a), y(j, b)));
-            return std::array::from_fn(|k| {
+            let (mut tx, mut ty) = ([0.0; 4], [0.0; 4]);
+            for k in 0..4 {
+                tx[k] = dot(x(i, k / 2), x(j, k % 2));
+                ty[k] = dot(y(i, k / 2), y(j, k % 2));
+            }
+            for k in 0..9 {
                 let ([a, b], [c, d]) = (ALONG_X[k], ALONG_Y[k]);
-                tx[2 * a + b] * ty[2 * c + d]
-            });
+                out[k] = tx[2 * a + b] * ty[2 * c + d];
+            }
+            return out;
         }
         let m = x1 - x0;
         scratch.clear();
@@ -289,10 +301,11 @@ impl Parts {
             }
         }
         let t: [&[f64]; 4] = [t00, t01, t10, t11];
-        std::array::from_fn(|k| {
+        for k in 0..9 {
             let ([a, b], [c, d]) = (ALONG_X[k], ALONG_Y[k]);
-            triple(t[2 * c + d], x(i, a), x(j, b))
-        })
+            out[k] = triple(t[2 * c + d], x(i, a), x(j, b));
+        }
+        out
     }
 }
 

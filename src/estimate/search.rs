@@ -151,8 +151,11 @@ impl Search {
             self.explain_otherwise(reading, frame, &mut model);
             is_settled = false;
         }
-        let is_melted = self.sampler.is_some();
-        let may_be_turned = is_doubled(&model) && (!is_melted || !is_settled && self.is_odd(&model));
+        // What a turned lens makes of one emitter takes several.
+        let may_be_turned = match self.sampler {
+            None => is_doubled(&model),
+            Some(_) => !is_settled && self.is_odd(&model) && 3 * model.spots.len() > 4 * first.spots.len(),
+        };
         if may_be_turned || !is_settled && !reading.is_explained(&model) {
             self.turn(reading, frame, first, &mut model);
             is_settled = false;
