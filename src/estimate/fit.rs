@@ -11,6 +11,7 @@ use std::time::Instant;
 
 use super::atoms::{self, Atoms};
 use super::basis::Basis;
+use super::effort::BEYOND;
 use super::linear::{axpy, dot};
 use super::model::{Model, Nuisances, pull};
 use super::part;
@@ -39,14 +40,6 @@ pub(super) const MOST_STEPS: usize = 8;
 /// Steps of all emitters together before those that still move are fitted alone, and how often.
 pub(super) const TOGETHER: usize = 2;
 const PARTINGS: usize = 2;
-/// Multiplications that a frame of a few emitters may cost: the same for every run, unlike a clock.
-const MOST_WORK: f64 = 1e8;
-/// Emitters from which on a frame may cost more, with the square of their number, and up to how many times as many.
-const MANY: f64 = 8.0;
-const MOST_TIMES: f64 = 5.0;
-/// Share that the last fit may take beyond.
-const BEYOND: f64 = 1.2;
-
 /// The fit's scratch memory. Grows to the largest problem seen and then allocates nothing.
 pub(super) struct Fitter {
     pub bx: Basis,
@@ -73,12 +66,12 @@ pub(super) struct Fitter {
     /// Multiplications since the last frame, and the time it must be done by.
     pub(super) work: f64,
     /// Work that must not be exceeded, whatever the hypotheses.
-    limit: f64,
+    pub(super) limit: f64,
     /// Sources of the largest hypothesis since.
-    most_sources: f64,
+    pub(super) most_sources: f64,
     /// Steps since.
     pub steps: u64,
-    deadline: Option<Instant>,
+    pub(super) deadline: Option<Instant>,
 }
 
 impl Fitter {
@@ -110,34 +103,6 @@ impl Fitter {
             steps: 0,
             deadline: None,
         }
-    }
-
-    /// Forgets the work done for the last frame.
-    pub fn restart(&mut self, deadline: Option<Instant>) {
-        self.work = 0.0;
-        self.limit = f64::INFINITY;
-        self.most_sources = 0.0;
-        self.steps = 0;
-        self.deadline = deadline;
-    }
-
-    /// Leaves at least this share of a frame's work for what comes.
-    pub fn reserve(&mut self, share: f64) {
-        self.work = self.work.min((1.0 - share) * self.most_work());
-    }
-
-    /// Allows what comes no more than this share of the work on a frame of a few emitters, or as much as is usual.
-    pub fn allow(&mut self, share: Option<f64>) {
-        self.limit = share.map_or(f64::INFINITY, |share| self.work + share * MOST_WORK);
-    }
-
-    fn most_work(&self) -> f64 {
-        (MOST_WORK * (self.most_sources / MANY).clamp(1.0, MOST_TIMES).powi(2)).min(self.limit)
-    }
-
-    /// Whether the frame has had its share of work, or of time where a budget is set.
-    pub fn is_exhausted(&self) -> bool {
-        self.work > self.most_work() || self.deadline.is_some_and(|d| Instant::now() >= d)
     }
 
     /// Fits `model` from where it stands, at most `steps` steps, and up to [`MOST_STEPS`] times as many while each brings much.
@@ -317,25 +282,6 @@ impl Fitter {
         // A fit of no steps only evaluates: it says nothing new about convergence.
         model.converged = converged || steps == 0 && model.converged;
         goes_on
-    }
-
-    /// Multiplications that one step costs.
-    fn step_work(&self, reading: &Reading) -> f64 {
-        let sources = self.now.sources() as f64;
-        let parameters = 3.0 * sources;
-        let unusable = reading.bad.len() as f64 * (2.0 * parameters + 0.5 * parameters * parameters);
-        let pairs = if reading.weights.is_empty() { 0.0 } else { 3.0 * sources };
-        let parts = self.now.parts_a_spot();
-        let products = if parts > 1.0 {
-            8.0 * (parts * sources).powi(2) * (reading.mx + reading.my) as f64
-        } else {
-            0.0
-        };
-        unusable
-            + products
-            + (9.0 + pairs) * self.now.footprint()
-            + 40.0 * sources * (reading.mx + reading.my) as f64
-            + 9.0 * sources.powi(3)
     }
 
     /// Places the atoms of the present or the trial hypothesis, solves their amplitudes, and returns the deviance.

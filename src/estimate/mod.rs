@@ -11,6 +11,7 @@ mod corrected;
 mod covariance;
 #[cfg(test)]
 mod descent;
+mod effort;
 mod emitter;
 mod fit;
 mod ground;

@@ -1,0 +1,63 @@
+//! What a frame may cost: multiplications, which are the same for every run, and time where a budget is set.
+
+use std::time::Instant;
+
+use super::fit::Fitter;
+use super::reading::Reading;
+
+/// Multiplications that a frame of a few emitters may cost: the same for every run, unlike a clock.
+const MOST_WORK: f64 = 1e8;
+/// Emitters from which on a frame may cost more, with the square of their number, and up to how many times as many.
+const MANY: f64 = 8.0;
+const MOST_TIMES: f64 = 5.0;
+/// Share that the last fit may take beyond.
+pub(super) const BEYOND: f64 = 1.2;
+
+impl Fitter {
+    /// Forgets the work done for the last frame.
+    pub fn restart(&mut self, deadline: Option<Instant>) {
+        self.work = 0.0;
+        self.limit = f64::INFINITY;
+        self.most_sources = 0.0;
+        self.steps = 0;
+        self.deadline = deadline;
+    }
+
+    /// Leaves at least this share of a frame's work for what comes.
+    pub fn reserve(&mut self, share: f64) {
+        self.work = self.work.min((1.0 - share) * self.most_work());
+    }
+
+    /// Allows what comes no more than this share of the work on a frame of a few emitters, or as much as is usual.
+    pub fn allow(&mut self, share: Option<f64>) {
+        self.limit = share.map_or(f64::INFINITY, |share| self.work + share * MOST_WORK);
+    }
+
+    pub(super) fn most_work(&self) -> f64 {
+        (MOST_WORK * (self.most_sources / MANY).clamp(1.0, MOST_TIMES).powi(2)).min(self.limit)
+    }
+
+    /// Whether the frame has had its share of work, or of time where a budget is set.
+    pub fn is_exhausted(&self) -> bool {
+        self.work > self.most_work() || self.deadline.is_some_and(|d| Instant::now() >= d)
+    }
+
+    /// Multiplications that one step costs.
+    pub(super) fn step_work(&self, reading: &Reading) -> f64 {
+        let sources = self.now.sources() as f64;
+        let parameters = 3.0 * sources;
+        let unusable = reading.bad.len() as f64 * (2.0 * parameters + 0.5 * parameters * parameters);
+        let pairs = if reading.weights.is_empty() { 0.0 } else { 3.0 * sources };
+        let parts = self.now.parts_a_spot();
+        let products = if parts > 1.0 {
+            8.0 * (parts * sources).powi(2) * (reading.mx + reading.my) as f64
+        } else {
+            0.0
+        };
+        unusable
+            + products
+            + (9.0 + pairs) * self.now.footprint()
+            + 40.0 * sources * (reading.mx + reading.my) as f64
+            + 9.0 * sources.powi(3)
+    }
+}
