@@ -122,7 +122,7 @@ impl Search {
     /// Takes turned spots where they explain the frame: from `model` with its doubles made one, or where spots melt from where the
     /// `first` look ended and from seeds of their own.
     pub(super) fn turn(&mut self, reading: &Reading, frame: &Screened, first: Model, model: &mut Model) {
-        if self.is_torn(reading) {
+        if model.spots.is_empty() || self.is_torn(reading) {
             return;
         }
         let is_melted = self.sampler.is_some();

@@ -29,6 +29,11 @@ impl Fitter {
         }
         self.velocity.extend_from_slice(&self.gradient[..p]);
         solve(&self.factor, p, &mut self.velocity);
+        // A system singular to rounding may overflow.
+        if !self.velocity.iter().all(|v| v.is_finite()) {
+            self.velocity.clear();
+            return false;
+        }
         if overlap {
             self.accelerate(reading, nuisances, p);
         } else {
