@@ -171,13 +171,15 @@ impl Store {
         rows.collect()
     }
 
-    pub(super) fn endpoint(&self, id: &str) -> Result<EndpointRecord, rusqlite::Error> {
+    /// Deliveries of events after `until` are not counted among those sent or given up.
+    pub(super) fn endpoint(&self, id: &str, until: i64) -> Result<EndpointRecord, rusqlite::Error> {
         let mut record = self
             .db
             .prepare_cached(
-                "SELECT sent, last_success_us, last_failure_us, last_error, disabled_us FROM endpoint WHERE id = ?1",
+                "SELECT sent - (SELECT count(*) FROM delivery WHERE seq > ?2 AND endpoint = ?1 AND state = 'sent'),
+                        last_success_us, last_failure_us, last_error, disabled_us FROM endpoint WHERE id = ?1",
             )?
-            .query_row([id], |row| {
+            .query_row(params![id, until], |row| {
                 Ok(EndpointRecord {
                     sent: row.get(0)?,
                     last_success: row.get::<_, Option<i64>>(1)?.map(time),
@@ -189,19 +191,19 @@ impl Store {
             })
             .optional()?
             .unwrap_or_default();
-        let count = |state: &str| -> Result<(u64, Option<i64>), rusqlite::Error> {
+        let count = |state: &str, until: i64| -> Result<(u64, Option<i64>), rusqlite::Error> {
             self.db
                 .prepare_cached(
                     "SELECT n, (SELECT recorded_us FROM event WHERE seq = oldest)
                      FROM (SELECT count(*) AS n, min(seq) AS oldest FROM delivery
-                           WHERE endpoint = ?1 AND state = ?2 AND state <> 'sent')",
+                           WHERE endpoint = ?1 AND state = ?2 AND state <> 'sent' AND seq <= ?3)",
                 )?
-                .query_row([id, state], |row| Ok((row.get(0)?, row.get(1)?)))
+                .query_row(params![id, state, until], |row| Ok((row.get(0)?, row.get(1)?)))
         };
-        let (waiting, oldest) = count("waiting")?;
+        let (waiting, oldest) = count("waiting", i64::MAX)?;
         record.waiting = waiting;
         record.oldest_waiting = oldest.map(time);
-        record.dead = count("dead")?.0;
+        record.dead = count("dead", until)?.0;
         Ok(record)
     }
 }

@@ -84,7 +84,13 @@ impl Journal {
     }
 
     pub fn endpoint(&self, id: &str) -> Result<EndpointRecord, Error> {
-        let (held, disk) = self.read(|store| store.endpoint(id))?;
+        self.endpoint_until(id, i64::MAX as u64)
+    }
+
+    /// [`Journal::endpoint`] without the deliveries of events after a sequence number among those sent or given up.
+    pub fn endpoint_until(&self, id: &str, seq: u64) -> Result<EndpointRecord, Error> {
+        let until = i64::try_from(seq).unwrap_or(i64::MAX);
+        let (held, disk) = self.read(|store| store.endpoint(id, until))?;
         Ok(disk.or(held).unwrap_or_default())
     }
 

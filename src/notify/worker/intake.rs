@@ -34,7 +34,7 @@ impl Worker {
             return;
         }
         let (name, after) = (lane.endpoint.name().to_owned(), lane.read_to);
-        let is_cooled = !lane.cool_down.is_off();
+        let (is_cooled, begun_at) = (!lane.cool_down.is_off(), self.begun_at);
         let held = self.journal.waiting_in_memory(&name, after).and_then(|(rows, is_all)| {
             let rows = rows.into_iter().filter(|row| !lane.ahead.contains(&row.seq)).collect();
             Ok((with_events(&self.journal, rows, is_cooled)?, is_all))
@@ -57,7 +57,8 @@ impl Worker {
             self.reads.spawn(async move {
                 let question = move || {
                     let rows = with_events(&journal, journal.waiting(&name, after)?, is_cooled)?;
-                    Ok((journal.endpoint(&name)?, rows))
+                    // What this run has sent since it counts itself.
+                    Ok((journal.endpoint_until(&name, begun_at)?, rows))
                 };
                 let answer = tokio::task::spawn_blocking(question).await;
                 let answer = answer.unwrap_or(Err(journal::Error::Panicked));
@@ -96,9 +97,9 @@ impl Worker {
         let lane = &mut self.lanes[k];
         lane.status.sent += record.sent;
         lane.status.failed += record.dead;
-        lane.status.last_success = record.last_success;
-        lane.status.last_failure = record.last_failure;
-        lane.status.last_error = record.last_error;
+        lane.status.last_success = lane.status.last_success.max(record.last_success);
+        lane.status.last_failure = lane.status.last_failure.max(record.last_failure);
+        lane.status.last_error = lane.status.last_error.take().or(record.last_error);
         if record.disabled_at.is_some() {
             tracing::warn!(
                 endpoint = lane.endpoint.name(),

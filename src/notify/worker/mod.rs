@@ -65,6 +65,8 @@ impl Lane {
 pub(super) struct Worker {
     lanes: Vec<Lane>,
     journal: Journal,
+    /// The last event when this worker began.
+    begun_at: u64,
     clock: Clock,
     rng: ChaCha8Rng,
     commands: mpsc::Receiver<Command>,
@@ -97,6 +99,7 @@ impl Worker {
         };
         Self {
             lanes: endpoints.into_iter().map(lane).collect(),
+            begun_at: journal.last_seq(),
             journal,
             clock,
             rng,
