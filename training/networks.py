@@ -143,8 +143,6 @@ class UNet(nn.Module):
 BODIES = {
     "cnn16": lambda: Hybrid(16),
     "cnn16-separable": lambda: Hybrid(16, separable=True),
-    "cnn8": lambda: Hybrid(8),
-    "cnn8-separable": lambda: Hybrid(8, separable=True),
     "cnn32": lambda: Hybrid(32),
     "unet": UNet,
 }
