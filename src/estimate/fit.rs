@@ -239,7 +239,9 @@ impl Fitter {
                     converged = true;
                     break;
                 }
-                if deviance - HOPE * expected > bar {
+                let is_hopeless = |drop: f64| deviance - HOPE * drop > bar;
+                // Damping hides what lies along a narrow valley.
+                if is_hopeless(expected) && is_hopeless(self.promise(parameters)) {
                     goes_on = false;
                     break;
                 }

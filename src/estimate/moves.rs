@@ -11,6 +11,8 @@ const FINAL_STEPS: usize = 200;
 const SEPARATION: f64 = 2.5;
 /// Spots nearer than this, σ, may be one.
 const MERGE: f64 = 2.5;
+/// Nearer, the second order does not tell how far apart two spots are.
+const CLOSE: f64 = 0.15;
 /// Spots that are tried to be done without, a round.
 const FAINTEST: usize = 6;
 /// A split that promises this share of an emitter's price is tried though the frame is explained without.
@@ -108,8 +110,8 @@ impl Search {
         loop {
             let n = model.spots.len();
             let mut has_shrunk = false;
-            for (_, i, j) in pairs(model, MERGE).into_iter().take(3) {
-                if self.separation(reading, model, i, j) > 8.0 * self.factor * self.price {
+            for (d, i, j) in pairs(model, MERGE).into_iter().take(3) {
+                if d > CLOSE && self.separation(reading, model, i, j) > 8.0 * self.factor * self.price {
                     continue;
                 }
                 let next = merged(model, &[(i, j)]);

@@ -11,6 +11,9 @@ const LARGEST_ACCELERATION: f64 = 0.56 / 4.0;
 /// Largest correlation between the axes: an ellipse 1.7 times as long as wide.
 const MOST_TURN: f64 = 0.5;
 
+/// Damping of a promise: what keeps rounding from promising anything.
+const UNDAMPED: f64 = 1e-10;
+
 impl Fitter {
     /// Sets the trial hypothesis one damped, accelerated step away. `false` where no step could be had.
     #[inline(always)]
@@ -70,6 +73,23 @@ impl Fitter {
             trial.turn = (trial.turn + delta(p - 1).clamp(-0.1, 0.1)).clamp(-room, room);
         }
         true
+    }
+
+    /// Drop of the deviance that the quadratic promises, all but undamped. Spoils the factor that a step left.
+    #[inline(always)]
+    pub(super) fn promise(&mut self, p: usize) -> f64 {
+        self.factor.clear();
+        self.factor.extend_from_slice(&self.hessian[..p * p]);
+        for i in 0..p {
+            self.factor[i * p + i] = self.factor[i * p + i].max(1e-30) * (1.0 + UNDAMPED);
+        }
+        if !cholesky(&mut self.factor, p) {
+            return 0.0;
+        }
+        self.acceleration.clear();
+        self.acceleration.extend_from_slice(&self.gradient[..p]);
+        solve(&self.factor, p, &mut self.acceleration);
+        dot(&self.acceleration, &self.gradient[..p])
     }
 
     /// Geodesic acceleration a = −(JᵀJ + λD)⁻¹ Jᵀ M_vv, with M_vv the model's second derivative along the velocity.

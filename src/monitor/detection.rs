@@ -99,7 +99,7 @@ impl Detection {
 }
 
 /// Signal-to-noise ratio of the matched filter for a spot wider than a pixel: A·pitch/(2√π·σ·σ_n).
-fn snr(camera: &Camera, energy_j: f64) -> f64 {
+pub(super) fn snr(camera: &Camera, energy_j: f64) -> f64 {
     let pitch = camera.x.pitch_m.max(camera.y.pitch_m);
     let spread = 2.0 * std::f64::consts::PI.sqrt() * camera.spot_sigma_m;
     energy_j.max(0.0) * pitch / (spread * camera.noise_std_j)

@@ -37,8 +37,8 @@ pub(super) struct Track {
     pub confirmed: bool,
     /// Detected in the newest frame.
     pub hit: bool,
-    /// Too near another beam to be told apart in the newest frame.
-    pub merged: bool,
+    /// The track whose spot the beam has melted into in the newest frame.
+    pub merged: Option<u64>,
     /// ln likelihood ratio of "an emitter" to "spurious detections".
     pub score: f64,
     /// Newest hits, one bit a frame.
@@ -68,7 +68,7 @@ impl Track {
             last_hit: time,
             confirmed: false,
             hit: true,
-            merged: false,
+            merged: None,
             score: (DETECTED / detection.ghost).ln(),
             hits: 1,
             frames: 1,
@@ -78,9 +78,14 @@ impl Track {
         }
     }
 
+    /// In a spot of its own or in another's.
+    pub fn is_seen(&self) -> bool {
+        self.hit || self.merged.is_some()
+    }
+
     /// Followed well and missed only just now: its place is not free yet.
     pub fn is_just_missed(&self) -> bool {
-        self.confirmed && !self.hit && !self.merged && self.missed_s <= JUST_MISSED_S
+        self.confirmed && !self.is_seen() && self.missed_s <= JUST_MISSED_S
     }
 
     /// Where the beam was at `time`, if the track reaches back that far.
@@ -99,7 +104,7 @@ impl Track {
         self.motion.update(detection.position, cov);
         self.last_hit = time;
         self.hit = true;
-        self.merged = false;
+        self.merged = None;
         self.missed_s = 0.0;
         self.score = (self.score + (DETECTED / detection.ghost).ln()).min(ceiling);
         self.detection = detection.clone();
@@ -115,7 +120,7 @@ impl Track {
 
     fn miss(&mut self, dt: f64, ghost: f64) {
         self.hit = false;
-        self.merged = false;
+        self.merged = None;
         self.missed_s += dt;
         self.score += ((1.0 - DETECTED) / (1.0 - ghost)).ln();
         self.note(false);
@@ -171,7 +176,7 @@ impl Tracks {
                 let (track, d) = (&self.all[rows[i]], &detections[columns[j]]);
                 let spread = track.motion.position_cov() + d.cov + floor;
                 // A spot that two beams share stays with the one it was followed by.
-                let shares = if track.merged { SHARING } else { 0.0 };
+                let shares = if track.merged.is_some() { SHARING } else { 0.0 };
                 mahalanobis2(d.position - track.motion.position(), spread) + shares
             });
             for (i, j) in matching.pairs {
@@ -185,12 +190,15 @@ impl Tracks {
             }
         }
         // Spots that a known beam is followed by: only into such a one can another beam melt.
-        let followed: Vec<bool> = owner.iter().map(|o| o.is_some_and(|i| self.all[i].confirmed)).collect();
+        let followed: Vec<Option<u64>> = owner
+            .iter()
+            .map(|o| Some(&self.all[(*o)?]).filter(|t| t.confirmed).map(|t| t.id))
+            .collect();
         let mut melted = vec![false; detections.len()];
         for (track, _) in self.all.iter_mut().zip(&hit).filter(|(_, found)| found.is_none()) {
             match track.neighbour(detections, &followed) {
-                Some(j) => {
-                    track.merge(&detections[j], dt_s);
+                Some((j, into)) => {
+                    track.merge(into, &detections[j], dt_s);
                     melted[j] = true;
                 }
                 None => track.miss(dt_s, track.detection.ghost),
@@ -228,21 +236,23 @@ impl Tracks {
 }
 
 impl Track {
-    /// Without a detection of its own the beam may have melted into a neighbour's spot.
-    fn neighbour(&self, detections: &[Detection], followed: &[bool]) -> Option<usize> {
-        let was_there = self.confirmed && (self.hit || self.merged);
+    /// Without a detection of its own the beam may have melted into a neighbour's spot: which, and whose.
+    fn neighbour(&self, detections: &[Detection], followed: &[Option<u64>]) -> Option<(usize, u64)> {
+        let was_there = self.confirmed && self.is_seen();
         let here = self.motion.position();
         let spread = largest_eigenvalue(&self.motion.position_cov()).sqrt().min(1.0);
-        (0..detections.len()).filter(|&j| was_there && followed[j]).find(|&j| {
-            let d = &detections[j];
-            (d.position - here).norm() < d.resolution_m + GATE_FLOOR_M + 3.0 * spread
-        })
+        let is_near = |d: &Detection| (d.position - here).norm() < d.resolution_m + GATE_FLOOR_M + 3.0 * spread;
+        let mut spots = followed
+            .iter()
+            .enumerate()
+            .filter_map(|(j, whose)| Some((j, (*whose)?)));
+        spots.find(|(j, _)| was_there && is_near(&detections[*j]))
     }
 
     /// It is known to be there, as well as the two can be told apart.
-    fn merge(&mut self, spot: &Detection, dt_s: f64) {
+    fn merge(&mut self, into: u64, spot: &Detection, dt_s: f64) {
         self.motion.update(spot.position, spot.shared_cov());
-        self.merged = true;
+        self.merged = Some(into);
         self.hit = false;
         // Bounds a track that shadows another one: it lives a few times longer than one lost in the open.
         self.missed_s += 0.2 * dt_s;

@@ -31,6 +31,8 @@ pub(super) struct Asserted {
     /// The beam must be seen if the claim holds.
     pub expected: bool,
     pub ended: bool,
+    /// No beam answers, and one at the claimed place would not be told apart from its neighbours.
+    pub hidden: bool,
     pub period_s: Option<f64>,
     pub came: Timestamp,
 }
@@ -51,6 +53,7 @@ impl Asserted {
             age_s,
             slack_m: (FREE_SPEED_M_S + standing.pace_m_s.min(FASTEST_M_S)) * age_s,
             expected: false,
+            hidden: false,
             ended: claim.state == ClaimState::Ended,
             period_s: standing.period_s,
             came: standing.came,

@@ -5,7 +5,7 @@ use oapwatch::monitor::AlertKind::UnclaimedEmitter;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use super::stage::{Story, review};
+use super::stage::{CROWD, Story, review};
 
 /// Of `n` shadows: how many go unseen, how often something else is alerted first, and the delays of the rest, s, rising.
 fn delays(n: u64, beside_m: f64, power_w: f64, history_s: f64) -> (usize, usize, Vec<f64>) {
@@ -53,22 +53,34 @@ fn a_shadow_by_distance_and_power() {
 #[test]
 #[ignore = "minutes; see the file's head"]
 fn honest_pixels_raise_nothing() {
-    let first = number("OAPWATCH_SEED", 1000);
-    let mut frames = 0;
-    for seed in first..first + 15 {
-        let mut story = Story::with(
-            seed,
-            "[[user]]\nname = \"r-1\"\nmotion.roam = { home_m = [0, 0], spread_m = 15, time_s = 12 }\n\
+    peace(
+        "[[user]]\nname = \"r-1\"\nmotion.roam = { home_m = [0, 0], spread_m = 15, time_s = 12 }\n\
              [[user]]\nname = \"r-2\"\nmotion.roam = { home_m = [10, 5], spread_m = 15, time_s = 12 }\n\
              [[user]]\nname = \"d-1\"\nmotion.walk = { through_m = [[-110, -110], [-110, 100], [-90, 110], [-90, -90], [100, -110]], \
              speed_m_s = 8 }",
-        );
+    );
+}
+
+/// Users who stand so near each other that a frame hardly ever tells them all apart, half an hour of them.
+#[test]
+#[ignore = "minutes; see the file's head"]
+fn an_honest_crowd_raises_nothing() {
+    peace(CROWD);
+}
+
+/// Fifteen stories of two minutes of the four users and whom `toml` names.
+fn peace(toml: &str) {
+    let first = number("OAPWATCH_SEED", 1000);
+    let (mut frames, mut raised) = (0, Vec::new());
+    for seed in first..first + 15 {
+        let mut story = Story::with(seed, toml);
         story.seconds = 120.0;
         let told = review(&story);
         frames += told.reports.len();
-        assert!(told.raised().is_empty(), "seed {seed}: {:?}", told.raised());
+        raised.extend(told.raised().into_iter().map(|alert| (seed, alert)));
     }
-    println!("{frames} honest frames, no alert");
+    println!("{frames} honest frames, {} alerts", raised.len());
+    assert!(raised.is_empty(), "{raised:?}");
 }
 
 fn number(name: &str, or: u64) -> u64 {
@@ -142,4 +154,39 @@ fn a_stranger_near_a_user() {
         .iter()
         .fold([0, 0], |[a, b], [late, in_time]| [a + late, b + in_time]);
     assert!(50 * far[0] <= far[1], "late and in time from 3 m on: {far:?}");
+}
+
+/// A stranger within 20 m of the middle of the crowd, after forty seconds of peace.
+#[test]
+#[ignore = "minutes; see the file's head"]
+fn a_stranger_in_a_crowd() {
+    const N: u64 = 200;
+    let first = number("OAPWATCH_SEED", 0);
+    let (mut delays, mut before) = (Vec::new(), 0);
+    for seed in first..first + N {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let (r, angle) = (
+            20.0 * rng.random::<f64>().sqrt(),
+            rng.random_range(0.0..std::f64::consts::TAU),
+        );
+        let (x, y) = (3.0 + r * angle.cos(), 3.0 + r * angle.sin());
+        let intruder = format!("[[intruder]]\nname = \"e\"\npresent = {{ from_s = 40 }}\nmotion.still = [{x}, {y}]");
+        let mut story = Story::with(seed, &format!("{CROWD}{intruder}"));
+        story.seconds = 60.0;
+        let raised = review(&story).raised();
+        before += raised.iter().filter(|(.., at)| *at < 40.0).count();
+        let found = raised
+            .iter()
+            .find(|(kind, _, at)| *kind == UnclaimedEmitter && *at >= 40.0);
+        delays.push(found.map_or(f64::INFINITY, |(.., at)| at - 40.0));
+    }
+    delays.sort_by(f64::total_cmp);
+    let within = |s: f64| delays.iter().filter(|d| **d <= s).count();
+    println!(
+        "of {N}: {} within 1 s, {} within 5 s, {} within 20 s; {before} alerts before",
+        within(1.0),
+        within(5.0),
+        within(20.0)
+    );
+    assert_eq!(before, 0);
 }

@@ -45,6 +45,22 @@ name = "u-4"
 motion.still = [-70, 60]
 "#;
 
+/// Four more who mill about within two spot widths.
+pub const CROWD: &str = r#"
+[[user]]
+name = "r-1"
+motion.roam = { home_m = [0, 0], spread_m = 12, time_s = 12 }
+[[user]]
+name = "r-2"
+motion.roam = { home_m = [10, 5], spread_m = 12, time_s = 12 }
+[[user]]
+name = "r-3"
+motion.roam = { home_m = [3, 9], spread_m = 12, time_s = 20 }
+[[user]]
+name = "r-4"
+motion.roam = { home_m = [-6, 4], spread_m = 12, time_s = 9 }
+"#;
+
 pub struct Story {
     scene: Scene,
     pub seed: u64,

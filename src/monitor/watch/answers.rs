@@ -17,7 +17,7 @@ impl Monitor {
     /// Which track answers which claim: near pairs by optimal assignment, then the beam that answered before.
     pub(super) fn answer(&self, asserted: &[Asserted]) -> Vec<Option<u64>> {
         let seen: Vec<&Track> = self.tracks.all.iter().filter(|t| t.hit).collect();
-        let merged: Vec<&Track> = self.tracks.all.iter().filter(|t| t.merged).collect();
+        let merged: Vec<&Track> = self.tracks.all.iter().filter(|t| t.merged.is_some()).collect();
         let mut answers = vec![None; asserted.len()];
         // A frame that misses a user's beam must not let another beam nearby pass for it.
         let held: Vec<bool> = asserted
@@ -73,13 +73,5 @@ impl Monitor {
         }
         let period = self.period_s.unwrap_or(CLAIM_LIFE_S).max(a.period_s.unwrap_or(0.0));
         self.config.claims_stale_s.max(5.0 * period).min(CLAIM_LIFE_S)
-    }
-
-    /// Whether the claimed place lies so near a beam of someone else that a second spot there could not be told apart.
-    pub(super) fn is_hidden(&self, a: &Asserted) -> bool {
-        self.tracks.all.iter().filter(|t| t.hit).any(|t| {
-            let reach = t.detection.resolution_m + 2.0 * a.variance.sqrt();
-            (t.motion.position() - a.position).norm() < reach
-        })
     }
 }

@@ -1,6 +1,7 @@
 //! The monitor: one frame after another through the steps that lead to verdicts, one file a step.
 
 mod answers;
+mod crowd;
 pub(super) mod habits;
 mod inputs;
 mod power;
@@ -123,6 +124,7 @@ impl Monitor {
             self.tracks.step(now, &detections, dt);
             self.find_pose(&mut asserted, dt);
             let mut answers = self.answer(&asserted);
+            self.note_hidden(&mut asserted, &answers);
             self.weigh(&asserted, &answers, now);
             self.note_alone(&answers, now);
             self.decide_unclaimed(&asserted, &mut answers, now);

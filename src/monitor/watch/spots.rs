@@ -142,17 +142,13 @@ impl Monitor {
     /// Whether another user's beam may be in this spot, by tracks or by claims.
     fn is_shared(&self, i: usize, track: &Track, asserted: &[Asserted], answers: &[Option<u64>]) -> bool {
         let (here, reach) = (track.motion.position(), track.detection.resolution_m);
-        let melted = self.tracks.all.iter().any(|t| {
-            let claimed = asserted.iter().zip(answers).any(|(_, answer)| *answer == Some(t.id));
-            t.id != track.id && t.merged && claimed && (t.motion.position() - here).norm() < reach
-        });
-        melted
+        self.confused_m(track, answers) > 0.0
             || (0..asserted.len())
                 .filter(|&j| j != i && answers[j].is_none())
                 .any(|j| {
                     let a = &asserted[j];
-                    let off = reach + self.config.tolerated_distance_m + a.slack_m + 2.0 * a.variance.sqrt();
-                    (a.position - here).norm() < off
+                    let away = (a.position - here).norm() - a.slack_m - 2.0 * a.variance.sqrt();
+                    away < reach + self.config.tolerated_distance_m || (a.hidden && away < self.overlap_m())
                 })
     }
 
@@ -218,7 +214,7 @@ impl Monitor {
         let here = track.motion.position();
         self.book.open().any(|(cause, _)| match cause {
             Cause::Track(AlertKind::UnclaimedEmitter, id) => self.tracks.get(*id).is_some_and(|t| {
-                (t.hit || t.merged) && (t.motion.position() - here).norm() < BESIDE * track.detection.resolution_m
+                t.is_seen() && (t.motion.position() - here).norm() < BESIDE * track.detection.resolution_m
             }),
             _ => false,
         })

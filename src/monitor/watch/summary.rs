@@ -20,7 +20,7 @@ impl Monitor {
             .tracks
             .all
             .iter()
-            .filter(|t| t.hit || t.merged)
+            .filter(|t| t.is_seen())
             .map(|t| {
                 let user = owner(t.id).map(|a| a.claim.user.clone());
                 let is_open = |kind: AlertKind| match (&user, kind) {
@@ -42,7 +42,7 @@ impl Monitor {
                     energy_j: t.detection.energy_j,
                     user,
                     status,
-                    flags: match t.merged {
+                    flags: match t.merged.is_some() {
                         true => (t.detection.flags | Flags::UNRESOLVED).names(),
                         false => t.detection.flags.names(),
                     },

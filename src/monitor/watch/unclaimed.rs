@@ -88,7 +88,7 @@ impl Monitor {
             })
             .collect();
         for (cause, id) in open {
-            let still = self.tracks.get(id).is_some_and(|t| t.hit || t.merged) && self.alone.contains_key(&id);
+            let still = self.tracks.get(id).is_some_and(Track::is_seen) && self.alone.contains_key(&id);
             if !still {
                 match self.swapped_with(id, answers) {
                     Some(other) => {
@@ -110,11 +110,7 @@ impl Monitor {
         let reach = 2.0 * track.detection.resolution_m;
         let others = self.tracks.all.iter().filter(|t| {
             let cause = Cause::Track(AlertKind::UnclaimedEmitter, t.id);
-            t.id != id
-                && (t.hit || t.merged)
-                && t.confirmed
-                && !answers.contains(&Some(t.id))
-                && !self.book.is_open(&cause)
+            t.id != id && t.is_seen() && t.confirmed && !answers.contains(&Some(t.id)) && !self.book.is_open(&cause)
         });
         let near = others.filter(|t| (t.motion.position() - here).norm() < reach);
         near.map(|t| t.id).next()

@@ -38,12 +38,12 @@ impl Monitor {
         // Before everybody has claimed once our own pose and the log's clock are not known.
         let settled = self.claims_settled(now);
         for (a, answer) in asserted.iter().zip(answers) {
-            let hidden = answer.is_none() && self.is_hidden(a);
-            let user = self.users.entry(a.claim.user.clone()).or_default();
             let track = answer.and_then(|id| self.tracks.get(id));
+            let confused_m = track.map_or(0.0, |t| self.confused_m(t, answers));
+            let user = self.users.entry(a.claim.user.clone()).or_default();
             let Some(track) = track else {
                 user.outside = 0;
-                if !a.expected || hidden {
+                if !a.expected || a.hidden {
                     user.unanswered_since = None;
                     user.absence = 0.0;
                 } else {
@@ -63,7 +63,7 @@ impl Monitor {
             let claimed = Vector2::new(a.claim.x_m, a.claim.y_m);
             let claimed = claimed + displacement.at(claimed);
             if user.residuals.newest().is_none_or(|t| t < a.claim.time) {
-                let is_clear = track.confirmed && !track.merged;
+                let is_clear = track.confirmed && track.merged.is_none() && confused_m == 0.0;
                 if let Some(stamped) = track.at(a.claim.time).filter(|_| is_clear && !user.mismatched) {
                     user.clock.push(stamped - claimed, track.motion.velocity(), a.variance);
                 }
@@ -79,7 +79,7 @@ impl Monitor {
             let floor = Matrix2::identity() * (SYSTEMATIC_M.powi(2) + self.pose.variance(a.position));
             let cov = track.motion.position_cov() + Matrix2::identity() * a.variance + floor;
             let offset = track.motion.position() - a.position;
-            let reach = tolerated + a.slack_m + unsure_s * track.motion.velocity().norm();
+            let reach = tolerated + a.slack_m + confused_m + unsure_s * track.motion.velocity().norm();
             let is_outside = track.hit && track.confirmed && surprise(offset, &cov, reach) > gate;
             user.outside = if is_outside { user.outside + 1 } else { 0 };
         }
