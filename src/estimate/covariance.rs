@@ -43,16 +43,15 @@ impl Fitter {
         (direct * inverted).max(1.0)
     }
 
-    /// ln det of an information matrix of `n` parameters over its first `size`, with `floor` added to the precision of
-    /// the positions in x and y.
-    pub fn log_det(&mut self, n: usize, size: usize, floor: [f64; 2]) -> Option<f64> {
+    /// ln det of an information matrix of `n` parameters over the places and energies of its spots, with each spot's `floor` added
+    /// to the precisions.
+    pub fn log_det(&mut self, n: usize, floor: &[[f64; 3]]) -> Option<f64> {
+        let size = 3 * floor.len();
         self.factor.clear();
         for i in 0..size {
             self.factor.extend_from_slice(&self.hessian[i * n..i * n + size]);
             self.factor[i * size + i] *= 1.0 + RIDGE;
-            if i % 3 < 2 {
-                self.factor[i * size + i] += floor[i % 3];
-            }
+            self.factor[i * size + i] += floor[i / 3][i % 3];
         }
         let is_regular = cholesky(&mut self.factor, size);
         is_regular.then(|| (0..size).map(|i| 2.0 * self.factor[i * size + i].ln()).sum())

@@ -28,9 +28,15 @@ impl Fitter {
         self.work = self.work.min((1.0 - share) * self.most_work());
     }
 
-    /// Allows what comes no more than this share of the work on a frame of a few emitters, or as much as is usual.
-    pub fn allow(&mut self, share: Option<f64>) {
-        self.limit = share.map_or(f64::INFINITY, |share| self.work + share * MOST_WORK);
+    /// Allows what comes no more than this share of the work on a frame of a few emitters. Returns the limit that stood, for
+    /// [`Fitter::lift`].
+    pub fn allow(&mut self, share: f64) -> f64 {
+        let within = self.limit.min(self.work + share * MOST_WORK);
+        std::mem::replace(&mut self.limit, within)
+    }
+
+    pub fn lift(&mut self, limit: f64) {
+        self.limit = limit;
     }
 
     pub(super) fn most_work(&self) -> f64 {

@@ -92,6 +92,8 @@ const TYPICAL: f64 = 1e-5;
 /// Share of a frame's work that the pencil's look may take where it is not the main way.
 const SHORT: f64 = 0.03;
 
+/// Share of a frame's work that is tried with pixels in it which may be lit alone.
+const TRIAL: f64 = 0.1;
 /// Times that a frame is looked over for pixels that are lit alone.
 const LOOKS: usize = 3;
 
@@ -256,14 +258,38 @@ impl Analytic {
             .pencil
             .as_mut()
             .filter(|s| reading.growth.is_flat() && !s.is_torn(reading))?;
-        search.fitter.allow(Some(SHORT));
+        let limit = search.fitter.allow(SHORT);
         let look = search.first_look(reading, &self.frame);
         if !reading.is_explained(&look) {
             return None;
         }
-        search.fitter.allow(None);
+        search.fitter.lift(limit);
         let model = search.maximum_likelihood(reading, &self.frame, look);
         reading.is_explained(&model).then_some(model)
+    }
+
+    /// Maximum likelihood from the first `look` on, without pixels that are lit alone. Where nothing but noise lies outside the
+    /// basis, these are most likely a misfit, and taken out only where that explains the frame at once or nothing else does.
+    fn search_on(&mut self, look: Model) -> Model {
+        let is_clean = self.inspection.is_clean;
+        let kept = is_clean.then(|| (self.frame.clone(), self.reading.clone()));
+        let limit = self.search.fitter.allow(if is_clean { SHORT } else { f64::INFINITY });
+        let rest = self.without_lone_pixels(look.clone());
+        self.search.fitter.lift(limit);
+        let Some((frame, reading)) = kept.filter(|_| !self.reading.is_explained(&rest)) else {
+            return self.search.maximum_likelihood(&self.reading, &self.frame, rest);
+        };
+        let frame = std::mem::replace(&mut self.frame, frame);
+        let reading = std::mem::replace(&mut self.reading, reading);
+        let has_lone = reading.bad.len() > self.reading.bad.len();
+        let limit = self.search.fitter.allow(if has_lone { TRIAL } else { f64::INFINITY });
+        let model = self.search.maximum_likelihood(&self.reading, &self.frame, look);
+        self.search.fitter.lift(limit);
+        if !has_lone || self.reading.is_explained(&model) {
+            return model;
+        }
+        (self.frame, self.reading) = (frame, reading);
+        self.search.maximum_likelihood(&self.reading, &self.frame, rest)
     }
 
     /// `look`, taken anew after taking out pixels that are lit alone.
@@ -317,10 +343,7 @@ impl Estimator for Analytic {
                 let is_explained = self.reading.is_explained(&look);
                 let by_pencil = if is_explained { None } else { self.pencil_look() };
                 is_by_pencil = by_pencil.is_some();
-                by_pencil.unwrap_or_else(|| {
-                    let look = self.without_lone_pixels(look);
-                    self.search.maximum_likelihood(&self.reading, &self.frame, look)
-                })
+                by_pencil.unwrap_or_else(|| self.search_on(look))
             }
         };
         let (search, reading) = match &mut self.pencil {

@@ -3,7 +3,7 @@
 use super::bend::Split;
 use super::model::{Model, Nuisances, Spot};
 use super::reading::Reading;
-use super::search::{MOST, Search, TRIAL_STEPS};
+use super::search::{Search, TRIAL_STEPS};
 
 /// Steps that a chosen model may take before it is reported.
 const FINAL_STEPS: usize = 200;
@@ -45,7 +45,7 @@ impl Search {
 
     /// Tries `next` and keeps it where it is better.
     pub(super) fn consider(&mut self, reading: &Reading, model: &mut Model, mut next: Model) -> bool {
-        if next.spots.len() > MOST || self.is_exhausted() {
+        if next.spots.len() > reading.most_spots() || self.is_exhausted() {
             return false;
         }
         if self.prior.is_some() {

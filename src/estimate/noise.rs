@@ -121,18 +121,17 @@ pub(super) struct Inspection {
     smooth: Vec<f64>,
     leverage: [Vec<f64>; 2],
     squares: Vec<(f64, f64)>,
+    /// Nothing but noise lies outside the basis.
+    pub is_clean: bool,
 }
 
 impl Inspection {
     /// Finds hot and dead pixels, measures the noise, and loads `reading` anew where that changes it: the frame is
     /// divided by the noise measured (returned, in units of the configured), bad pixels are listed and filled in.
     pub fn run(&mut self, frame: &mut Screened, reading: &mut Reading, bx: &Basis, by: &Basis) -> f64 {
-        let left = reading.outside.1;
-        if left < FEWEST {
-            return 1.0;
-        }
         let z = |reading: &Reading| (reading.outside.0 - 1.0) * (reading.outside.1 / 2.0).sqrt();
-        if z(reading).abs() < DIFFERENT {
+        self.is_clean = z(reading).abs() < DIFFERENT;
+        if self.is_clean || reading.outside.1 < FEWEST {
             return 1.0;
         }
         for _ in 0..PASSES {

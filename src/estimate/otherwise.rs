@@ -138,12 +138,13 @@ impl Search {
         }
         let left = next.deviance - reading.numbers;
         next.nuisances = TURNED;
-        self.fitter.allow(Some(TRIAL));
+        let limit = self.fitter.allow(TRIAL);
         self.fitter.fit(reading, &mut next, TRIAL_STEPS);
+        self.fitter.lift(limit);
         if !reading.is_explained(&next) && next.deviance - reading.numbers > MUCH * left {
-            return self.fitter.allow(None);
+            return;
         }
-        self.fitter.allow(Some(TURN));
+        self.fitter.allow(TURN);
         self.fitter.fit(reading, &mut next, LONG_POLISH);
         if reading.is_explained(&next) {
             self.refine(reading, &mut next, EARLY_ROUNDS);
@@ -153,7 +154,7 @@ impl Search {
             let next = self.start(reading, frame, TURNED, LONG_POLISH);
             self.take_better(model, next);
         }
-        self.fitter.allow(None);
+        self.fitter.lift(limit);
     }
 
     /// Takes out nuisances that the frame can do without.

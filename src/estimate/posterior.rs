@@ -67,10 +67,14 @@ impl Search {
         let area = side(bx) * side(by);
         // A position is never known better by the Hessian than a spot and a pixel allow it to be unknown.
         let least = |b: &super::basis::Basis| 1.0 / (0.25 + b.pitch() * b.pitch() / 12.0);
-        let floor = [least(bx), least(by)];
+        let floor: Vec<_> = (model
+            .spots
+            .iter()
+            .map(|s| [least(bx), least(by), prior.least_precision(s)]))
+        .collect();
         let p = model.parameters();
         self.fitter.information(reading, model);
-        let log_det = self.fitter.log_det(p, 3 * n, floor).unwrap_or(f64::INFINITY);
+        let log_det = self.fitter.log_det(p, &floor).unwrap_or(f64::INFINITY);
         let orders: f64 = (2..=n).map(|k| 2.0 * (k as f64).ln()).sum();
         let volume = n as f64 * (2.0 * area.ln() - 3.0 * std::f64::consts::TAU.ln());
         let nuisances = NUISANCE_PRICE * model.nuisances.count() as f64;

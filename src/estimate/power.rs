@@ -79,6 +79,11 @@ impl Power {
 /// Energies of "anything" are spread evenly over this many decades' logarithm.
 const DECADES: f64 = 6.0;
 
+/// Of a spot's energy, where it may be anything.
+fn density(spot: &Spot) -> f64 {
+    1.0 / (spot.a.max(1e-3) * DECADES * std::f64::consts::LN_10)
+}
+
 /// The mixture for one frame.
 pub(super) struct Prior {
     known: KnownPower,
@@ -127,10 +132,16 @@ impl Prior {
                 let share = known.share / known.energies_j.len() as f64;
                 -2.0 * share.ln() + (std::f64::consts::TAU * self.temper / p.precision).ln()
             }
-            None => {
-                let range = DECADES * std::f64::consts::LN_10;
-                -2.0 * (1.0 - known.share).ln() + 2.0 * (spot.a.max(1e-3) * range).ln()
-            }
+            None => -2.0 * (1.0 - known.share).ln() - 2.0 * density(spot).ln(),
+        }
+    }
+
+    /// Precision below which an energy is no more uncertain: the prior holds no more than one, whatever the frame leaves open, as it
+    /// does of a spot beyond the sensor's edge. A user's own is in the fit.
+    pub fn least_precision(&self, spot: &Spot) -> f64 {
+        match spot.power {
+            Some(_) => 0.0,
+            None => std::f64::consts::TAU * density(spot).powi(2),
         }
     }
 

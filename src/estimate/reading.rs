@@ -12,6 +12,8 @@ use super::unusable::{self, BadPixel};
 
 /// What a frame may leave outside the basis, in units of the noise.
 const LOSS: f64 = 0.02;
+/// Emitters a frame may hold at most.
+const MOST_SPOTS: usize = 80;
 
 /// Coefficients of a screened frame and what the rest of it says about the noise.
 #[derive(Clone, Default)]
@@ -144,6 +146,11 @@ impl Reading {
         } else {
             &self.weighted
         }
+    }
+
+    /// Emitters that are looked for at most: three numbers each must be had from the frame.
+    pub fn most_spots(&self) -> usize {
+        MOST_SPOTS.min((self.numbers / 3.0) as usize).max(1)
     }
 
     /// Whether the model explains the frame to within the noise.

@@ -8,7 +8,7 @@ use crate::optics::Camera;
 const OVERFLOWS: f64 = 1e100;
 
 /// A frame divided by the noise, with its unusable pixels listed and filled in.
-#[derive(Default)]
+#[derive(Clone, Default)]
 pub(super) struct Screened {
     /// (Ny, Nx) row-major. Unusable pixels hold the mean of their usable neighbours, or `ceiling`; a fit must not
     /// look at them.

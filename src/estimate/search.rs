@@ -14,8 +14,6 @@ use super::power::Prior;
 use super::reading::Reading;
 use super::screen::Screened;
 
-/// Emitters a frame may hold at most.
-pub(super) const MOST: usize = 80;
 /// Steps that a candidate may take before it is judged.
 pub(super) const TRIAL_STEPS: usize = 30;
 /// So many further emitters that explain a frame are not asked for another explanation.
@@ -216,7 +214,10 @@ impl Search {
         });
         let peaks = self.residual_peaks(reading, &mut model);
         let least = peaks.first().map_or(0.0, |p| 0.1 * p.significance);
-        let spots = peaks.iter().take_while(|p| p.significance >= least).take(MOST);
+        let spots = peaks
+            .iter()
+            .take_while(|p| p.significance >= least)
+            .take(reading.most_spots());
         model.spots = spots.map(|p| Spot::new(p.u, p.a)).collect();
         self.fitter.fit(reading, &mut model, TRIAL_STEPS);
         model
@@ -224,8 +225,8 @@ impl Search {
 
     /// Adds peaks of the residual to `model` until none is significant, refitting all emitters each time.
     pub fn greedy(&mut self, reading: &Reading, frame: &Screened, mut model: Model) -> Model {
-        while model.spots.len() < MOST && (model.spots.is_empty() || !reading.is_explained(&model)) {
-            let room = MOST - model.spots.len();
+        while model.spots.len() < reading.most_spots() && (model.spots.is_empty() || !reading.is_explained(&model)) {
+            let room = reading.most_spots() - model.spots.len();
             let mut next = model.clone();
             let peaks = self.residual_peaks(reading, &mut model);
             let least = peaks.first().map_or(0.0, |p| 0.1 * p.significance);
@@ -272,7 +273,7 @@ impl Search {
             .analyse(reading, &self.fitter.bx, &self.fitter.by)?;
         let sure = pencil.strength.iter().take_while(|&&s| s > 4.0).count();
         let likely = pencil.strength.iter().take_while(|&&s| s > 0.5).count();
-        let last = (likely + 2).min(pencil.most()).min(MOST);
+        let last = (likely + 2).min(pencil.most()).min(reading.most_spots());
         let mut best = Model::empty(nuisances);
         self.fitter.fit(reading, &mut best, TRIAL_STEPS);
         // A background and another width have singular values of their own.

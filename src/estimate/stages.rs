@@ -1,16 +1,18 @@
-//! The stages of a frame one by one, so that a bench can time each; not part of the interface.
+//! The stages of a frame one by one, so that a bench can time each and a test begin at the truth; not part of the interface.
 
 use super::ground;
 use super::model::{Model, Nuisances, Spot};
+use super::power::Prior;
 use super::reading::Reading;
 use super::screen::Screened;
 use super::search::Search;
-use super::{Error, Estimate};
+use super::{Error, Estimate, KnownPower};
 use crate::frame::Frame;
 use crate::optics::Camera;
 
 /// Steps of the joint fit that is timed.
 const STEPS: usize = 5;
+const MANY_STEPS: usize = 200;
 
 /// A frame's way from pixels to positions, halted between stages.
 pub struct Stages {
@@ -53,12 +55,26 @@ impl Stages {
 
     /// Five steps of the joint fit of the spots at `places`, m on the sensor.
     pub fn fit(&mut self, places: &[[f64; 2]]) {
+        self.fit_from(places, STEPS);
+    }
+
+    fn fit_from(&mut self, places: &[[f64; 2]], steps: usize) {
         let sigma = self.camera.spot_sigma_m;
         self.model = Model::empty(Nuisances::default());
         let spots = places.iter().map(|p| Spot::new(p.map(|v| v / sigma), 0.0));
         self.model.spots.extend(spots);
-        self.search.fitter.restart(None);
-        self.search.fitter.fit(&self.reading, &mut self.model, STEPS);
+        self.search.restart(None);
+        self.search.fitter.fit(&self.reading, &mut self.model, steps);
+    }
+
+    /// −2 ln of the posterior probability of what `map` makes of spots at `places`, m on the sensor, and that.
+    pub fn most_probable(&mut self, known: &KnownPower, places: &[[f64; 2]]) -> (f64, Estimate) {
+        self.fit_from(places, MANY_STEPS);
+        self.search.prior = Some(Prior::new(known, &self.camera));
+        self.search.maximum_posterior(&self.reading, &mut self.model);
+        let score = self.search.score(&self.model);
+        self.search.prior = None;
+        (score, self.ground())
     }
 
     /// Positions on the ground of what was fitted, with covariances and flags.

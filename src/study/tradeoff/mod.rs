@@ -2,6 +2,8 @@
 
 mod condition;
 mod networks;
+#[cfg(test)]
+mod oracle;
 mod picture;
 mod report;
 mod scene;
