@@ -149,8 +149,9 @@ def main():
             print("| program | median m² | over ml's | N right | µs a frame | over ml's |\n|---|---|---|---|---|---|")
             found, times = oapwatch(program, folder, "ml")
             best = row("oapwatch `ml`", found, truth, times)
-            found, times = oapwatch(program, folder, "greedy-fit")
-            row("oapwatch `greedy-fit`", found, truth, times, best)
+            for rung in ("greedy-fit", "peak-fit"):
+                found, times = oapwatch(program, folder, rung)
+                row(f"oapwatch `{rung}`", found, truth, times, best)
             sigma = sigma_m / SIDE_M * n
             for name, make in (
                 ("photutils, iterative PSF fit", photutils_fit),

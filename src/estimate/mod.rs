@@ -2,6 +2,7 @@
 //! independent judge) and never claims (an attacker writes those).
 
 mod amplitudes;
+mod analytic;
 mod atoms;
 mod basis;
 mod bend;

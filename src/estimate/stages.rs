@@ -26,7 +26,7 @@ pub struct Stages {
 impl Stages {
     pub fn new(camera: &Camera) -> Self {
         Self {
-            search: Search::new(super::ladder::bases(camera).0),
+            search: Search::new(super::analytic::bases(camera).0),
             camera: camera.clone(),
             frame: Screened::default(),
             reading: Reading::default(),
