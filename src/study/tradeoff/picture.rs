@@ -11,6 +11,9 @@ const SIZE: (u32, u32) = (900, 600);
 /// Pixels a side that the axis goes to: beyond 100 there is room for the legend.
 const ARRAYS: f64 = 145.0;
 const FONT: (&str, i32) = ("sans-serif", 16);
+/// Width of a letter and height of a line of it, px.
+const LETTER: i32 = 8;
+const LINE: i32 = 16;
 const CAPTION: (&str, i32) = ("sans-serif", 22);
 
 type Drawn = Result<(), Box<dyn std::error::Error + Send + Sync>>;
@@ -91,22 +94,26 @@ fn accuracy_against_time(study: &Study, path: &Path) -> Drawn {
         .draw_series(LineSeries::new(line, BLUE.stroke_width(2)))?
         .label("Pareto front (time, OSPA)")
         .legend(|(x, y)| PathElement::new([(x, y), (x + 18, y)], BLUE));
-    // Labels point inwards; one just below its neighbour's mark hangs down.
+    // Labels point inwards, each as near to its mark as others leave room, px.
     let middle = (times.start * times.end).sqrt();
-    let mut last = (0.0, 0.0);
+    let mut taken: Vec<(std::ops::Range<i32>, i32)> = Vec::new();
     for row in &rows {
         let Some(error) = row.median_m2 else { continue };
         let at = (row.latency_median_us, error);
-        let hangs = at.0 < 1.5 * last.0 && at.0 > last.0 / 1.5 && at.1 < last.1;
-        last = at;
-        let (side, dx) = if at.0 > middle {
-            (HPos::Right, -10)
-        } else {
-            (HPos::Left, 10)
-        };
-        let (height, dy) = if hangs { (VPos::Top, 4) } else { (VPos::Bottom, -4) };
-        let style = FONT.into_text_style(&area).pos(Pos::new(side, height));
         let label = format!("{} (OSPA {:.2} m)", row.rung, row.ospa_m);
+        let width = LETTER * label.len() as i32;
+        let (x, y) = chart.backend_coord(&at);
+        let (side, dx, left) = match at.0 > middle {
+            true => (HPos::Right, -10, x - 10 - width),
+            false => (HPos::Left, 10, x + 10),
+        };
+        let is_free = |dy: &i32| {
+            let mut beside = taken.iter().filter(|(xs, _)| left < xs.end && xs.start < left + width);
+            beside.all(|(_, other)| (other - y - dy).abs() >= LINE)
+        };
+        let dy = [-10, 10, 26, -26, 42, -42].into_iter().find(is_free).unwrap_or(-10);
+        taken.push((left..left + width, y + dy));
+        let style = FONT.into_text_style(&area).pos(Pos::new(side, VPos::Center));
         let mark = EmptyElement::at(at) + Circle::new((0, 0), 5, BLUE.filled()) + Text::new(label, (dx, dy), style);
         chart.draw_series([mark])?;
     }
