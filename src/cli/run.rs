@@ -16,7 +16,7 @@ pub struct Args {
 }
 
 /// Threads that serve the API, and those that wait for the journal on its behalf. A machine of many cores has no more of
-/// them: each costs memory, and the frames have threads of their own.
+/// them: each costs memory, and the frames have threads of their own, and where it can be a core.
 const MOST_SERVING: usize = 4;
 const MOST_WAITING: usize = 32;
 
@@ -34,9 +34,10 @@ pub fn run(args: Args) -> Outcome {
         tracing::warn!(%refused, "transparent huge pages stay on: more memory than need be");
     }
     let daemon = Daemon::new(config, args.config).map_err(Failure::Config)?;
+    let cores = std::thread::available_parallelism().map_or(1, |n| n.get());
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .enable_all()
-        .worker_threads(std::thread::available_parallelism().map_or(1, |n| n.get().min(MOST_SERVING)))
+        .worker_threads(cores.saturating_sub(1).clamp(1, MOST_SERVING))
         .max_blocking_threads(MOST_WAITING)
         .thread_name("oapwatch")
         .build()
