@@ -67,11 +67,8 @@ impl Search {
         let area = side(bx) * side(by);
         // A position is never known better by the Hessian than a spot and a pixel allow it to be unknown.
         let least = |b: &super::basis::Basis| 1.0 / (0.25 + b.pitch() * b.pitch() / 12.0);
-        let floor: Vec<_> = (model
-            .spots
-            .iter()
-            .map(|s| [least(bx), least(by), prior.least_precision(s)]))
-        .collect();
+        let floors = |s: &Spot| [least(bx), least(by), prior.least_precision(s)];
+        let floor: Vec<_> = model.spots.iter().map(floors).collect();
         let p = model.parameters();
         self.fitter.information(reading, model);
         let log_det = self.fitter.log_det(p, &floor).unwrap_or(f64::INFINITY);

@@ -1,11 +1,10 @@
 //! How much better `map` would be if it began at the truth: what its search leaves on the table.
 
+use super::score::{CUTOFF_M, mean};
 use super::{Cell, Noise};
 use crate::assign::ospa;
 use crate::estimate::stages::Stages;
 use crate::estimate::{self, Emitter};
-
-const CUTOFF_M: f64 = 25.0;
 
 /// Mean squared errors, m², of `map` and of the more probable of it and of what it makes of the truth; frames in which the
 /// truth leads to what is more probable by more than e, and of how many.
@@ -53,10 +52,9 @@ fn ask(cell: Cell, frames: usize, seed: u64) -> Oracle {
         found_m2.extend(squared(&scene.positions, &found));
         best_m2.extend(squared(&scene.positions, best));
     }
-    let mean = |v: &[f64]| v.iter().sum::<f64>() / v.len() as f64;
     Oracle {
-        found_m2: mean(&found_m2),
-        best_m2: mean(&best_m2),
+        found_m2: mean(&found_m2).unwrap(),
+        best_m2: mean(&best_m2).unwrap(),
         missed,
         of: frames,
     }

@@ -9,7 +9,7 @@ use crate::assign::ospa;
 use crate::estimate;
 
 /// OSPA's cutoff, m.
-const CUTOFF_M: f64 = 25.0;
+pub(super) const CUTOFF_M: f64 = 25.0;
 /// An emitter is resolvable where its bound's root is below this share of the distance to the next and below 10 m.
 const RESOLVABLE_SHARE: f64 = 0.1;
 const RESOLVABLE_M: f64 = 10.0;
@@ -140,7 +140,7 @@ fn is_resolvable(scene: &Scene, i: usize) -> bool {
     error < RESOLVABLE_SHARE * nearest && error < RESOLVABLE_M
 }
 
-fn mean(values: &[f64]) -> Option<f64> {
+pub(super) fn mean(values: &[f64]) -> Option<f64> {
     (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
 }
 
