@@ -31,16 +31,25 @@ impl Fitter {
                 rhs[i] += power.precision * power.mean;
             }
         }
-        for bad in &reading.bad {
-            let values = &mut self.scratch;
-            values.resize(values.len().max(sources), 0.0);
+        if reading.bad.is_long() {
             for i in 0..sources {
-                values[i] = atoms.at(i, bad.x, bad.y)[0][0];
-                rhs[i] -= values[i] * bad.value;
+                for j in 0..=i {
+                    gram[i * sources + j] -= atoms.couple_at(i, j, &reading.bad.runs, &mut self.strip)[8];
+                }
             }
-            for i in (0..sources).filter(|&i| values[i] != 0.0) {
-                let s = -values[i];
-                axpy(s, &values[..i + 1], &mut gram[i * sources..i * sources + i + 1]);
+        } else {
+            for bad in &reading.bad.pixels {
+                let values = &mut self.scratch;
+                values.resize(values.len().max(sources), 0.0);
+                for i in 0..sources {
+                    values[i] = atoms.at(i, bad.x, bad.y)[0];
+                }
+                for i in 0..sources {
+                    if values[i] != 0.0 {
+                        let s = -values[i];
+                        axpy(s, &values[..i + 1], &mut gram[i * sources..i * sources + i + 1]);
+                    }
+                }
             }
         }
         self.active.clear();

@@ -160,9 +160,9 @@ impl Analytic {
             if reading.is_explained(&look) {
                 break;
             }
-            let residual = search.fitter.residual_of(reading, &mut look).to_vec();
+            let expected = search.fitter.expectation(reading, &mut look);
             let (bx, by) = (&search.fitter.bx, &search.fitter.by);
-            if !self.inspection.reject_lone(&mut self.frame, reading, &residual, bx, by) {
+            if !self.inspection.reject_lone(&mut self.frame, reading, expected, bx, by) {
                 break;
             }
             look = search.first_look(reading, &self.frame);

@@ -7,6 +7,7 @@ use super::basis::Basis;
 use super::model::{Nuisances, Spot};
 use super::parts::Parts;
 use super::reading::Reading;
+use super::unusable::Run;
 
 /// Places along the smear, in its σ, and their shares; exact for the first nine moments.
 const SMEAR: [(f64, f64); 5] = [
@@ -90,7 +91,7 @@ impl Atoms {
             self.parts
                 .push_flat([0, 1].map(|k| backgrounds[k][kinds[k]].as_slice()));
         }
-        self.parts.expand(axes, &reading.bad_lines);
+        self.parts.expand(axes, &reading.bad.lines);
     }
 
     /// The parts' places and shares in a source.
@@ -111,17 +112,42 @@ impl Atoms {
         (if i < n { i * each } else { n * each + i - n }, self.smear(i))
     }
 
-    /// Values of source `i` at an unusable pixel: `[a][b]` derived a times along x and b times along y.
+    /// f_x f_y, f′_x f_y and f_x f′_y of source `i` at an unusable pixel.
     #[inline(always)]
-    pub fn at(&self, i: usize, x: usize, y: usize) -> [[f64; 3]; 3] {
-        let mut sum = [[0.0; 3]; 3];
+    pub fn at(&self, i: usize, x: usize, y: usize) -> [f64; 3] {
         let (first, shares) = self.parts(i);
+        let mut sum = [0.0; 3];
         for (k, (_, share)) in shares.iter().enumerate() {
             let [fx, fy] = self.parts.at(first + k, x, y);
-            for a in 0..3 {
-                for b in 0..3 {
-                    sum[a][b] += share * fx[a] * fy[b];
-                }
+            add(&mut sum, *share, [fx[0] * fy[0], fx[1] * fy[0], fx[0] * fy[1]]);
+        }
+        sum
+    }
+
+    /// Second derivatives of source `i` at an unusable pixel: xx, xy, yy.
+    #[inline(always)]
+    pub fn bend_at(&self, i: usize, x: usize, y: usize) -> [f64; 3] {
+        let (first, shares) = self.parts(i);
+        let mut sum = [0.0; 3];
+        for (k, (_, share)) in shares.iter().enumerate() {
+            let [fx, fy] = self.parts.at(first + k, x, y);
+            add(&mut sum, *share, [fx[2] * fy[0], fx[1] * fy[1], fx[0] * fy[2]]);
+        }
+        sum
+    }
+
+    /// [`Atoms::couple`] over unusable pixels alone.
+    #[inline(always)]
+    pub fn couple_at(&self, i: usize, j: usize, runs: &[Run], scratch: &mut Vec<f64>) -> [f64; 9] {
+        let ((first, shares), (other, others)) = (self.parts(i), self.parts(j));
+        let mut sum = [0.0; 9];
+        for (k, (_, share)) in shares.iter().enumerate() {
+            for (l, (_, of)) in others.iter().enumerate() {
+                add(
+                    &mut sum,
+                    share * of,
+                    self.parts.couple_at(first + k, other + l, runs, scratch),
+                );
             }
         }
         sum
@@ -155,6 +181,36 @@ impl Atoms {
             add(&mut sum, *share, self.parts.project(first + k, matrix, scratch));
         }
         sum
+    }
+
+    /// Inner products of a matrix (my, mx) with the model's slopes in every spot's x, y and energy, then in the background.
+    #[inline(always)]
+    pub fn slopes(&self, matrix: &[f64], scratch: &mut Vec<f64>, out: &mut [f64]) {
+        let n = self.spots.len();
+        for i in 0..self.sources {
+            let [value, along_x, along_y] = self.project(i, matrix, scratch);
+            if i < n {
+                let a = self.spots[i].a;
+                (out[3 * i], out[3 * i + 1], out[3 * i + 2]) = (a * along_x, a * along_y, value);
+            } else {
+                out[2 * n + i] = value;
+            }
+        }
+    }
+
+    /// The same at an unusable pixel.
+    #[inline(always)]
+    pub fn slopes_at(&self, x: usize, y: usize, out: &mut [f64]) {
+        let n = self.spots.len();
+        for i in 0..self.sources {
+            let [value, along_x, along_y] = self.at(i, x, y);
+            if i < n {
+                let a = self.spots[i].a;
+                (out[3 * i], out[3 * i + 1], out[3 * i + 2]) = (a * along_x, a * along_y, value);
+            } else {
+                out[2 * n + i] = value;
+            }
+        }
     }
 
     /// The first of these alone.

@@ -29,6 +29,8 @@ pub(super) struct Basis {
     pub stride: usize,
     /// Pixels to coefficients, (n, stride) row-major; unused columns are zero.
     u: Vec<f64>,
+    /// Its transpose, (stride, width).
+    transposed: Vec<f64>,
     pub is_pixels: bool,
     /// `tail[m]`: largest norm that a spot of width σ leaves outside the first m columns.
     tail: Vec<f64>,
@@ -57,6 +59,7 @@ impl Basis {
             n,
             stride: n.next_multiple_of(4),
             u: Vec::new(),
+            transposed: Vec::new(),
             is_pixels: true,
             tail: Vec::new(),
             table: Vec::new(),
@@ -64,6 +67,7 @@ impl Basis {
             edges,
         };
         basis.fill_identity();
+        basis.transpose();
         basis
     }
 
@@ -94,6 +98,26 @@ impl Basis {
     #[inline(always)]
     pub fn rows(&self) -> &[f64] {
         &self.u
+    }
+
+    /// Basis columns from pixel `first` on, with [`Basis::width`] doubles between them; zero beyond the last pixel.
+    #[inline(always)]
+    pub fn columns_from(&self, first: usize) -> &[f64] {
+        &self.transposed[first..]
+    }
+
+    pub fn width(&self) -> usize {
+        self.n + 4
+    }
+
+    fn transpose(&mut self) {
+        let width = self.width();
+        self.transposed = vec![0.0; self.stride * width];
+        for (k, row) in self.u.chunks_exact(self.stride).enumerate() {
+            for (c, value) in row.iter().enumerate() {
+                self.transposed[c * width + k] = *value;
+            }
+        }
     }
 
     /// Largest norm that a spot leaves outside the first `m` columns.
@@ -163,6 +187,7 @@ impl Basis {
                 self.u[k * self.stride + c] = columns[(k, c)];
             }
         }
+        self.transpose();
         self.tail.truncate(kept + 1);
         self.is_pixels = false;
 

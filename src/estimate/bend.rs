@@ -6,15 +6,12 @@ use super::Bend;
 use super::atoms::Atoms;
 use super::fit::Fitter;
 use super::linear::{axpy, dot};
-use super::linearise::slope_at;
 use super::model::Model;
 use super::reading::Reading;
 
 /// The derivatives that go with the second moments xx, xy, yy, and what multiplies them: a spot spread by M changes by
 /// ½A(M_xx f_xx + 2 M_xy f_xy + M_yy f_yy).
 const SECOND: [([usize; 2], f64); 3] = [([2, 0], 0.5), ([1, 1], 1.0), ([0, 2], 0.5)];
-/// Derivatives along x and y that go with a spot's x, y and energy.
-const FIRST: [[usize; 2]; 3] = [[1, 0], [0, 1], [0, 0]];
 /// Directions that are looked in, over half a turn.
 const DIRECTIONS: usize = 16;
 /// A direction of which less than this share is left beside what the model adjusts says nothing.
@@ -68,35 +65,12 @@ impl Fitter {
     fn bent(&mut self, reading: &Reading, model: &Model, covariance: &[f64]) -> Vec<Bend> {
         let p = model.parameters();
         let widths = model.nuisances.widths();
-        self.work += (model.spots.len() * p * (3 * reading.bad.len() + 3 * p)) as f64;
-        let mut rows = Vec::new();
-        let mut lefts = Vec::new();
-        for bad in &reading.bad {
-            let start = rows.len();
-            rows.resize(start + p, 0.0);
-            lefts.push(slope_at(bad, &self.now, widths, &mut rows[start..]));
-        }
+        self.work += (model.spots.len() * p * 3 * p) as f64;
         let (mut cross, mut taken) = (vec![0.0; 3 * p], vec![0.0; 3 * p]);
         let mut bends = Vec::with_capacity(model.spots.len());
         for i in 0..model.spots.len() {
             cross.fill(0.0);
             let (mut score, mut information) = self.raw_bend(reading, i, widths, &mut cross);
-            let atoms = &self.now;
-            for (k, bad) in reading.bad.iter().enumerate() {
-                let at = atoms.at(i, bad.x, bad.y);
-                let a = atoms.amplitude(i);
-                let own = [0.5 * a * at[2][0], a * at[1][1], 0.5 * a * at[0][2]];
-                if own == [0.0; 3] {
-                    continue;
-                }
-                for r in 0..3 {
-                    score[r] -= own[r] * lefts[k];
-                    axpy(-own[r], &rows[k * p..(k + 1) * p], &mut cross[r * p..(r + 1) * p]);
-                    for c in 0..3 {
-                        information[r][c] -= own[r] * own[c];
-                    }
-                }
-            }
             let whole = information;
             for r in 0..3 {
                 for k in 0..p {
@@ -120,51 +94,74 @@ impl Fitter {
         bends
     }
 
-    /// Score and information of spot `i`'s second moments, and what they share with the model's parameters, (3, p); unusable
-    /// pixels not taken out yet.
+    /// Score and information of spot `i`'s second moments, and what they share with the model's parameters, (3, p).
     #[inline(always)]
     fn raw_bend(&mut self, reading: &Reading, i: usize, widths: usize, cross: &mut [f64]) -> ([f64; 3], [[f64; 3]; 3]) {
         let p = cross.len() / 3;
         let atoms: &Atoms = &self.now;
-        let n = atoms.spots.len();
         let own = SECOND.map(|(_, f)| f * atoms.amplitude(i));
         let strip = &mut self.strip;
-        let mut grams = None;
-        let mut inner = |a: [usize; 2], j: usize, b: [usize; 2], grams: &Option<[[[f64; 2]; 3]; 2]>| match grams {
-            Some([x, y]) => x[a[0]][b[0]] * y[a[1]][b[1]],
-            None => atoms.inner(i, a, j, b, &reading.weights, strip),
-        };
-        for j in 0..atoms.sources() {
-            if reading.weights.is_empty() && atoms.turn == 0.0 {
-                grams = atoms.grams(i, j);
-                if grams.is_none() {
-                    continue;
-                }
-            }
+        let mut information = [[0.0; 3]; 3];
+        if reading.weights.is_empty() && !reading.bad.is_long() && widths == 0 && atoms.turn == 0.0 {
             for (r, (second, _)) in SECOND.into_iter().enumerate() {
-                if j >= n {
-                    cross[r * p + 2 * n + j] = own[r] * inner(second, j, [0, 0], &grams);
+                for (c, (other, _)) in SECOND.into_iter().enumerate() {
+                    information[r][c] = own[r] * own[c] * atoms.inner(i, second, i, other, &[], strip);
+                }
+            }
+            share(atoms, i, own, cross);
+            self.velocity.resize(p, 0.0);
+            for bad in &reading.bad.pixels {
+                let at = atoms.bend_at(i, bad.x, bad.y);
+                if at == [0.0; 3] {
                     continue;
                 }
-                for (c, first) in FIRST.into_iter().enumerate() {
-                    let scale = if c < 2 { atoms.amplitude(j) } else { 1.0 };
-                    cross[r * p + 3 * j + c] = own[r] * scale * inner(second, j, first, &grams);
+                atoms.slopes_at(bad.x, bad.y, &mut self.velocity);
+                for r in 0..3 {
+                    axpy(-own[r] * at[r], &self.velocity, &mut cross[r * p..(r + 1) * p]);
+                    for c in 0..3 {
+                        information[r][c] -= own[r] * at[r] * own[c] * at[c];
+                    }
                 }
             }
-        }
-        let information =
-            [0, 1, 2].map(|r| [0, 1, 2].map(|c| own[r] * own[c] * inner(SECOND[r].0, i, SECOND[c].0, &None)));
-        for w in 0..widths {
-            self.weighted.clone_from(&self.broadening[w]);
-            for (d, w) in self.weighted.iter_mut().zip(&reading.weights) {
-                *d *= w;
-            }
-            for (r, shared) in atoms.bend(i, &self.weighted, strip).into_iter().enumerate() {
-                cross[r * p + p - widths + w] = own[r] * shared;
+        } else {
+            for (r, (second, _)) in SECOND.into_iter().enumerate() {
+                self.bend.clear();
+                self.bend.resize(reading.mx * reading.my, 0.0);
+                atoms.add(i, second[0], second[1], own[r], &mut self.bend);
+                reading.weight(&mut self.bend, [&self.bx, &self.by], false, &mut self.scratch);
+                let row = &mut cross[r * p..(r + 1) * p];
+                atoms.slopes(&self.bend, strip, row);
+                for w in 0..widths {
+                    row[p - widths + w] = dot(&self.bend, &self.broadening[w]);
+                }
+                let bend = atoms.bend(i, &self.bend, strip);
+                for c in 0..3 {
+                    information[r][c] = own[c] * bend[c];
+                }
             }
         }
         let bend = atoms.bend(i, &self.residual, strip);
         ([0, 1, 2].map(|r| own[r] * bend[r]), information)
+    }
+}
+
+/// What spot `i`'s second moments share with all sources in an unweighted frame, (3, p).
+#[inline(always)]
+fn share(atoms: &Atoms, i: usize, own: [f64; 3], cross: &mut [f64]) {
+    let (n, p) = (atoms.spots.len(), cross.len() / 3);
+    for j in 0..atoms.sources() {
+        let Some([x, y]) = atoms.grams(i, j) else { continue };
+        for (r, (second, _)) in SECOND.into_iter().enumerate() {
+            let along = |first: [usize; 2]| own[r] * x[second[0]][first[0]] * y[second[1]][first[1]];
+            if j >= n {
+                cross[r * p + 2 * n + j] = along([0, 0]);
+                continue;
+            }
+            let a = atoms.amplitude(j);
+            cross[r * p + 3 * j] = a * along([1, 0]);
+            cross[r * p + 3 * j + 1] = a * along([0, 1]);
+            cross[r * p + 3 * j + 2] = along([0, 0]);
+        }
     }
 }
 

@@ -52,16 +52,22 @@ impl Fitter {
     pub(super) fn step_work(&self, reading: &Reading) -> f64 {
         let sources = self.now.sources() as f64;
         let parameters = 3.0 * sources;
-        let unusable = reading.bad.len() as f64 * (2.0 * parameters + 0.5 * parameters * parameters);
+        let bad = &reading.bad;
+        let products = if bad.is_long() {
+            sources * sources * (4 * self.bx.n + 16 * bad.runs.len()) as f64
+        } else {
+            bad.len() as f64 * (2.0 * parameters + 0.5 * parameters * parameters)
+        };
+        let unusable = products + 2.0 * bad.work(reading.mx, reading.my);
         let pairs = if reading.weights.is_empty() { 0.0 } else { 3.0 * sources };
         let parts = self.now.parts_a_spot();
-        let products = if parts > 1.0 {
+        let smears = if parts > 1.0 {
             8.0 * (parts * sources).powi(2) * (reading.mx + reading.my) as f64
         } else {
             0.0
         };
         unusable
-            + products
+            + smears
             + (9.0 + pairs) * self.now.footprint()
             + 40.0 * sources * (reading.mx + reading.my) as f64
             + 9.0 * sources.powi(3)

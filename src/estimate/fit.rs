@@ -12,11 +12,10 @@ use std::time::Instant;
 use super::atoms::{self, Atoms};
 use super::basis::Basis;
 use super::effort::BEYOND;
-use super::linear::{axpy, dot};
+use super::linear::dot;
 use super::model::{Model, Nuisances, pull};
 use super::part;
 use super::reading::Reading;
-use super::unusable::BadPixel;
 
 const LAMBDA_START: f64 = 1e-3;
 const LAMBDA_FLOOR: f64 = 1e-14;
@@ -179,18 +178,6 @@ impl Fitter {
         sum
     }
 
-    /// Takes what unusable pixels hold out of a residual.
-    pub fn clean(&self, reading: &Reading, residual: &mut [f64]) {
-        for bad in &reading.bad {
-            let left = residual_at(bad, &self.now);
-            let ux = &self.bx.row(bad.x)[..reading.mx];
-            let uy = self.by.row(bad.y)[..reading.my].iter().enumerate();
-            for (c, &u) in uy.filter(|(_, u)| **u != 0.0) {
-                axpy(-left * u, ux, &mut residual[c * reading.mx..(c + 1) * reading.mx]);
-            }
-        }
-    }
-
     /// `false` where it is given up.
     #[inline(always)]
     fn run(&mut self, reading: &Reading, model: &mut Model, steps: usize, bar: f64) -> bool {
@@ -310,31 +297,8 @@ impl Fitter {
         for i in 0..atoms.sources() {
             atoms.add(i, 0, 0, -atoms.amplitude(i), residual);
         }
-        if !reading.weights.is_empty() {
-            let mut deviance = 0.0;
-            for (r, w) in residual.iter_mut().zip(&reading.weights) {
-                let weighted = w * *r;
-                deviance += weighted * *r;
-                *r = weighted;
-            }
-            return deviance;
-        }
-        let mut deviance = dot(residual, residual);
-        for bad in &reading.bad {
-            deviance -= residual_at(bad, atoms).powi(2);
-        }
-        deviance
+        reading.weight(residual, [&self.bx, &self.by], true, &mut self.scratch)
     }
-}
-
-/// What an unusable pixel holds beyond the model.
-#[inline(always)]
-fn residual_at(bad: &BadPixel, atoms: &Atoms) -> f64 {
-    let mut left = bad.value;
-    for i in 0..atoms.sources() {
-        left -= atoms.amplitude(i) * atoms.at(i, bad.x, bad.y)[0][0];
-    }
-    left
 }
 
 struct Job<'a> {

@@ -1,11 +1,9 @@
 //! The normal equations: a hypothesis's gradient and information.
 
-use super::atoms::Atoms;
 use super::fit::Fitter;
 use super::linear::{axpy, dot};
 use super::model::Nuisances;
 use super::reading::Reading;
-use super::unusable::BadPixel;
 
 impl Fitter {
     /// Gradient Jᵀr and information JᵀJ at the present hypothesis.
@@ -24,7 +22,13 @@ impl Fitter {
             let ai = atoms.amplitude(i);
             for j in i..sources {
                 let aj = atoms.amplitude(j);
-                let c = atoms.couple(i, j, &reading.weights, &mut self.strip);
+                let mut c = atoms.couple(i, j, &reading.weights, &mut self.strip);
+                if reading.bad.is_long() {
+                    let taken = atoms.couple_at(i, j, &reading.bad.runs, &mut self.strip);
+                    for k in 0..9 {
+                        c[k] -= taken[k];
+                    }
+                }
                 if j < n {
                     let block = [
                         ai * aj * c[0],
@@ -49,15 +53,12 @@ impl Fitter {
                     h[(2 * n + i) * p + 2 * n + j] = c[8];
                 }
             }
-            let s = atoms.project(i, &self.residual, &mut self.strip);
-            if i < n {
-                (g[3 * i], g[3 * i + 1], g[3 * i + 2]) = (ai * s[1], ai * s[2], s[0]);
-                if let Some(power) = atoms.spots[i].power {
-                    h[(3 * i + 2) * p + 3 * i + 2] += power.precision;
-                    g[3 * i + 2] += power.precision * (power.mean - ai);
-                }
-            } else {
-                g[2 * n + i] = s[0];
+        }
+        atoms.slopes(&self.residual, &mut self.strip, &mut g[..p]);
+        for (i, spot) in atoms.spots.iter().enumerate() {
+            if let Some(power) = spot.power {
+                h[(3 * i + 2) * (p + 1)] += power.precision;
+                g[3 * i + 2] += power.precision * (power.mean - spot.a);
             }
         }
         let widths = nuisances.widths();
@@ -78,61 +79,32 @@ impl Fitter {
         for w in 0..widths {
             let weighted = &mut self.weighted;
             weighted.clone_from(&self.broadening[w]);
-            for (d, w) in weighted.iter_mut().zip(&reading.weights) {
-                *d *= w;
-            }
+            reading.weight(weighted, [&self.bx, &self.by], false, &mut self.scratch);
             let column = first_width + w;
-            for i in 0..sources {
-                let s = atoms.project(i, weighted, &mut self.strip);
-                if i < n {
-                    let a = atoms.spots[i].a;
-                    for (r, v) in [a * s[1], a * s[2], s[0]].into_iter().enumerate() {
-                        h[(3 * i + r) * p + column] = v;
-                    }
-                } else {
-                    h[(2 * n + i) * p + column] = s[0];
-                }
+            let shared = &mut self.velocity;
+            shared.resize(p.max(shared.len()), 0.0);
+            atoms.slopes(weighted, &mut self.strip, shared);
+            for i in 0..first_width {
+                h[i * p + column] = shared[i];
             }
             for v in 0..=w {
                 h[(first_width + v) * p + column] = dot(weighted, &self.broadening[v]);
             }
             g[first_width + w] = dot(&self.broadening[w], &self.residual);
         }
-        for bad in &reading.bad {
+        if reading.bad.is_long() {
+            return;
+        }
+        for bad in &reading.bad.pixels {
             let row = &mut self.velocity;
             row.resize(p.max(row.len()), 0.0);
-            let left = slope_at(bad, atoms, widths, &mut row[..p]);
-            for i in (0..p).filter(|&i| row[i] != 0.0) {
-                g[i] -= row[i] * left;
-                let s = -row[i];
-                axpy(s, &row[i..p], &mut h[i * p + i..(i + 1) * p]);
+            atoms.slopes_at(bad.x, bad.y, row);
+            for i in 0..first_width {
+                if row[i] != 0.0 {
+                    let s = -row[i];
+                    axpy(s, &row[i..first_width], &mut h[i * p + i..i * p + first_width]);
+                }
             }
         }
     }
-}
-
-/// What an unusable pixel holds beyond the model, and the model's slope there in all parameters.
-#[inline(always)]
-pub(super) fn slope_at(bad: &BadPixel, atoms: &Atoms, widths: usize, row: &mut [f64]) -> f64 {
-    let (n, p) = (atoms.spots.len(), row.len());
-    row[p - widths..].fill(0.0);
-    let mut left = bad.value;
-    for i in 0..atoms.sources() {
-        let at = atoms.at(i, bad.x, bad.y);
-        let a = atoms.amplitude(i);
-        left -= a * at[0][0];
-        if i >= n {
-            row[2 * n + i] = at[0][0];
-            continue;
-        }
-        (row[3 * i], row[3 * i + 1], row[3 * i + 2]) = (a * at[1][0], a * at[0][1], at[0][0]);
-        if widths > 0 {
-            row[p - widths] += a * atoms.width[0].powi(2) * at[2][0];
-            row[p - widths + (widths - 1).min(1)] += a * atoms.width[1].powi(2) * at[0][2];
-        }
-        if widths > 2 {
-            row[p - 1] += a * at[1][1];
-        }
-    }
-    left
 }

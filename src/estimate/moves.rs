@@ -63,7 +63,6 @@ impl Search {
     pub(super) fn residual_peaks(&mut self, reading: &Reading, model: &mut Model) -> &[super::heatmap::Peak] {
         self.residual.clear();
         self.residual.extend_from_slice(self.fitter.residual_of(reading, model));
-        self.fitter.clean(reading, &mut self.residual);
         let (mx, my) = (reading.mx, reading.my);
         // A peak's share that other spots have absorbed comes back in the joint fit: look a little lower.
         let threshold = 0.7 * (self.factor * self.price).sqrt();

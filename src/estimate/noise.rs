@@ -181,13 +181,13 @@ impl Inspection {
         scale
     }
 
-    /// Rejects pixels that stand out of the residual (my, mx) of a first model alone, as no spot or misfit of one can.
+    /// Rejects pixels that stand out of what a first model expects, (my, mx), alone, as no spot or misfit of one can.
     /// `true` where there were any.
     pub fn reject_lone(
         &mut self,
         frame: &mut Screened,
         reading: &mut Reading,
-        residual: &[f64],
+        expected: Vec<f64>,
         bx: &Basis,
         by: &Basis,
     ) -> bool {
@@ -195,12 +195,7 @@ impl Inspection {
             return false;
         }
         let (nx, ny) = (bx.n, by.n);
-        let data = reading.z.clone();
-        for (z, r) in reading.z.iter_mut().zip(residual) {
-            *z -= r;
-        }
-        reading.expand(bx, by, &mut self.smooth);
-        reading.z = data;
+        reading.expand_matrix(&expected, bx, by, &mut self.smooth);
         let left: Vec<f64> = frame.pixels.iter().zip(&self.smooth).map(|(p, m)| p - m).collect();
         let mut found = Vec::new();
         for y in 0..ny {

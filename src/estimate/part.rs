@@ -62,10 +62,8 @@ impl Fitter {
         for i in (0..self.now.spots.len()).filter(|i| !kept.contains(i)) {
             let amplitude = self.now.amplitude(i);
             self.now.add(i, 0, 0, -amplitude, &mut part.z);
-            for bad in &mut part.bad {
-                bad.value -= amplitude * self.now.at(i, bad.x, bad.y)[0][0];
-            }
         }
+        part.reweight([&self.bx, &self.by]);
         part
     }
 }

@@ -4,6 +4,11 @@ use std::ops::Range;
 
 use super::basis::Basis;
 use super::linear::{axpy, combine, dot};
+use super::unusable::Run;
+
+/// Which derivative of i and of j, along x and along y, makes each of the nine products of a pair.
+const ALONG_X: [[usize; 2]; 9] = [[1, 1], [1, 0], [1, 0], [0, 1], [0, 0], [0, 0], [0, 1], [0, 0], [0, 0]];
+const ALONG_Y: [[usize; 2]; 9] = [[0, 0], [0, 1], [0, 0], [1, 0], [1, 1], [1, 0], [0, 0], [0, 1], [0, 0]];
 
 /// Separable parts in the bases, in the order they were pushed.
 #[derive(Default)]
@@ -267,9 +272,6 @@ impl Parts {
         let (mx, my) = (self.mx, self.my);
         let x = |i: usize, d: usize| &self.x[(3 * i + d) * mx + x0..(3 * i + d) * mx + x1];
         let y = |i: usize, d: usize| &self.y[(3 * i + d) * my + y0..(3 * i + d) * my + y1];
-        // Which derivative of i and of j, along x and along y, makes each of the nine.
-        const ALONG_X: [[usize; 2]; 9] = [[1, 1], [1, 0], [1, 0], [0, 1], [0, 0], [0, 0], [0, 1], [0, 0], [0, 0]];
-        const ALONG_Y: [[usize; 2]; 9] = [[0, 0], [0, 1], [0, 0], [1, 0], [1, 1], [1, 0], [0, 0], [0, 1], [0, 0]];
         if weights.is_empty() {
             let (mut tx, mut ty) = ([0.0; 4], [0.0; 4]);
             for k in 0..4 {
@@ -304,6 +306,40 @@ impl Parts {
         for k in 0..9 {
             let ([a, b], [c, d]) = (ALONG_X[k], ALONG_Y[k]);
             out[k] = triple(t[2 * c + d], x(i, a), x(j, b));
+        }
+        out
+    }
+
+    /// [`Parts::couple`] over the pixels of `runs` alone, each run a difference of running sums along x.
+    #[inline(always)]
+    pub fn couple_at(&self, i: usize, j: usize, runs: &[Run], scratch: &mut Vec<f64>) -> [f64; 9] {
+        let [nx, ny] = self.lines;
+        let (xi, xj) = (&self.at[0][i * nx..(i + 1) * nx], &self.at[0][j * nx..(j + 1) * nx]);
+        let (yi, yj) = (&self.at[1][i * ny..(i + 1) * ny], &self.at[1][j * ny..(j + 1) * ny]);
+        scratch.resize(scratch.len().max(4 * (nx + 1)), 0.0);
+        let sums = scratch.as_chunks_mut::<4>().0;
+        let mut sum = [0.0; 4];
+        for x in 0..nx {
+            sums[x] = sum;
+            for k in 0..4 {
+                sum[k] += xi[x][k / 2] * xj[x][k % 2];
+            }
+        }
+        sums[nx] = sum;
+        let mut whole = [[0.0; 4]; 4];
+        for run in runs {
+            let (from, to) = (sums[run.x.start], sums[run.x.end]);
+            for k in 0..4 {
+                let along_y = yi[run.y][k / 2] * yj[run.y][k % 2];
+                for l in 0..4 {
+                    whole[k][l] += along_y * (to[l] - from[l]);
+                }
+            }
+        }
+        let mut out = [0.0; 9];
+        for k in 0..9 {
+            let ([a, b], [c, d]) = (ALONG_X[k], ALONG_Y[k]);
+            out[k] = whole[2 * c + d][2 * a + b];
         }
         out
     }

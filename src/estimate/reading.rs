@@ -1,14 +1,12 @@
 //! A frame in the two bases, ready to be fitted.
 
-use std::collections::BTreeSet;
-
 use super::basis::Basis;
 use super::linear::{combine, dot, largest};
 use super::model::Model;
 use super::noise::Growth;
 use super::screen::Screened;
 use super::spot;
-use super::unusable::{self, BadPixel};
+use super::unusable::{BadPixel, Unusable};
 
 /// What a frame may leave outside the basis, in units of the noise.
 const LOSS: f64 = 0.02;
@@ -24,9 +22,7 @@ pub(super) struct Reading {
     pub my: usize,
     /// (my, mx) row-major.
     pub z: Vec<f64>,
-    pub bad: Vec<BadPixel>,
-    /// Their columns and rows, each once.
-    pub bad_lines: [Vec<usize>; 2],
+    pub bad: Unusable,
     /// Inverse variances (my, mx) where pixels differ in them, and Σ ln of the variances. Only in the pixel bases.
     pub weights: Vec<f64>,
     pub log_det: f64,
@@ -84,25 +80,18 @@ impl Reading {
         } else {
             self.compress(frame, bx, by);
         }
-        self.bad.clear();
-        self.bad.extend(frame.bad.iter().map(|b| BadPixel {
+        let bad = frame.bad.iter().map(|b| BadPixel {
             x: b.x,
             y: b.y,
             value: frame.pixels[b.y * nx + b.x],
-        }));
-        self.bad_lines = [
-            self.bad.iter().map(|b| b.x).collect::<BTreeSet<_>>(),
-            self.bad.iter().map(|b| b.y).collect(),
-        ]
-        .map(|lines| lines.into_iter().collect());
-        if !(self.bad.is_empty() || bx.is_pixels && by.is_pixels) {
-            unusable::fill(&mut self.bad, &mut self.z, mx, bx, by);
-        }
+        });
+        self.bad.load(bad, &mut self.z, mx, bx, by);
+        self.reweight([bx, by]);
         let usable = (nx * ny - self.bad.len()) as f64;
         self.numbers = ((self.rank[0] * self.rank[1]) as f64).min(usable);
         let left = usable - self.numbers;
         let filled = |b: &BadPixel| b.value.powi(2) - frame.pixels[b.y * nx + b.x].powi(2);
-        let energy = square(&frame.pixels) + self.bad.iter().map(filled).sum::<f64>() - square(&self.z);
+        let energy = square(&frame.pixels) + self.bad.pixels.iter().map(filled).sum::<f64>() - square(&self.z);
         self.outside = (energy.max(0.0) / left.max(1.0), left);
         (self.growth, self.mean_variance, self.lit_variance) = (Growth::default(), 1.0, 1.0);
     }
@@ -122,7 +111,8 @@ impl Reading {
     }
 
     /// Gives every pixel the weight 1/`variance`, (Ny, Nx), and unusable ones none.
-    pub fn weigh(&mut self, frame: &Screened, nx: usize, variance: impl Fn(usize) -> f64) {
+    pub fn weigh(&mut self, frame: &Screened, axes: [&Basis; 2], variance: impl Fn(usize) -> f64) {
+        let nx = axes[0].n;
         self.weights.clear();
         self.weights.resize(self.z.len(), 0.0);
         self.log_det = 0.0;
@@ -132,20 +122,50 @@ impl Reading {
             self.weights[k / nx * self.mx + k % nx] = 1.0 / v;
         }
         self.bad.clear();
-        self.bad_lines = Default::default();
-        self.weighted.clear();
-        self.weighted
-            .extend(self.z.iter().zip(&self.weights).map(|(z, w)| z * w));
+        self.reweight(axes);
+    }
+
+    /// Weights the frame anew.
+    #[inline(always)]
+    pub fn reweight(&mut self, axes: [&Basis; 2]) {
+        if self.is_even() {
+            return;
+        }
+        let mut weighted = std::mem::take(&mut self.weighted);
+        weighted.clone_from(&self.z);
+        self.weight(&mut weighted, axes, true, &mut Vec::new());
+        self.weighted = weighted;
+    }
+
+    /// Whether all numbers count alike.
+    pub fn is_even(&self) -> bool {
+        self.weights.is_empty() && self.bad.is_empty()
+    }
+
+    /// Weights a matrix (my, mx): by the pixels' inverse variances, or none for those that tell nothing; `is_residual` where it is
+    /// the frame less a model. Returns its weighted square.
+    #[inline(always)]
+    pub fn weight(&self, matrix: &mut [f64], axes: [&Basis; 2], is_residual: bool, scratch: &mut Vec<f64>) -> f64 {
+        if self.weights.is_empty() {
+            let whole = dot(matrix, matrix);
+            if self.bad.is_empty() {
+                return whole;
+            }
+            return whole - self.bad.take_out(matrix, self.mx, axes, is_residual, scratch);
+        }
+        let mut square = 0.0;
+        for (m, w) in matrix.iter_mut().zip(&self.weights) {
+            let weighted = w * *m;
+            square += weighted * *m;
+            *m = weighted;
+        }
+        square
     }
 
     /// The frame times its weights.
     #[inline(always)]
     pub fn weighted(&self) -> &[f64] {
-        if self.weights.is_empty() {
-            &self.z
-        } else {
-            &self.weighted
-        }
+        if self.is_even() { &self.z } else { &self.weighted }
     }
 
     /// Emitters that are looked for at most: three numbers each must be had from the frame.

@@ -112,24 +112,20 @@ impl Fitter {
                 bend,
             );
         }
-        for (b, w) in bend.iter_mut().zip(&reading.weights) {
-            *b *= w;
+        // A few pixels more or less make no other step.
+        if reading.bad.is_empty() || reading.bad.is_long() {
+            reading.weight(bend, [&self.bx, &self.by], false, &mut self.scratch);
         }
         self.acceleration.clear();
         self.acceleration.resize(p, 0.0);
         let out = &mut self.acceleration;
-        for i in 0..atoms.sources() {
-            let s = atoms.project(i, bend, &mut self.strip);
-            if i < n {
-                let a = atoms.spots[i].a;
-                (out[3 * i], out[3 * i + 1], out[3 * i + 2]) = (-a * s[1], -a * s[2], -s[0]);
-            } else {
-                out[2 * n + i] = -s[0];
-            }
-        }
+        atoms.slopes(bend, &mut self.strip, out);
         let widths = nuisances.widths();
         for w in 0..widths {
-            out[p - widths + w] = -dot(&self.broadening[w], bend);
+            out[p - widths + w] = dot(&self.broadening[w], bend);
+        }
+        for v in &mut *out {
+            *v = -*v;
         }
         solve(&self.factor, p, out);
     }

@@ -1,17 +1,20 @@
-//! Pixels that tell nothing: what stands in their place until the fit takes it out again.
+//! Pixels that tell nothing, taken out of the fit again, which is exact whatever they were filled with.
+
+use std::collections::BTreeSet;
+use std::ops::Range;
 
 use super::basis::Basis;
-use super::linear::{axpy, cholesky, dot, solve};
+use super::linear::{axpy, combine, dot};
 
-/// A further change of the deviance that is not worth another round.
-const SMALL: f64 = 0.01;
-const ROUNDS: usize = 100;
-/// From so many pixels on it may be cheaper to solve for the coefficients, where there are few.
-const MANY: usize = 200;
-/// Precision of what only unusable pixels could tell, over a coefficient's.
-const RIDGE: f64 = 1e-9;
+/// Runs of so many pixels each, on average, are summed over as a whole.
+const LONG: usize = 4;
+/// Fewer pixels than this are taken out one by one.
+const MANY: usize = 64;
+/// A further change of the deviance that is not worth another round of filling.
+const SMALL: f64 = 1e-3;
+const ROUNDS: usize = 500;
 
-/// An unusable pixel with the value it was filled with, which the fit takes out again exactly.
+/// An unusable pixel with what it was filled with.
 #[derive(Clone, Copy)]
 pub(super) struct BadPixel {
     pub x: usize,
@@ -19,86 +22,196 @@ pub(super) struct BadPixel {
     pub value: f64,
 }
 
-/// Fills unusable pixels with what the usable ones let the bases say there, and `z`, (my, mx), accordingly: then nothing of
-/// them lies outside the bases, where it would pass for noise, and the deviance is that of the usable pixels alone.
-///
-/// With P the projection on the bases, the values solve (I − P)ᵦᵦ v = (P y)ᵦ; conjugate gradients (Hestenes and Stiefel, 1952).
-#[inline(always)]
-pub(super) fn fill(bad: &mut [BadPixel], z: &mut [f64], mx: usize, bx: &Basis, by: &Basis) {
-    let size = z.len() as f64;
-    let iterated = ROUNDS as f64 * 4.0 * bad.len() as f64 * size;
-    if bad.len() > MANY && size * size * (size / 3.0 + bad.len() as f64 / 2.0) < iterated {
-        return solve_all(bad, z, mx, bx, by);
-    }
-    let my = z.len() / mx;
-    let at = |matrix: &[f64], b: &BadPixel| -> f64 {
-        let (ux, uy) = (&bx.row(b.x)[..mx], &by.row(b.y)[..my]);
-        uy.iter()
-            .zip(matrix.chunks_exact(mx))
-            .map(|(u, row)| u * dot(row, ux))
-            .sum()
-    };
-    let mut left: Vec<f64> = bad.iter().map(|b| at(z, b) - b.value).collect();
-    let mut direction = left.clone();
-    let mut spread = vec![0.0; z.len()];
-    let mut change = left.clone();
-    let mut square = dot(&left, &left);
-    for _ in 0..ROUNDS {
-        spread.fill(0.0);
-        for (b, d) in bad.iter().zip(&direction) {
-            let ux = &bx.row(b.x)[..mx];
-            for (u, row) in by.row(b.y).iter().zip(spread.chunks_exact_mut(mx)) {
-                axpy(d * u, ux, row);
+/// Neighbours in one row.
+#[derive(Clone)]
+pub(super) struct Run {
+    pub y: usize,
+    pub x: Range<usize>,
+    first: usize,
+}
+
+/// A frame's unusable pixels, row by row.
+#[derive(Clone, Default)]
+pub(super) struct Unusable {
+    pub pixels: Vec<BadPixel>,
+    pub runs: Vec<Run>,
+    /// Their columns and rows, each once.
+    pub lines: [Vec<usize>; 2],
+    /// What they were filled with beyond what the bases hold there.
+    beyond: Vec<f64>,
+}
+
+impl Unusable {
+    /// The unusable pixels of a frame of coefficients `z`, (my, mx), which are filled in.
+    #[inline(always)]
+    pub fn load(&mut self, pixels: impl Iterator<Item = BadPixel>, z: &mut [f64], mx: usize, bx: &Basis, by: &Basis) {
+        self.clear();
+        self.pixels.extend(pixels);
+        if self.pixels.is_empty() {
+            return;
+        }
+        self.pixels.sort_unstable_by_key(|b| (b.y, b.x));
+        for (k, b) in self.pixels.iter().enumerate() {
+            match self.runs.last_mut() {
+                Some(run) if run.y == b.y && run.x.end == b.x => run.x.end += 1,
+                _ => self.runs.push(Run {
+                    y: b.y,
+                    x: b.x..b.x + 1,
+                    first: k,
+                }),
             }
         }
-        for ((c, b), d) in change.iter_mut().zip(bad.iter()).zip(&direction) {
-            *c = d - at(&spread, b);
+        let columns: BTreeSet<usize> = self.pixels.iter().map(|b| b.x).collect();
+        self.lines = [
+            columns.into_iter().collect(),
+            self.runs.chunk_by(|a, b| a.y == b.y).map(|row| row[0].y).collect(),
+        ];
+        self.beyond.resize(self.pixels.len(), 0.0);
+        if !(bx.is_pixels && by.is_pixels) {
+            self.fill(z, mx, [bx, by]);
         }
-        let curvature = dot(&direction, &change);
-        if !(curvature > 1e-12 * dot(&direction, &direction)) {
-            return;
+    }
+
+    pub fn clear(&mut self) {
+        self.pixels.clear();
+        self.runs.clear();
+        self.lines = Default::default();
+        self.beyond.clear();
+    }
+
+    pub fn len(&self) -> usize {
+        self.pixels.len()
+    }
+
+    pub fn is_empty(&self) -> bool {
+        self.pixels.is_empty()
+    }
+
+    /// Whether sums over runs cost less than sums over pixels.
+    pub fn is_long(&self) -> bool {
+        self.len() >= MANY && self.len() >= LONG * self.runs.len()
+    }
+
+    /// Multiplications of [`Unusable::take_out`].
+    pub fn work(&self, mx: usize, my: usize) -> f64 {
+        (2 * mx * (self.len() + my * self.lines[1].len())) as f64
+    }
+
+    /// Takes what the pixels hold of a matrix (my, mx) out of it, M − UᵦᵀUᵦM; of a frame's residual also what they were filled
+    /// with. Returns the square of what they held.
+    #[inline(always)]
+    pub fn take_out(
+        &self,
+        matrix: &mut [f64],
+        mx: usize,
+        [bx, by]: [&Basis; 2],
+        is_residual: bool,
+        scratch: &mut Vec<f64>,
+    ) -> f64 {
+        let mut square = 0.0;
+        if bx.is_pixels && by.is_pixels {
+            for b in &self.pixels {
+                let value = std::mem::take(&mut matrix[b.y * mx + b.x]);
+                square += value * value;
+            }
+            return square;
         }
-        let step = square / curvature;
-        for (b, d) in bad.iter_mut().zip(&direction) {
-            b.value += step * d;
+        let (size, my) = (matrix.len(), matrix.len() / mx);
+        scratch.clear();
+        scratch.extend_from_slice(matrix);
+        scratch.resize(size + 3 * mx + bx.width(), 0.0);
+        let (whole, rest) = scratch.split_at_mut(size);
+        let (row, rest) = rest.split_at_mut(mx);
+        let (part, rest) = rest.split_at_mut(mx);
+        let (sum, held) = rest.split_at_mut(mx);
+        for line in self.runs.chunk_by(|a, b| a.y == b.y) {
+            let uy = &by.row(line[0].y)[..my];
+            combine([uy], 1, whole, mx, mx, row);
+            sum.fill(0.0);
+            for run in line {
+                let held = run.show(row, bx, held);
+                if is_residual {
+                    axpy(1.0, &self.beyond[run.first..], held);
+                }
+                square += dot(held, held);
+                combine([&*held], 1, &bx.rows()[run.x.start * bx.stride..], bx.stride, mx, part);
+                axpy(1.0, part, sum);
+            }
+            for (u, out) in uy.iter().zip(matrix.chunks_exact_mut(mx)) {
+                axpy(-u, sum, out);
+            }
         }
-        axpy(step, &spread, z);
-        axpy(-step, &change, &mut left);
-        let before = std::mem::replace(&mut square, dot(&left, &left));
-        if step * before < SMALL {
-            return;
+        square
+    }
+
+    /// Notes what the pixels were filled with beyond what `z` holds there.
+    #[inline(always)]
+    fn compare(&mut self, z: &[f64], mx: usize, [bx, by]: [&Basis; 2]) {
+        let my = z.len() / mx;
+        let (mut row, mut held) = (vec![0.0; mx], vec![0.0; bx.width()]);
+        for run in &self.runs {
+            combine([&by.row(run.y)[..my]], 1, z, mx, mx, &mut row);
+            let held = run.show(&row, bx, &mut held);
+            for (k, shown) in held.iter().enumerate() {
+                self.beyond[run.first + k] = self.pixels[run.first + k].value - shown;
+            }
         }
-        for (d, l) in direction.iter_mut().zip(&left) {
-            *d = l + square / before * *d;
+    }
+
+    /// Fills the pixels with what the usable ones let the bases say there, and `z`, (my, mx), accordingly: then nothing of them lies
+    /// outside the bases, where it would pass for noise.
+    ///
+    /// The usable pixels' coefficients solve (I − UᵦᵀUᵦ) z = Uᵀ y over them; conjugate gradients (Hestenes and Stiefel, 1952).
+    #[inline(always)]
+    fn fill(&mut self, z: &mut [f64], mx: usize, axes: [&Basis; 2]) {
+        let mut scratch = Vec::new();
+        self.compare(z, mx, axes);
+        let mut usable = z.to_vec();
+        self.take_out(&mut usable, mx, axes, true, &mut scratch);
+        let mut change = z.to_vec();
+        self.take_out(&mut change, mx, axes, false, &mut scratch);
+        let mut left: Vec<f64> = usable.iter().zip(&change).map(|(u, c)| u - c).collect();
+        let mut direction = left.clone();
+        let mut square = dot(&left, &left);
+        for _ in 0..ROUNDS {
+            change.clone_from(&direction);
+            self.take_out(&mut change, mx, axes, false, &mut scratch);
+            let curvature = dot(&direction, &change);
+            if !(curvature > 1e-12 * dot(&direction, &direction)) {
+                break;
+            }
+            let step = square / curvature;
+            axpy(step, &direction, z);
+            axpy(-step, &change, &mut left);
+            let before = std::mem::replace(&mut square, dot(&left, &left));
+            if step * before < SMALL {
+                break;
+            }
+            for (d, l) in direction.iter_mut().zip(&left) {
+                *d = l + square / before * *d;
+            }
         }
+        self.compare(z, mx, axes);
+        for (b, beyond) in self.pixels.iter_mut().zip(&self.beyond) {
+            b.value -= beyond;
+        }
+        // Of what the pixels hold now, whether or not the rounds came to an end.
+        change.copy_from_slice(z);
+        self.take_out(&mut change, mx, axes, false, &mut scratch);
+        for ((z, c), u) in z.iter_mut().zip(&change).zip(&usable) {
+            *z += u - c;
+        }
+        self.compare(z, mx, axes);
     }
 }
 
-/// The same by the coefficients that the usable pixels give, (I − UᵦᵀUᵦ) z = Uᵀ y over them.
-#[inline(always)]
-fn solve_all(bad: &mut [BadPixel], z: &mut [f64], mx: usize, bx: &Basis, by: &Basis) {
-    let (n, my) = (z.len(), z.len() / mx);
-    let mut gram = vec![0.0; n * n];
-    let mut atom = vec![0.0; n];
-    for i in 0..n {
-        gram[i * n + i] = 1.0 + RIDGE;
-    }
-    for b in bad.iter() {
-        let (ux, uy) = (&bx.row(b.x)[..mx], &by.row(b.y)[..my]);
-        for (row, u) in atom.chunks_exact_mut(mx).zip(uy) {
-            row.fill(0.0);
-            axpy(*u, ux, row);
-        }
-        axpy(-b.value, &atom, z);
-        for i in 0..n {
-            axpy(-atom[i], &atom[i..], &mut gram[i * n + i..(i + 1) * n]);
-        }
-    }
-    if cholesky(&mut gram, n) {
-        solve(&gram, n, z);
-    }
-    for b in bad.iter_mut() {
-        let (ux, uy) = (&bx.row(b.x)[..mx], &by.row(b.y)[..my]);
-        b.value = uy.iter().zip(z.chunks_exact(mx)).map(|(u, row)| u * dot(row, ux)).sum();
+impl Run {
+    /// What a row of coefficients, (mx), holds at its pixels; `out` has room for a row of the frame.
+    #[inline(always)]
+    fn show<'a>(&self, row: &[f64], bx: &Basis, out: &'a mut [f64]) -> &'a mut [f64] {
+        let length = self.x.len();
+        let columns = bx.columns_from(self.x.start);
+        combine([row], 1, columns, bx.width(), length.next_multiple_of(4), out);
+        &mut out[..length]
     }
 }

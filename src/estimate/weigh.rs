@@ -47,7 +47,8 @@ impl Weighing {
         for _ in 0..PASSES {
             let mx = reading.mx;
             let at = |k: usize| k / nx * mx + k % nx;
-            reading.weigh(frame, nx, |k| growth.at(signal[at(k)]));
+            let fitter = &search.fitter;
+            reading.weigh(frame, [&fitter.bx, &fitter.by], |k| growth.at(signal[at(k)]));
             search.settle(reading, &mut next, ROUNDS);
             signal = search.fitter.expectation(reading, &mut next);
             let mut residual = search.fitter.residual_of(reading, &mut next).to_vec();
