@@ -41,6 +41,7 @@ pub mod stages;
 mod step;
 mod straight;
 mod unusable;
+mod valley;
 mod weigh;
 
 pub use bound::{Beside, Shape, position_bound, position_bound_beside};

@@ -9,7 +9,7 @@ use super::search::{NUISANCE_PRICE, Search, TRIAL_STEPS};
 /// Rounds of moves.
 const ROUNDS: usize = 6;
 /// A spot is taken for a user's, to begin with, where its energy speaks against that no more than this.
-const LENIENCY: f64 = 60.0;
+pub(super) const LENIENCY: f64 = 60.0;
 /// A spot of this many times a known power may be two.
 const TWOFOLD: f64 = 1.4;
 /// Parts of a divided spot stand this far apart, σ, at least and at most.
@@ -33,6 +33,8 @@ impl Search {
         self.attempt(reading, model, known);
         for _ in 0..ROUNDS {
             let before = self.score(model);
+            self.tighten(reading, model);
+            self.wander(reading, model);
             self.divide(reading, model);
             self.balance(reading, model);
             self.unite(reading, model);

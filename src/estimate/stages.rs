@@ -69,8 +69,9 @@ impl Stages {
 
     /// −2 ln of the posterior probability of what `map` makes of spots at `places`, m on the sensor, and that.
     pub fn most_probable(&mut self, known: &KnownPower, places: &[[f64; 2]]) -> (f64, Estimate) {
-        self.fit_from(places, MANY_STEPS);
+        self.fit_from(places, 0);
         self.search.prior = Some(Prior::new(known, &self.camera));
+        self.search.weigh_up(&self.reading, &mut self.model, f64::INFINITY, f64::INFINITY);
         self.search.maximum_posterior(&self.reading, &mut self.model);
         let score = self.search.score(&self.model);
         self.search.prior = None;
