@@ -227,15 +227,25 @@ impl Estimator for Analytic {
             (search, reading)
         };
         let noise_j = scale * self.camera.noise_std_j;
+        let mut centres = None;
         if let Some(mut prior) = self.prior.take() {
             prior.noise_j = noise_j;
             prior.temper = reading.misfit(&model);
             search.prior = Some(prior);
             search.maximum_posterior(reading, &mut model);
             self.prior = search.prior.take();
+            centres = search.centres(reading, &mut model);
         }
         let is_exhausted = search.is_exhausted();
-        let mut estimate = ground::locate(search, reading, &mut model, &self.frame, &self.camera, noise_j);
+        let mut estimate = ground::locate(
+            search,
+            reading,
+            &mut model,
+            &self.frame,
+            &self.camera,
+            noise_j,
+            centres.as_deref(),
+        );
         estimate.rung = self.rung.name;
         estimate.is_cut_short = is_exhausted;
         let by_pencil = self.pencil.as_ref().map_or(0, |pencil| pencil.fitter.steps);

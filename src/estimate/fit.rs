@@ -16,6 +16,7 @@ use super::linear::dot;
 use super::model::{Model, Nuisances, pull};
 use super::part;
 use super::reading::Reading;
+use super::valley::Tether;
 
 const LAMBDA_START: f64 = 1e-3;
 const LAMBDA_FLOOR: f64 = 1e-14;
@@ -52,6 +53,8 @@ pub(super) struct Fitter {
     /// The frame's derivatives in the widths and the turn, (my, mx), plain and weighted.
     pub(super) broadening: [Vec<f64>; 3],
     pub(super) weighted: Vec<f64>,
+    /// Where the spots are held together on a line through their places, if they are.
+    pub tether: Option<Tether>,
     pub(super) hessian: Vec<f64>,
     pub(super) factor: Vec<f64>,
     pub(super) gradient: Vec<f64>,
@@ -86,6 +89,7 @@ impl Fitter {
             trial_residual: Vec::new(),
             broadening: Default::default(),
             weighted: Vec::new(),
+            tether: None,
             hessian: Vec::new(),
             factor: Vec::new(),
             gradient: Vec::new(),
@@ -113,7 +117,7 @@ impl Fitter {
     pub fn fit_below(&mut self, reading: &Reading, model: &mut Model, steps: usize, bar: f64) {
         let last = self.steps + steps as u64;
         for _ in 0..PARTINGS {
-            if self.steps + TOGETHER as u64 >= last {
+            if self.tether.is_some() || self.steps + TOGETHER as u64 >= last {
                 break;
             }
             let Some(groups) = model.groups() else { break };
@@ -267,7 +271,7 @@ impl Fitter {
         model.background = self.now.background;
         model.width = self.now.width;
         model.turn = self.now.turn;
-        model.deviance = deviance - pull(&model.spots);
+        model.deviance = deviance - pull(&model.spots) - self.strain(&model.spots);
         // A fit of no steps only evaluates: it says nothing new about convergence.
         model.converged = converged || steps == 0 && model.converged;
         goes_on
@@ -281,7 +285,7 @@ impl Fitter {
         atoms.place([&self.bx, &self.by], backgrounds, reading, nuisances, &mut self.scratch);
         self.solve_amplitudes(reading, is_trial);
         let spots = if is_trial { &self.trial.spots } else { &self.now.spots };
-        pull(spots) + self.subtract(reading, is_trial)
+        pull(spots) + self.strain(spots) + self.subtract(reading, is_trial)
     }
 
     /// Weighted residual and deviance of the present or the trial hypothesis.

@@ -5,6 +5,7 @@ use super::model::Model;
 use super::reading::Reading;
 use super::screen::Screened;
 use super::search::Search;
+use super::valley::Centre;
 use super::{Bend, Emitter, Estimate, Flags, spread};
 use crate::optics::Camera;
 
@@ -29,6 +30,7 @@ pub(super) fn locate(
     frame: &Screened,
     camera: &Camera,
     noise_j: f64,
+    centres: Option<&[Centre]>,
 ) -> Estimate {
     let n = model.spots.len();
     let p = model.parameters();
@@ -124,6 +126,12 @@ pub(super) fn locate(
                         own[other][k] *= wider;
                     }
                 }
+            }
+            if let Some(centre) = centres.map(|c| c[i]) {
+                for k in 0..2 {
+                    u[k] += centre.shift[k];
+                }
+                own = centre.covariance;
             }
             let sensor_m = u.map(|u| u * sigma);
             let scale = sigma * sigma * inflation;

@@ -101,7 +101,7 @@ impl Estimator for LearnedEstimator {
             search.shrink(reading, &mut model);
         }
         let noise_j = camera.noise_std_j;
-        let mut estimate = ground::locate(search, reading, &mut model, &self.frame, camera, noise_j);
+        let mut estimate = ground::locate(search, reading, &mut model, &self.frame, camera, noise_j, None);
         estimate.rung = self.rung.name();
         Ok(estimate)
     }

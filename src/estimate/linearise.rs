@@ -61,6 +61,9 @@ impl Fitter {
                 g[3 * i + 2] += power.precision * (power.mean - spot.a);
             }
         }
+        if let Some(tether) = &self.tether {
+            tether.linearise(&atoms.spots, g, h, p);
+        }
         let widths = nuisances.widths();
         let first_width = p - widths;
         for d in &mut self.broadening[..widths] {

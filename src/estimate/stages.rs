@@ -12,7 +12,6 @@ use crate::optics::Camera;
 
 /// Steps of the joint fit that is timed.
 const STEPS: usize = 5;
-const MANY_STEPS: usize = 200;
 
 /// A frame's way from pixels to positions, halted between stages.
 pub struct Stages {
@@ -71,7 +70,8 @@ impl Stages {
     pub fn most_probable(&mut self, known: &KnownPower, places: &[[f64; 2]]) -> (f64, Estimate) {
         self.fit_from(places, 0);
         self.search.prior = Some(Prior::new(known, &self.camera));
-        self.search.weigh_up(&self.reading, &mut self.model, f64::INFINITY, f64::INFINITY);
+        self.search
+            .weigh_up(&self.reading, &mut self.model, f64::INFINITY, f64::INFINITY);
         self.search.maximum_posterior(&self.reading, &mut self.model);
         let score = self.search.score(&self.model);
         self.search.prior = None;
@@ -87,6 +87,6 @@ impl Stages {
             reading,
             model,
         } = self;
-        ground::locate(search, reading, model, frame, camera, camera.noise_std_j)
+        ground::locate(search, reading, model, frame, camera, camera.noise_std_j, None)
     }
 }

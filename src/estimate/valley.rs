@@ -1,7 +1,8 @@
 //! Other lowest places of a bent valley. Where spots melt, many places explain a frame nearly as well, and which of them is the most
 //! probable is up to the known powers: a fit that begins at what explains the frame best ends in the nearest of them.
 
-use super::model::Model;
+use super::fit::Fitter;
+use super::model::{Model, Spot};
 use super::posterior::LENIENCY;
 use super::reading::Reading;
 use super::search::{Search, TRIAL_STEPS};
@@ -16,6 +17,58 @@ const FAR: [f64; 4] = [-2.0, 2.0, -5.0, 5.0];
 const FARTHEST: f64 = 1.0;
 /// Rounds of the power iteration.
 const ITERATIONS: usize = 20;
+
+/// Steps along a valley, in standard deviations, how many to either side at most, and what is too improbable to count.
+const STEP: f64 = 0.5;
+const STEPS: usize = 12;
+const NEGLIGIBLE: f64 = 14.0;
+/// How much narrower than the valley is long a tether is.
+const NARROW: f64 = 4.0;
+/// Steps of a fit from one place of the valley to the next.
+const FEW_STEPS: usize = 8;
+
+/// Holds places to a line across a valley: Σ direction·u = `at` with a precision.
+#[derive(Clone)]
+pub(super) struct Tether {
+    direction: Vec<f64>,
+    at: f64,
+    precision: f64,
+}
+
+/// Where a spot is on average, from where it most probably is, and its covariance, σ and σ².
+#[derive(Clone, Copy)]
+pub(super) struct Centre {
+    pub shift: [f64; 2],
+    pub covariance: [[f64; 2]; 2],
+}
+
+impl Tether {
+    fn beyond(&self, spots: &[Spot]) -> f64 {
+        let places = spots.iter().flat_map(|s| s.u);
+        self.direction.iter().zip(places).map(|(d, u)| d * u).sum::<f64>() - self.at
+    }
+
+    /// Adds its part of the normal equations of `p` parameters.
+    pub fn linearise(&self, spots: &[Spot], gradient: &mut [f64], hessian: &mut [f64], p: usize) {
+        let beyond = self.beyond(spots);
+        let at = |k: usize| 3 * (k / 2) + k % 2;
+        for (k, d) in self.direction.iter().enumerate() {
+            gradient[at(k)] -= self.precision * d * beyond;
+            for (l, e) in self.direction.iter().enumerate().skip(k) {
+                hessian[at(k) * p + at(l)] += self.precision * d * e;
+            }
+        }
+    }
+}
+
+impl Fitter {
+    /// What the tether adds to the deviance.
+    pub(super) fn strain(&self, spots: &[Spot]) -> f64 {
+        self.tether
+            .as_ref()
+            .map_or(0.0, |t| t.precision * t.beyond(spots).powi(2))
+    }
+}
 
 impl Search {
     /// Fits `model` anew from where its places come to lie with energies all but fixed to the known ones, which are then let go by
@@ -41,20 +94,11 @@ impl Search {
 
     /// Fits `model` anew from places along the directions in which it is known least.
     pub(super) fn wander(&mut self, reading: &Reading, model: &mut Model) {
-        let (n, p) = (model.spots.len(), model.parameters());
-        self.fitter.information(reading, model);
-        let mut covariance = Vec::new();
-        if !self.fitter.covariance(p, n, 1.0, &mut covariance) {
-            return;
-        }
-        let at = |i: usize| 3 * (i / 2) + i % 2;
-        let mut places: Vec<f64> = (0..4 * n * n).map(|k| covariance[at(k / (2 * n)) * p + at(k % (2 * n))]).collect();
+        let mut places = self.uncertainty(reading, model);
         for _ in 0..DIRECTIONS {
-            let (variance, direction) = leading(&mut places);
-            let deviation = variance.sqrt();
-            if !(deviation > LEAST) {
+            let Some((deviation, direction)) = valley(&mut places) else {
                 return;
-            }
+            };
             let largest = direction.iter().fold(0.0, |a: f64, d| a.max(d.abs()));
             for far in FAR {
                 let length = (far * deviation).clamp(-FARTHEST / largest, FARTHEST / largest);
@@ -66,12 +110,118 @@ impl Search {
             }
         }
     }
+
+    /// Covariance of all places, σ², (2 N, 2 N); empty where there is none.
+    fn uncertainty(&mut self, reading: &Reading, model: &mut Model) -> Vec<f64> {
+        let (n, p) = (2 * model.spots.len(), model.parameters());
+        self.fitter.information(reading, model);
+        let mut covariance = Vec::new();
+        if n == 0 || !self.fitter.covariance(p, n / 2, 1.0, &mut covariance) {
+            return Vec::new();
+        }
+        let of = |k: usize| 3 * (k / 2) + k % 2;
+        (0..n * n).map(|k| covariance[of(k / n) * p + of(k % n)]).collect()
+    }
+
+    /// Means and covariances of places along the valley that `model` lies in: the position of least squared error is the mean of the
+    /// posterior and not its highest place. `None` where there is no valley.
+    pub(super) fn centres(&mut self, reading: &Reading, model: &mut Model) -> Option<Vec<Centre>> {
+        let mut places = self.uncertainty(reading, model);
+        let (deviation, direction) = valley(&mut places)?;
+        let stops = self.follow(reading, model, deviation, &direction);
+        self.fitter.tether = None;
+        self.fitter.fit(reading, model, 0);
+        let best = stops.iter().map(|s| s.score).fold(f64::INFINITY, f64::min);
+        let weights: Vec<f64> = stops.iter().map(|s| (-0.5 * (s.score - best)).exp()).collect();
+        let whole: f64 = weights.iter().sum();
+        let centre = |i: usize| {
+            let mean =
+                |f: &dyn Fn(&Stop) -> f64| stops.iter().zip(&weights).map(|(s, w)| w / whole * f(s)).sum::<f64>();
+            let away = |s: &Stop, k: usize| s.places[i][k] - model.spots[i].u[k];
+            let shift = [0, 1].map(|k| mean(&|s| away(s, k)));
+            let spread = |r: usize, c: usize| {
+                mean(&|s| s.covariances[i][r][c] + (away(s, r) - shift[r]) * (away(s, c) - shift[c]))
+            };
+            Centre {
+                shift,
+                covariance: [0, 1].map(|r| [0, 1].map(|c| spread(r, c))),
+            }
+        };
+        (whole > 0.0).then(|| (0..model.spots.len()).map(centre).collect())
+    }
+
+    /// Follows a valley from `mode` to both sides along the direction that is known least, all else fitted anew at each stop and
+    /// integrated over as a normal density (Laplace), until stops are improbable or two emitters would change places.
+    fn follow(&mut self, reading: &Reading, mode: &Model, deviation: f64, direction: &[f64]) -> Vec<Stop> {
+        let (n, p) = (mode.spots.len(), mode.parameters());
+        let tether = Tether {
+            direction: direction.to_vec(),
+            at: 0.0,
+            precision: (NARROW / deviation).powi(2),
+        };
+        let start = tether.beyond(&mode.spots);
+        let mut stops: Vec<Stop> = Vec::new();
+        let mut best = f64::INFINITY;
+        let mut covariance = Vec::new();
+        for side in [1.0, -1.0] {
+            let mut next = mode.clone();
+            for k in usize::from(side < 0.0)..=STEPS {
+                let at = start + side * k as f64 * STEP * deviation;
+                self.fitter.tether = Some(Tether { at, ..tether.clone() });
+                self.fitter.fit(reading, &mut next, FEW_STEPS);
+                self.fitter.information(reading, &mut next);
+                let Some(log_det) = self.fitter.log_det(p, &vec![[0.0; 3]; n]) else {
+                    break;
+                };
+                let score = next.deviance + next.pull() + self.fitter.strain(&next.spots) + log_det;
+                best = best.min(score);
+                let is_probable = score < best + NEGLIGIBLE && !self.is_exhausted();
+                if !is_probable || has_swapped(mode, &next) || !self.fitter.covariance(p, n, 0.0, &mut covariance) {
+                    break;
+                }
+                let block = |i: usize| [0, 1].map(|r| [0, 1].map(|c| covariance[(3 * i + r) * p + 3 * i + c]));
+                stops.push(Stop {
+                    score,
+                    places: next.spots.iter().map(|s| s.u).collect(),
+                    covariances: (0..n).map(block).collect(),
+                });
+            }
+        }
+        stops
+    }
+}
+
+/// A place along a valley: −2 ln of its probability, the spots' places there, σ, and their covariances across the valley, σ².
+struct Stop {
+    score: f64,
+    places: Vec<[f64; 2]>,
+    covariances: Vec<[[f64; 2]; 2]>,
+}
+
+/// Standard deviation along the direction that is known least, and that direction, which is taken out of the covariance; `None`
+/// where all is known well.
+fn valley(places: &mut [f64]) -> Option<(f64, Vec<f64>)> {
+    let (variance, direction) = leading(places);
+    (variance > LEAST * LEAST).then(|| (variance.sqrt(), direction))
+}
+
+/// Whether two emitters have come to lie the other way around.
+fn has_swapped(mode: &Model, next: &Model) -> bool {
+    let between = |m: &Model, i: usize, j: usize| [0, 1].map(|k| m.spots[i].u[k] - m.spots[j].u[k]);
+    (0..mode.spots.len()).any(|i| {
+        (0..i).any(|j| {
+            let (a, b) = (between(mode, i, j), between(next, i, j));
+            a[0] * b[0] + a[1] * b[1] < 0.0
+        })
+    })
 }
 
 /// The largest eigenvalue of a symmetric matrix and its eigenvector, both taken out of the matrix (power iteration).
 fn leading(matrix: &mut [f64]) -> (f64, Vec<f64>) {
     let n = matrix.len().isqrt();
-    let widest = (0..n).max_by(|&i, &j| matrix[i * (n + 1)].total_cmp(&matrix[j * (n + 1)])).unwrap_or(0);
+    let widest = (0..n)
+        .max_by(|&i, &j| matrix[i * (n + 1)].total_cmp(&matrix[j * (n + 1)]))
+        .unwrap_or(0);
     let mut vector = matrix[widest * n..(widest + 1) * n].to_vec();
     let mut value = 0.0;
     for _ in 0..ITERATIONS {
