@@ -11,8 +11,17 @@ const FINAL_STEPS: usize = 200;
 const SEPARATION: f64 = 2.5;
 /// Spots nearer than this, σ, may be one.
 const MERGE: f64 = 2.5;
+/// Pixels wider than this, σ, make the deviance no parabola: spots nearer than so many of them may be one, whatever the second order says.
+const WIDE: f64 = 2.0;
+const MERGE_PIXELS: f64 = 1.6;
+/// Pairs that are tried as one, a round, and where pixels are wide.
+const PAIRS: [usize; 2] = [3, 8];
 /// Nearer, the second order does not tell how far apart two spots are.
 const CLOSE: f64 = 0.15;
+/// A spot that is brought inside comes to lie so far from the edge, σ.
+const INSIDE: f64 = 1.0;
+/// The faintest spots that are tried to be done without for it.
+const SPARE: usize = 3;
 /// Spots that are tried to be done without, a round.
 const FAINTEST: usize = 6;
 /// A split that promises this share of an emitter's price is tried though the frame is explained without.
@@ -106,11 +115,18 @@ impl Search {
     /// Merges and drops.
     pub fn shrink(&mut self, reading: &Reading, model: &mut Model) {
         while self.merge_several(reading, model) {}
+        let pitch = self.fitter.bx.pitch().max(self.fitter.by.pitch());
+        let is_wide = pitch > WIDE;
+        let limit = if is_wide {
+            MERGE.max(MERGE_PIXELS * pitch)
+        } else {
+            MERGE
+        };
         loop {
             let n = model.spots.len();
             let mut has_shrunk = false;
-            for (d, i, j) in pairs(model, MERGE).into_iter().take(3) {
-                if d > CLOSE && self.separation(reading, model, i, j) > 8.0 * self.factor * self.price {
+            for (d, i, j) in pairs(model, limit).into_iter().take(PAIRS[usize::from(is_wide)]) {
+                if !is_wide && d > CLOSE && self.separation(reading, model, i, j) > 8.0 * self.factor * self.price {
                     continue;
                 }
                 let next = merged(model, &[(i, j)]);
@@ -134,10 +150,36 @@ impl Search {
                     }
                 }
             }
-            if !has_shrunk {
+            if !has_shrunk && !self.pull_in(reading, model) {
                 break;
             }
         }
+    }
+
+    /// Does without a spot where one beyond the sensor's edge comes inside: with a second, what little is seen of it may stand in for
+    /// one that the edge cuts.
+    fn pull_in(&mut self, reading: &Reading, model: &mut Model) -> bool {
+        let axes = [&self.fitter.bx, &self.fitter.by];
+        let ends = axes.map(|b| [b.edges[0], b.edges[b.n]]);
+        let is_outside = |i: usize| (0..2).any(|k| !(ends[k][0]..=ends[k][1]).contains(&model.spots[i].u[k]));
+        let outside: Vec<usize> = (0..model.spots.len()).filter(|&i| is_outside(i)).collect();
+        let mut spare: Vec<usize> = (0..model.spots.len()).collect();
+        spare.sort_by(|&i, &j| model.spots[i].a.total_cmp(&model.spots[j].a));
+        spare.truncate(SPARE);
+        spare.extend(&outside);
+        for &k in &outside {
+            for &i in spare.iter().filter(|&&i| i != k) {
+                let mut next = model.clone();
+                for (u, [low, high]) in next.spots[k].u.iter_mut().zip(ends) {
+                    *u = u.clamp(low + INSIDE, high - INSIDE);
+                }
+                next.spots.remove(i);
+                if self.consider(reading, model, next) {
+                    return true;
+                }
+            }
+        }
+        false
     }
 
     /// Merges all pairs at once that the frame does not tell apart, where there are several.
