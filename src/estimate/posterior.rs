@@ -33,8 +33,7 @@ impl Search {
         self.attempt(reading, model, known);
         for _ in 0..ROUNDS {
             let before = self.score(model);
-            self.tighten(reading, model);
-            self.wander(reading, model);
+            self.explore(reading, model);
             self.divide(reading, model);
             self.balance(reading, model);
             self.unite(reading, model);

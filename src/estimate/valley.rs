@@ -3,12 +3,15 @@
 
 use super::fit::Fitter;
 use super::model::{Model, Spot};
+use super::moves::pairs;
 use super::posterior::LENIENCY;
 use super::reading::Reading;
 use super::search::{Search, TRIAL_STEPS};
 
 /// How many times tighter energies are held to the known ones, step by step.
 const TIGHT: [f64; 2] = [100.0, 10.0];
+/// Spots nearer than this, σ, touch.
+const TOUCHING: f64 = 2.0;
 /// Places known better than this, σ, in all directions lie in no valley.
 const LEAST: f64 = 0.02;
 /// Directions that are looked along, and how far, in standard deviations and, at most, in σ.
@@ -74,7 +77,7 @@ impl Search {
     /// Fits `model` anew from where its places come to lie with energies all but fixed to the known ones, which are then let go by
     /// degrees: a valley that bends has more than one lowest place, and the one next to what was fitted without the prior need not
     /// be the lowest.
-    pub(super) fn tighten(&mut self, reading: &Reading, model: &mut Model) {
+    fn tighten(&mut self, reading: &Reading, model: &mut Model) {
         let Some(prior) = self.prior.take() else { return };
         let mut next = model.clone();
         prior.label(&mut next, LENIENCY);
@@ -92,8 +95,12 @@ impl Search {
         self.attempt(reading, model, next);
     }
 
-    /// Fits `model` anew from places along the directions in which it is known least.
-    pub(super) fn wander(&mut self, reading: &Reading, model: &mut Model) {
+    /// Looks for a more probable place of the valley that `model` may lie in: with energies held tight where spots touch, and from
+    /// places along the directions that are known least.
+    pub(super) fn explore(&mut self, reading: &Reading, model: &mut Model) {
+        if !pairs(model, TOUCHING).is_empty() {
+            self.tighten(reading, model);
+        }
         let mut places = self.uncertainty(reading, model);
         for _ in 0..DIRECTIONS {
             let Some((deviation, direction)) = valley(&mut places) else {
@@ -103,8 +110,8 @@ impl Search {
             for far in FAR {
                 let length = (far * deviation).clamp(-FARTHEST / largest, FARTHEST / largest);
                 let mut next = model.clone();
-                for (i, d) in direction.iter().enumerate() {
-                    next.spots[i / 2].u[i % 2] += length * d;
+                for (u, d) in next.spots.iter_mut().flat_map(|s| &mut s.u).zip(&direction) {
+                    *u += length * d;
                 }
                 self.attempt(reading, model, next);
             }
