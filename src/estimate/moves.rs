@@ -171,7 +171,8 @@ impl Search {
             for &i in spare.iter().filter(|&&i| i != k) {
                 let mut next = model.clone();
                 for (u, [low, high]) in next.spots[k].u.iter_mut().zip(ends) {
-                    *u = u.clamp(low + INSIDE, high - INSIDE);
+                    let inside = INSIDE.min(0.5 * (high - low));
+                    *u = u.max(low + inside).min(high - inside);
                 }
                 next.spots.remove(i);
                 if self.consider(reading, model, next) {
