@@ -38,6 +38,13 @@ fn honest_scenes_raise_nothing() {
     assert!(raised.is_empty(), "{raised:#?}");
 }
 
+/// A user leaves just as another walks by: the track left behind in that one's spot now and then takes its detection.
+#[test]
+fn a_track_in_anothers_spot_is_no_beam() {
+    let (_, raised) = soak(1000, 1_500_598);
+    assert!(raised.is_empty(), "{raised:#?}");
+}
+
 #[test]
 #[ignore = "minutes; see the file's head"]
 fn a_million_honest_frames() {

@@ -16,6 +16,8 @@ const SHARING: f64 = 4.0;
 const GATE_FLOOR_M: f64 = 0.4;
 /// A track is confirmed by M hits of its last N frames.
 const CONFIRM: (u32, u32) = (3, 5);
+/// Hits in a row, one bit each, by which a track takes the place of the one whose spot it had melted into.
+const SUCCEEDED: u32 = 0b111;
 /// A confirmed track is kept this long without a hit, in time the sensor could see.
 const KEEP_S: f64 = 1.5;
 /// A beam missed for no longer than this still holds its claim against others, s.
@@ -39,6 +41,8 @@ pub(super) struct Track {
     pub hit: bool,
     /// The track whose spot the beam has melted into in the newest frame.
     pub merged: Option<u64>,
+    /// The track whose spot it melted into, until the two have been seen beside each other again or it has taken the other's place.
+    pub shadows: Option<u64>,
     /// ln likelihood ratio of "an emitter" to "spurious detections".
     pub score: f64,
     /// Newest hits, one bit a frame.
@@ -69,6 +73,7 @@ impl Track {
             confirmed: false,
             hit: true,
             merged: None,
+            shadows: None,
             score: (DETECTED / detection.ghost).ln(),
             hits: 1,
             frames: 1,
@@ -98,17 +103,23 @@ impl Track {
         }
     }
 
-    /// A spot that another beam has `melted` into lies between the two: neither may take its place or its pace for its own.
-    fn take(&mut self, time: Timestamp, detection: &Detection, melted: bool, ceiling: f64) {
+    /// A spot that another beam has `melted` into lies between the two: neither may take its place or its pace for its own. `beside`
+    /// where the beam that it shadows is seen as well, or no more.
+    fn take(&mut self, time: Timestamp, detection: &Detection, melted: bool, beside: bool, ceiling: f64) {
         let cov = if melted { detection.shared_cov() } else { detection.cov };
         self.motion.update(detection.position, cov);
         self.last_hit = time;
         self.hit = true;
         self.merged = None;
-        self.missed_s = 0.0;
         self.score = (self.score + (DETECTED / detection.ghost).ln()).min(ceiling);
         self.detection = detection.clone();
         self.note(true);
+        if beside || self.hits & SUCCEEDED == SUCCEEDED {
+            self.shadows = None;
+        }
+        if self.shadows.is_none() {
+            self.missed_s = 0.0;
+        }
         let due = self.trail.back().is_none_or(|(t, _)| seconds(*t, time) >= TRAIL_STEP_S);
         if due {
             self.trail.push_back((time, self.motion.position()));
@@ -204,9 +215,17 @@ impl Tracks {
                 None => track.miss(dt_s, track.detection.ghost),
             }
         }
+        let unseen: Vec<u64> = self
+            .all
+            .iter()
+            .zip(&hit)
+            .filter(|(_, h)| h.is_none())
+            .map(|(t, _)| t.id)
+            .collect();
         for (track, found) in self.all.iter_mut().zip(&hit) {
             if let Some(j) = *found {
-                track.take(time, &detections[j], melted[j], self.score_ceiling);
+                let beside = track.shadows.is_none_or(|other| !unseen.contains(&other));
+                track.take(time, &detections[j], melted[j], beside, self.score_ceiling);
             }
         }
         self.all.retain(|t| !t.is_over());
@@ -253,6 +272,7 @@ impl Track {
     fn merge(&mut self, into: u64, spot: &Detection, dt_s: f64) {
         self.motion.update(spot.position, spot.shared_cov());
         self.merged = Some(into);
+        self.shadows = Some(into);
         self.hit = false;
         // Bounds a track that shadows another one: it lives a few times longer than one lost in the open.
         self.missed_s += 0.2 * dt_s;

@@ -26,7 +26,7 @@ impl Monitor {
         for track in &self.tracks.all {
             if answers.contains(&Some(track.id)) {
                 self.alone.remove(&track.id);
-            } else if track.hit {
+            } else if track.hit && track.shadows.is_none() {
                 self.alone.entry(track.id).or_insert(now);
             }
         }
@@ -53,6 +53,7 @@ impl Monitor {
             let open = self.book.is_open(&cause);
             let ripe = settled
                 && track.hit
+                && track.shadows.is_none()
                 && track.confirmed
                 && track.score >= self.level_unclaimed
                 && seconds(since, now) >= patience;
