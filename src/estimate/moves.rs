@@ -159,6 +159,9 @@ impl Search {
     /// Does without a spot where one beyond the sensor's edge comes inside: with a second, what little is seen of it may stand in for
     /// one that the edge cuts.
     fn pull_in(&mut self, reading: &Reading, model: &mut Model) -> bool {
+        if !reading.is_explained(model) {
+            return false;
+        }
         let axes = [&self.fitter.bx, &self.fitter.by];
         let ends = axes.map(|b| [b.edges[0], b.edges[b.n]]);
         let is_outside = |i: usize| (0..2).any(|k| !(ends[k][0]..=ends[k][1]).contains(&model.spots[i].u[k]));
