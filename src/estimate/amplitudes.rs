@@ -31,24 +31,22 @@ impl Fitter {
                 rhs[i] += power.precision * power.mean;
             }
         }
-        if reading.bad.is_long() {
-            for i in 0..sources {
-                for j in 0..=i {
-                    gram[i * sources + j] -= atoms.couple_at(i, j, &reading.bad.runs, &mut self.strip)[8];
-                }
+        let runs = reading.bad.runs();
+        for i in 0..if runs.is_empty() { 0 } else { sources } {
+            for j in 0..=i {
+                gram[i * sources + j] -= atoms.couple_at(i, j, runs, &mut self.strip)[8];
             }
-        } else {
-            for bad in &reading.bad.pixels {
-                let values = &mut self.scratch;
-                values.resize(values.len().max(sources), 0.0);
-                for i in 0..sources {
-                    values[i] = atoms.at(i, bad.x, bad.y)[0];
-                }
-                for i in 0..sources {
-                    if values[i] != 0.0 {
-                        let s = -values[i];
-                        axpy(s, &values[..i + 1], &mut gram[i * sources..i * sources + i + 1]);
-                    }
+        }
+        for bad in reading.bad.scattered() {
+            let values = &mut self.scratch;
+            values.resize(values.len().max(sources), 0.0);
+            for i in 0..sources {
+                values[i] = atoms.at(i, bad.x, bad.y)[0];
+            }
+            for i in 0..sources {
+                if values[i] != 0.0 {
+                    let s = -values[i];
+                    axpy(s, &values[..i + 1], &mut gram[i * sources..i * sources + i + 1]);
                 }
             }
         }

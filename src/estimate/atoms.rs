@@ -186,30 +186,27 @@ impl Atoms {
     /// Inner products of a matrix (my, mx) with the model's slopes in every spot's x, y and energy, then in the background.
     #[inline(always)]
     pub fn slopes(&self, matrix: &[f64], scratch: &mut Vec<f64>, out: &mut [f64]) {
-        let n = self.spots.len();
         for i in 0..self.sources {
-            let [value, along_x, along_y] = self.project(i, matrix, scratch);
-            if i < n {
-                let a = self.spots[i].a;
-                (out[3 * i], out[3 * i + 1], out[3 * i + 2]) = (a * along_x, a * along_y, value);
-            } else {
-                out[2 * n + i] = value;
-            }
+            self.set_slope(i, self.project(i, matrix, scratch), out);
         }
     }
 
     /// The same at an unusable pixel.
     #[inline(always)]
     pub fn slopes_at(&self, x: usize, y: usize, out: &mut [f64]) {
-        let n = self.spots.len();
         for i in 0..self.sources {
-            let [value, along_x, along_y] = self.at(i, x, y);
-            if i < n {
-                let a = self.spots[i].a;
-                (out[3 * i], out[3 * i + 1], out[3 * i + 2]) = (a * along_x, a * along_y, value);
-            } else {
-                out[2 * n + i] = value;
-            }
+            self.set_slope(i, self.at(i, x, y), out);
+        }
+    }
+
+    #[inline(always)]
+    fn set_slope(&self, i: usize, [value, along_x, along_y]: [f64; 3], out: &mut [f64]) {
+        let n = self.spots.len();
+        if i < n {
+            let a = self.spots[i].a;
+            (out[3 * i], out[3 * i + 1], out[3 * i + 2]) = (a * along_x, a * along_y, value);
+        } else {
+            out[2 * n + i] = value;
         }
     }
 

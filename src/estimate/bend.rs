@@ -102,7 +102,7 @@ impl Fitter {
         let own = SECOND.map(|(_, f)| f * atoms.amplitude(i));
         let strip = &mut self.strip;
         let mut information = [[0.0; 3]; 3];
-        if reading.weights.is_empty() && !reading.bad.is_long() && widths == 0 && atoms.turn == 0.0 {
+        if reading.weights.is_empty() && reading.bad.runs().is_empty() && widths == 0 && atoms.turn == 0.0 {
             for (r, (second, _)) in SECOND.into_iter().enumerate() {
                 for (c, (other, _)) in SECOND.into_iter().enumerate() {
                     information[r][c] = own[r] * own[c] * atoms.inner(i, second, i, other, &[], strip);
@@ -110,7 +110,7 @@ impl Fitter {
             }
             share(atoms, i, own, cross);
             self.velocity.resize(p, 0.0);
-            for bad in &reading.bad.pixels {
+            for bad in reading.bad.scattered() {
                 let at = atoms.bend_at(i, bad.x, bad.y);
                 if at == [0.0; 3] {
                     continue;

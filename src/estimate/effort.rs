@@ -53,12 +53,12 @@ impl Fitter {
         let sources = self.now.sources() as f64;
         let parameters = 3.0 * sources;
         let bad = &reading.bad;
-        let products = if bad.is_long() {
-            sources * sources * (4 * self.bx.n + 16 * bad.runs.len()) as f64
-        } else {
-            bad.len() as f64 * (2.0 * parameters + 0.5 * parameters * parameters)
+        let runs = match bad.runs().len() {
+            0 => 0.0,
+            n => sources * sources * (4 * self.bx.n + 16 * n) as f64,
         };
-        let unusable = products + 2.0 * bad.work(reading.mx, reading.my);
+        let scattered = bad.scattered().len() as f64 * (2.0 * parameters + 0.5 * parameters * parameters);
+        let unusable = runs + scattered + 2.0 * bad.work(reading.mx, reading.my);
         let pairs = if reading.weights.is_empty() { 0.0 } else { 3.0 * sources };
         let parts = self.now.parts_a_spot();
         let smears = if parts > 1.0 {

@@ -3,7 +3,7 @@
 //! A frame is F_y·diag(A)·F_xᵀ, so a residual costs O(m² N) and the normal equations are Hadamard products of small
 //! Gram matrices, O(m N²) (Golub and Pereyra, 1973, for separable least squares). Steps carry geodesic acceleration
 //! (Transtrum and Sethna, 2012, eq. 14), amplitudes are solved anew at each trial, and unusable pixels are taken out of
-//! the normal equations one by one, which is exact whatever they were filled with.
+//! the normal equations again, which is exact whatever they were filled with.
 //!
 //! In the pixel bases every source is touched only where it holds light, and pixels may have weights of their own.
 

@@ -18,13 +18,14 @@ impl Fitter {
         h.resize(p * p, 0.0);
         let g = &mut self.gradient;
         g.resize(p.max(g.len()), 0.0);
+        let runs = reading.bad.runs();
         for i in 0..sources {
             let ai = atoms.amplitude(i);
             for j in i..sources {
                 let aj = atoms.amplitude(j);
                 let mut c = atoms.couple(i, j, &reading.weights, &mut self.strip);
-                if reading.bad.is_long() {
-                    let taken = atoms.couple_at(i, j, &reading.bad.runs, &mut self.strip);
+                if !runs.is_empty() {
+                    let taken = atoms.couple_at(i, j, runs, &mut self.strip);
                     for k in 0..9 {
                         c[k] -= taken[k];
                     }
@@ -95,10 +96,7 @@ impl Fitter {
             }
             g[first_width + w] = dot(&self.broadening[w], &self.residual);
         }
-        if reading.bad.is_long() {
-            return;
-        }
-        for bad in &reading.bad.pixels {
+        for bad in reading.bad.scattered() {
             let row = &mut self.velocity;
             row.resize(p.max(row.len()), 0.0);
             atoms.slopes_at(bad.x, bad.y, row);

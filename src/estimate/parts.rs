@@ -313,6 +313,10 @@ impl Parts {
     /// [`Parts::couple`] over the pixels of `runs` alone, each run a difference of running sums along x.
     #[inline(always)]
     pub fn couple_at(&self, i: usize, j: usize, runs: &[Run], scratch: &mut Vec<f64>) -> [f64; 9] {
+        let [[x0, x1], [y0, y1]] = self.shared(i, j);
+        if x0 >= x1 || y0 >= y1 {
+            return [0.0; 9];
+        }
         let [nx, ny] = self.lines;
         let (xi, xj) = (&self.at[0][i * nx..(i + 1) * nx], &self.at[0][j * nx..(j + 1) * nx]);
         let (yi, yj) = (&self.at[1][i * ny..(i + 1) * ny], &self.at[1][j * ny..(j + 1) * ny]);

@@ -113,7 +113,7 @@ impl Fitter {
             );
         }
         // A few pixels more or less make no other step.
-        if reading.bad.is_empty() || reading.bad.is_long() {
+        if reading.bad.scattered().is_empty() {
             reading.weight(bend, [&self.bx, &self.by], false, &mut self.scratch);
         }
         self.acceleration.clear();

@@ -34,7 +34,7 @@ pub(super) struct Run {
 #[derive(Clone, Default)]
 pub(super) struct Unusable {
     pub pixels: Vec<BadPixel>,
-    pub runs: Vec<Run>,
+    runs: Vec<Run>,
     /// Their columns and rows, each once.
     pub lines: [Vec<usize>; 2],
     /// What they were filled with beyond what the bases hold there.
@@ -88,8 +88,18 @@ impl Unusable {
     }
 
     /// Whether sums over runs cost less than sums over pixels.
-    pub fn is_long(&self) -> bool {
+    fn is_long(&self) -> bool {
         self.len() >= MANY && self.len() >= LONG * self.runs.len()
+    }
+
+    /// Their runs, where these are long.
+    pub fn runs(&self) -> &[Run] {
+        if self.is_long() { &self.runs } else { &[] }
+    }
+
+    /// The pixels one by one, elsewhere.
+    pub fn scattered(&self) -> &[BadPixel] {
+        if self.is_long() { &[] } else { &self.pixels }
     }
 
     /// Multiplications of [`Unusable::take_out`].
@@ -213,5 +223,39 @@ impl Run {
         let columns = bx.columns_from(self.x.start);
         combine([row], 1, columns, bx.width(), length.next_multiple_of(4), out);
         &mut out[..length]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::optics::Axis;
+
+    #[test]
+    fn what_is_taken_out_is_what_the_pixels_hold() {
+        let b = Basis::new(&Axis::centred(20, 0.02), 0.004);
+        let m = b.columns().next_multiple_of(4).min(b.stride);
+        let mut z: Vec<f64> = (0..m * m).map(|k| ((k * 37 % 101) as f64 / 50.0) - 1.0).collect();
+        let blob = (0..6).flat_map(|y| (0..5).map(move |x| (x + 7, y + 9)));
+        let pixels: Vec<_> = blob.chain([(0, 0), (19, 3), (4, 19)]).collect();
+        let filled = pixels.iter().map(|&(x, y)| BadPixel { x, y, value: 40.0 });
+        let mut bad = Unusable::default();
+        bad.load(filled, &mut z, m, &b, &b);
+        let mut expected = z.clone();
+        let mut square = 0.0;
+        for &(x, y) in &pixels {
+            let (ux, uy) = (&b.row(x)[..m], &b.row(y)[..m]);
+            let held: f64 = (0..m * m).map(|k| uy[k / m] * z[k] * ux[k % m]).sum();
+            square += held * held;
+            for (k, e) in expected.iter_mut().enumerate() {
+                *e -= held * uy[k / m] * ux[k % m];
+            }
+        }
+        let mut taken = z.clone();
+        let found = bad.take_out(&mut taken, m, [&b, &b], false, &mut Vec::new());
+        assert!((found - square).abs() < 1e-9 * square, "{found} {square}");
+        for (t, e) in taken.iter().zip(&expected) {
+            assert!((t - e).abs() < 1e-9, "{t} {e}");
+        }
     }
 }

@@ -257,3 +257,23 @@ fn leading(matrix: &mut [f64]) -> (f64, Vec<f64>) {
     }
     (value, vector)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::leading;
+
+    #[test]
+    fn the_leading_directions_come_one_after_the_other() {
+        // 9 along (1, 2, 2)/3 and 4 along (2, 1, -2)/3.
+        let (u, v) = ([1.0 / 3.0, 2.0 / 3.0, 2.0 / 3.0], [2.0 / 3.0, 1.0 / 3.0, -2.0 / 3.0]);
+        let mut matrix: Vec<f64> = (0..9)
+            .map(|k| 9.0 * u[k / 3] * u[k % 3] + 4.0 * v[k / 3] * v[k % 3])
+            .collect();
+        for (expected, axis) in [(9.0, u), (4.0, v)] {
+            let (value, direction) = leading(&mut matrix);
+            let along: f64 = direction.iter().zip(axis).map(|(a, b)| a * b).sum();
+            assert!((value - expected).abs() < 1e-6, "{value}");
+            assert!((along.abs() - 1.0).abs() < 1e-6, "{direction:?}");
+        }
+    }
+}
