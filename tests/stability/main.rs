@@ -123,9 +123,13 @@ proptest! {
             _ => 10f64.powf(exponents[k].0) * if exponents[k].1 { 1.0 } else { -0.1 },
         };
         let frame = trial::frame(ndarray::Array2::from_shape_fn(camera.shape(), |(y, x)| value(12 * y + x)));
-        let mut estimator = estimate::build(&estimate::Config::default(), &camera).expect("the default");
-        if let Ok(estimate) = estimator.estimate(&frame) {
-            prop_assert_eq!(trial::faults(&estimate), Vec::<String>::new());
+        let known = estimate::KnownPower { energies_j: vec![1.0], relative_std: 0.1, share: 0.95, attenuation_per_m: 0.0 };
+        for name in ["ml", "map"] {
+            let config = estimate::Config { name: Some(name.into()), known_power: Some(known.clone()), ..Default::default() };
+            let mut estimator = estimate::build(&config, &camera).expect("a rung");
+            if let Ok(estimate) = estimator.estimate(&frame) {
+                prop_assert_eq!(trial::faults(&estimate), Vec::<String>::new());
+            }
         }
     }
 }
