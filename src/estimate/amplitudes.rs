@@ -1,5 +1,6 @@
 //! The linear part of the joint fit: energies at given positions.
 
+use super::atoms::SLOPES;
 use super::fit::Fitter;
 use super::linear::{axpy, cholesky, solve};
 use super::reading::Reading;
@@ -41,7 +42,7 @@ impl Fitter {
             let values = &mut self.scratch;
             values.resize(values.len().max(sources), 0.0);
             for i in 0..sources {
-                values[i] = atoms.at(i, bad.x, bad.y)[0];
+                values[i] = atoms.at(i, [bad.x, bad.y], SLOPES)[0];
             }
             for i in 0..sources {
                 if values[i] != 0.0 {

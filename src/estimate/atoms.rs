@@ -19,6 +19,9 @@ const SMEAR: [(f64, f64); 5] = [
 ];
 const WHOLE: [(f64, f64); 1] = [(0.0, 1.0)];
 
+/// What goes with a spot's energy, x and y.
+pub(super) const SLOPES: [[usize; 2]; 3] = [[0, 0], [1, 0], [0, 1]];
+
 /// Sources in the bases. Spots come first, then background atoms.
 #[derive(Default)]
 pub(super) struct Atoms {
@@ -112,26 +115,16 @@ impl Atoms {
         (if i < n { i * each } else { n * each + i - n }, self.smear(i))
     }
 
-    /// f_x f_y, f′_x f_y and f_x f′_y of source `i` at an unusable pixel.
+    /// Derivatives of source `i` at an unusable pixel, each so many times along x and y.
     #[inline(always)]
-    pub fn at(&self, i: usize, x: usize, y: usize) -> [f64; 3] {
+    pub fn at(&self, i: usize, [x, y]: [usize; 2], derivatives: [[usize; 2]; 3]) -> [f64; 3] {
         let (first, shares) = self.parts(i);
         let mut sum = [0.0; 3];
         for (k, (_, share)) in shares.iter().enumerate() {
             let [fx, fy] = self.parts.at(first + k, x, y);
-            add(&mut sum, *share, [fx[0] * fy[0], fx[1] * fy[0], fx[0] * fy[1]]);
-        }
-        sum
-    }
-
-    /// Second derivatives of source `i` at an unusable pixel: xx, xy, yy.
-    #[inline(always)]
-    pub fn bend_at(&self, i: usize, x: usize, y: usize) -> [f64; 3] {
-        let (first, shares) = self.parts(i);
-        let mut sum = [0.0; 3];
-        for (k, (_, share)) in shares.iter().enumerate() {
-            let [fx, fy] = self.parts.at(first + k, x, y);
-            add(&mut sum, *share, [fx[2] * fy[0], fx[1] * fy[1], fx[0] * fy[2]]);
+            for (s, [a, b]) in sum.iter_mut().zip(derivatives) {
+                *s += share * fx[a] * fy[b];
+            }
         }
         sum
     }
@@ -193,9 +186,9 @@ impl Atoms {
 
     /// The same at an unusable pixel.
     #[inline(always)]
-    pub fn slopes_at(&self, x: usize, y: usize, out: &mut [f64]) {
+    pub fn slopes_at(&self, pixel: [usize; 2], out: &mut [f64]) {
         for i in 0..self.sources {
-            self.set_slope(i, self.at(i, x, y), out);
+            self.set_slope(i, self.at(i, pixel, SLOPES), out);
         }
     }
 

@@ -111,11 +111,11 @@ impl Fitter {
             share(atoms, i, own, cross);
             self.velocity.resize(p, 0.0);
             for bad in reading.bad.scattered() {
-                let at = atoms.bend_at(i, bad.x, bad.y);
+                let at = atoms.at(i, [bad.x, bad.y], SECOND.map(|(second, _)| second));
                 if at == [0.0; 3] {
                     continue;
                 }
-                atoms.slopes_at(bad.x, bad.y, &mut self.velocity);
+                atoms.slopes_at([bad.x, bad.y], &mut self.velocity);
                 for r in 0..3 {
                     axpy(-own[r] * at[r], &self.velocity, &mut cross[r * p..(r + 1) * p]);
                     for c in 0..3 {

@@ -99,7 +99,7 @@ impl Fitter {
         for bad in reading.bad.scattered() {
             let row = &mut self.velocity;
             row.resize(p.max(row.len()), 0.0);
-            atoms.slopes_at(bad.x, bad.y, row);
+            atoms.slopes_at([bad.x, bad.y], row);
             for i in 0..first_width {
                 if row[i] != 0.0 {
                     let s = -row[i];

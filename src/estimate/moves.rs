@@ -4,6 +4,7 @@ use super::bend::Split;
 use super::model::{Model, Nuisances, Spot};
 use super::reading::Reading;
 use super::search::{Search, TRIAL_STEPS};
+use super::spread::WIDE;
 
 /// Steps that a chosen model may take before it is reported.
 const FINAL_STEPS: usize = 200;
@@ -11,8 +12,7 @@ const FINAL_STEPS: usize = 200;
 const SEPARATION: f64 = 2.5;
 /// Spots nearer than this, σ, may be one.
 const MERGE: f64 = 2.5;
-/// Pixels wider than this, σ, make the deviance no parabola: spots nearer than so many of them may be one, whatever the second order says.
-const WIDE: f64 = 2.0;
+/// Where pixels are wide, spots nearer than so many of them may be one, whatever the second order says.
 const MERGE_PIXELS: f64 = 1.6;
 /// Pairs that are tried as one, a round, and where pixels are wide.
 const PAIRS: [usize; 2] = [3, 8];

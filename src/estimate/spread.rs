@@ -11,7 +11,7 @@ use super::model::Spot;
 use super::spot;
 
 /// Pixels wider than this, σ, make the deviance no parabola at any signal-to-noise ratio of interest.
-const WIDE: f64 = 2.0;
+pub(super) const WIDE: f64 = 2.0;
 /// Distance between the places that are tried, and how far to either side of a pixel's edge, σ.
 const STEP: f64 = 0.1;
 const AROUND: f64 = 6.0;

@@ -7,6 +7,7 @@ use super::moves::pairs;
 use super::posterior::LENIENCY;
 use super::reading::Reading;
 use super::search::{Search, TRIAL_STEPS};
+use super::spread::WIDE;
 
 /// How many times tighter energies are held to the known ones, step by step.
 const TIGHT: [f64; 2] = [100.0, 10.0];
@@ -131,8 +132,13 @@ impl Search {
     }
 
     /// Means and covariances of places along the valley that `model` lies in: the position of least squared error is the mean of the
-    /// posterior and not its highest place. `None` where there is no valley.
+    /// posterior and not its highest place. `None` where there is no valley, and where pixels are so wide that each emitter's
+    /// place within its own is averaged over instead.
     pub(super) fn centres(&mut self, reading: &Reading, model: &mut Model) -> Option<Vec<Centre>> {
+        let pitch = self.fitter.bx.pitch().max(self.fitter.by.pitch());
+        if pitch > WIDE {
+            return None;
+        }
         let mut places = self.uncertainty(reading, model);
         let (deviation, direction) = valley(&mut places)?;
         let stops = self.follow(reading, model, deviation, &direction);

@@ -274,7 +274,50 @@ impl Track {
         self.merged = Some(into);
         self.shadows = Some(into);
         self.hit = false;
+        self.note(false);
         // Bounds a track that shadows another one: it lives a few times longer than one lost in the open.
         self.missed_s += 0.2 * dt_s;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn seen(x: f64) -> Detection {
+        Detection {
+            position: Vector2::new(x, 0.0),
+            cov: Matrix2::identity() * 0.01,
+            energy_j: 1.0,
+            flags: crate::estimate::Flags::empty(),
+            moments: Default::default(),
+            snr: 100.0,
+            resolution_m: 2.0,
+            ghost: 1e-4,
+        }
+    }
+
+    #[test]
+    fn one_spot_is_no_evidence_of_a_second_beam() {
+        let mut tracks = Tracks::new(50.0);
+        let mut frame = 0;
+        let mut show = |tracks: &mut Tracks, places: &[f64]| {
+            frame += 1;
+            let time = Timestamp::from_millisecond(100 * frame).unwrap();
+            let detections: Vec<_> = places.iter().map(|&x| seen(x)).collect();
+            tracks.step(time, &detections, 0.1);
+        };
+        for _ in 0..20 {
+            show(&mut tracks, &[0.0, 2.4]);
+        }
+        let [a, b] = [0, 1].map(|k| tracks.all[k].id);
+        show(&mut tracks, &[0.0]);
+        assert_eq!(tracks.get(b).unwrap().shadows, Some(a));
+        // A jump to where the other one was: its own track takes the detection.
+        show(&mut tracks, &[2.4]);
+        let track = tracks.get(b).unwrap();
+        assert!(track.hit && track.shadows == Some(a), "{track:?}");
+        show(&mut tracks, &[0.0, 2.4]);
+        assert_eq!(tracks.get(b).unwrap().shadows, None);
     }
 }
