@@ -1,12 +1,14 @@
 //! The stages of a frame one by one, so that a bench can time each and a test begin at the truth; not part of the interface.
 
-use super::ground;
-use super::model::{Model, Nuisances, Spot};
-use super::power::Prior;
-use super::reading::Reading;
-use super::screen::Screened;
-use super::search::Search;
-use super::{Error, Estimate, KnownPower};
+use crate::estimate::config::KnownPower;
+use crate::estimate::emitter::Estimate;
+use crate::estimate::error::Error;
+use crate::estimate::model::compressed_frame::Reading;
+use crate::estimate::model::hypothesis::{Model, Nuisances, Spot};
+use crate::estimate::model_order::power_prior::Prior;
+use crate::estimate::model_order::search::Search;
+use crate::estimate::preprocess::screening::Screened;
+use crate::estimate::uncertainty::localise;
 use crate::frame::Frame;
 use crate::optics::Camera;
 
@@ -25,7 +27,7 @@ pub struct Stages {
 impl Stages {
     pub fn new(camera: &Camera) -> Self {
         Self {
-            search: Search::new(super::analytic::bases(camera).0),
+            search: Search::new(crate::estimate::estimators::analytic::bases(camera).0),
             camera: camera.clone(),
             frame: Screened::default(),
             reading: Reading::default(),
@@ -87,6 +89,6 @@ impl Stages {
             reading,
             model,
         } = self;
-        ground::locate(search, reading, model, frame, camera, camera.noise_std_j, None)
+        localise::locate(search, reading, model, frame, camera, camera.noise_std_j, None)
     }
 }
