@@ -1,3 +1,5 @@
+//! `[estimator]` and why it may be refused.
+
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
@@ -8,13 +10,13 @@ use crate::estimate::detect::heatmap_network::NetworkError;
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Config {
-    /// A rung of the ladder; the embedded default when left out.
+    /// The name of an estimator; [`crate::estimate::DEFAULT`] when left out.
     pub name: Option<String>,
-    /// ONNX file of the `network` and `hybrid` rungs, its card beside it; the embedded one when left out.
+    /// ONNX file of the `network` and `hybrid` estimators, its card beside it; the embedded one when left out.
     pub network: Option<PathBuf>,
-    /// Time allowed a frame; the best rung finished within it is returned.
+    /// Time allowed a frame, ms; the best hypothesis reached by then is returned.
     pub budget_ms: Option<f64>,
-    /// What the `map` rung may take for known of users' power; `map` without it is `ml` with another price of emitters.
+    /// What the `map` estimator may assume of users' power; without it `map` is `ml`.
     pub known_power: Option<KnownPower>,
 }
 

@@ -22,9 +22,9 @@ mod uncertainty;
 
 pub use config::{Config, ConfigError, KnownPower};
 pub use detect::heatmap_network::NetworkError;
-pub use emitter::{Bend, Emitter, Estimate, Flags};
+pub use emitter::{Emitter, Estimate, Flags, SecondMomentScore};
 pub use error::Error;
 pub use estimator::Estimator;
 pub use estimators::build::build;
-pub use estimators::list::{DEFAULT, LADDER, Learned, Rung, rung};
-pub use uncertainty::cramer_rao::{Beside, Shape, position_bound, position_bound_beside};
+pub use estimators::list::{DEFAULT, ESTIMATORS, EstimatorSpec, Learned, find};
+pub use uncertainty::cramer_rao::{BoundAssumptions, PsfShape, position_bound, position_bound_with};

@@ -1,4 +1,4 @@
-//! The analytic heatmap and its maxima: a matched filter on a fine grid, non-maximum suppression, sub-pixel peaks.
+//! The matched filter on a fine grid and its maxima: non-maximum suppression, sub-grid peaks.
 
 use crate::estimate::dense_linalg::{axpy, dot};
 use crate::estimate::model::svd_basis::Basis;
@@ -6,10 +6,10 @@ use crate::estimate::model::svd_basis::Basis;
 /// Grid spacing, σ: a spot half-way between grid points loses 3 % of its response.
 const SPACING: f64 = 0.5;
 
-/// Half-width of a template, σ: what lies beyond holds 1e-5 of a spot's square.
+/// Half-width of a template, σ: the rest holds 1e-5 of a spot's square.
 const REACH: f64 = 3.0;
 
-/// A maximum of the heatmap.
+/// A maximum of the response.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Peak {
     /// Sub-pixel position, σ.
@@ -23,7 +23,7 @@ pub(crate) struct Peak {
 }
 
 /// The matched filter: unit-norm spots on a grid, in the bases.
-pub(crate) struct Heatmap {
+pub(crate) struct MatchedFilter {
     grid: [Vec<f64>; 2],
     /// (grid, stride), each row of unit norm over the full basis.
     templates: [Vec<f64>; 2],
@@ -37,11 +37,11 @@ pub(crate) struct Heatmap {
     peaks: Vec<Peak>,
 }
 
-impl Heatmap {
+impl MatchedFilter {
     pub fn new(bx: &Basis, by: &Basis) -> Self {
         let axis = |b: &Basis| {
-            // Centres up to half a σ outside; beyond that only a fit can tell.
-            // Inside a pixel much wider than the spot all places look alike: a grid of σ would be endless and say no more.
+            // Centres up to half a σ outside; farther out only a fit can place them.
+            // Within a pixel much wider than the spot the response is constant: a grid of σ would only cost memory.
             let spacing = SPACING.max(0.25 * b.pitch());
             let (lo, hi) = (b.edges[0] - spacing, b.edges[b.n] + spacing);
             let count = ((hi - lo) / spacing).ceil() as usize + 1;
@@ -51,12 +51,12 @@ impl Heatmap {
             let mut templates = vec![0.0; count * b.stride];
             let mut norms = Vec::with_capacity(count);
             let mut spans = Vec::with_capacity(count);
-            let (mut scratch, mut atom) = (vec![0.0; 3 * b.n], vec![0.0; 3 * b.stride]);
+            let (mut scratch, mut profile) = (vec![0.0; 3 * b.n], vec![0.0; 3 * b.stride]);
             for (k, row) in templates.chunks_exact_mut(b.stride).enumerate() {
-                let span = b.atom(grid[k], 1.0, REACH, b.stride, &mut scratch, &mut atom);
+                let span = b.profile(grid[k], 1.0, REACH, b.stride, &mut scratch, &mut profile);
                 spans.push([span.start, span.end]);
-                let norm = dot(&atom[..b.stride], &atom[..b.stride]).sqrt().max(1e-12);
-                for (t, a) in row.iter_mut().zip(&atom) {
+                let norm = dot(&profile[..b.stride], &profile[..b.stride]).sqrt().max(1e-12);
+                for (t, a) in row.iter_mut().zip(&profile) {
                     *t = a / norm;
                 }
                 norms.push(norm);
@@ -86,7 +86,7 @@ impl Heatmap {
     /// Fills the map with the response to `residual`.
     pub fn respond(&mut self, residual: &[f64], mx: usize, my: usize) {
         pulp::Arch::new().dispatch(Filter {
-            heatmap: self,
+            matched_filter: self,
             residual,
             mx,
             my,
@@ -171,7 +171,7 @@ impl Heatmap {
 }
 
 struct Filter<'a> {
-    heatmap: &'a mut Heatmap,
+    matched_filter: &'a mut MatchedFilter,
     residual: &'a [f64],
     mx: usize,
     my: usize,
@@ -182,6 +182,6 @@ impl pulp::NullaryFnOnce for Filter<'_> {
 
     #[inline(always)]
     fn call(self) {
-        self.heatmap.filter(self.residual, self.mx, self.my);
+        self.matched_filter.filter(self.residual, self.mx, self.my);
     }
 }

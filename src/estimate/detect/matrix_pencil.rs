@@ -1,4 +1,4 @@
-//! Seeds for overlapping spots: the half-kernel matrix pencil.
+//! Starting positions for overlapping spots: the half-kernel matrix pencil.
 //!
 //! With half-coordinates x_i, Y(x_i + x_j)·exp(−(x_i − x_j)²/2s²) = Σ A_k v_k(i) v_k(j) with v_k(i) = exp(−(x_i − x_k/2)²/s²):
 //! a Gaussian mixture becomes a symmetric matrix of rank N whose vectors shift into each other,
@@ -11,63 +11,63 @@ use faer::{Mat, Side};
 use rand::SeedableRng;
 use rand_distr::{Distribution, StandardNormal};
 
-use crate::estimate::model::compressed_frame::Reading;
+use crate::estimate::model::compressed_frame::CompressedFrame;
 use crate::estimate::model::psf_table;
 use crate::estimate::model::svd_basis::Basis;
 
 /// Samples along an axis, odd so that every one is used, and their spacing, σ, where that gives a number in between.
 const SAMPLES: [usize; 2] = [11, 15];
 const SPACING: f64 = 0.33;
-/// Centres at which samples are held to the Gaussian, a σ.
+/// Centres per σ at which the sampling map is fitted to the Gaussian.
 const CENTRES: f64 = 8.0;
-/// Sensors up to so many σ wide are for the pencil, and where they have so many pixels at least, up to the second.
+/// Widest sensors, σ, for which the pencil is the main way to a hypothesis, and, with at least `FINE` pixels, a first try.
 const WIDEST: [f64; 2] = [13.0, 16.0];
 const FINE: usize = 30;
-/// Where a basis leaves out so few of an array's pixels, its last columns only amplify the noise: samples are held to the
-/// Gaussian no better than that of a bright spot lets them.
+/// Where a basis leaves out at most this many of an array's pixels, its last columns only amplify the noise: the map is regularised
+/// by this much instead of the basis's own error.
 const NEARLY: usize = 4;
 const FAINTEST: f64 = 1e-5;
-/// Frames of noise by which singular values are judged.
+/// Simulated frames of noise that set the scale of the singular values.
 const DRAWS: usize = 6;
-/// The mix of the two shifts whose eigenvectors are taken; any generic one does.
+/// The linear combination of the two shifts whose eigenvectors are taken; any generic one does.
 const MIX: [f64; 2] = [0.37, 0.63];
 
-/// Turns a frame in the bases into samples of a mixture of unit Gaussians: what pixels integrate is taken back.
-pub(crate) struct Sampler {
+/// Maps a frame's coefficients to samples of a mixture of unit Gaussians, which undoes the pixels' integration.
+pub(crate) struct PencilSampler {
     count: [usize; 2],
     /// Spacing and first sample, σ.
     spacing: [f64; 2],
     first: [f64; 2],
-    rules: Vec<Rule>,
+    rules: Vec<SamplingMap>,
 }
 
 /// The map from coefficients to samples for one pair of ranks.
-struct Rule {
+struct SamplingMap {
     rank: [usize; 2],
     /// (samples, rank) along each axis.
     maps: [Mat<f64>; 2],
-    /// Largest singular value that noise alone reaches.
+    /// Mean largest singular value of noise alone.
     noise: f64,
 }
 
-/// The frame's signal subspace, from which seeds for any number of emitters can be had.
-pub(crate) struct Pencil {
+/// The frame's signal subspace, which gives starting positions for any number of emitters.
+pub(crate) struct MatrixPencil {
     vectors: Mat<f64>,
-    /// Singular values over what noise alone reaches, falling.
-    pub strength: Vec<f64>,
+    /// Singular values over that of noise alone, falling.
+    pub singular_value_ratio: Vec<f64>,
     half: [usize; 2],
     spacing: [f64; 2],
     first: [f64; 2],
 }
 
-impl Sampler {
+impl PencilSampler {
     /// `None` where spots are too small against the sensor for the pencil to resolve them with few samples.
     pub fn new(bx: &Basis, by: &Basis) -> Option<Self> {
         Self::up_to(WIDEST[0], 4, bx, by)
     }
 
-    /// Where spots mostly stand apart, and the pencil is the quickest way only to those that do not.
-    pub fn for_a_look(bx: &Basis, by: &Basis) -> Option<Self> {
+    /// For sensors where spots mostly stand apart and the pencil is only tried first.
+    pub fn for_pencil_start(bx: &Basis, by: &Basis) -> Option<Self> {
         let melted = Self::new(bx, by);
         if melted.is_some() {
             None
@@ -103,13 +103,13 @@ impl Sampler {
         self.count.map(|c| c.div_ceil(2))
     }
 
-    /// The rule for the ranks of `reading`, made where there is none yet.
-    fn rule(&mut self, reading: &Reading, bx: &Basis, by: &Basis) -> &Rule {
-        let rank = [reading.mx, reading.my];
+    /// The sampling map for the ranks of `compressed`, made on first use.
+    fn rule(&mut self, compressed: &CompressedFrame, bx: &Basis, by: &Basis) -> &SamplingMap {
+        let rank = [compressed.mx, compressed.my];
         let known = self.rules.iter().position(|r| r.rank == rank);
         let index = known.unwrap_or_else(|| {
             let maps = [self.map(0, bx, rank[0]), self.map(1, by, rank[1])];
-            let mut rule = Rule { rank, maps, noise: 1.0 };
+            let mut rule = SamplingMap { rank, maps, noise: 1.0 };
             // The same draws for every camera and run.
             let mut rng = rand_chacha::ChaCha8Rng::seed_from_u64(0);
             let mut sum = 0.0;
@@ -127,18 +127,18 @@ impl Sampler {
         &self.rules[index]
     }
 
-    /// Least squares over all centres, held back where only noise would be amplified.
+    /// Least squares over all centres, regularised where only noise would be amplified.
     fn map(&self, k: usize, basis: &Basis, rank: usize) -> Mat<f64> {
-        let (lo, hi) = (basis.lowest(), basis.highest());
+        let (lo, hi) = (basis.min_position(), basis.max_position());
         let centres = ((hi - lo) * CENTRES).ceil() as usize + 1;
         let at = |j: usize| lo + (hi - lo) * j as f64 / (centres - 1) as f64;
         let mut scratch = vec![0.0; 3 * basis.n.max(rank)];
         let mut atoms = Mat::<f64>::zeros(centres + rank, rank);
-        let mut atom = vec![0.0; 3 * rank];
+        let mut profile = vec![0.0; 3 * rank];
         for j in 0..centres {
-            basis.atom(at(j), 1.0, psf_table::REACH, rank, &mut scratch, &mut atom);
+            basis.profile(at(j), 1.0, psf_table::REACH, rank, &mut scratch, &mut profile);
             for c in 0..rank {
-                atoms[(j, c)] = atom[c];
+                atoms[(j, c)] = profile[c];
             }
         }
         let least = if rank + NEARLY >= basis.n { FAINTEST } else { 1e-14 };
@@ -153,7 +153,7 @@ impl Sampler {
         atoms.qr().solve_lstsq(&samples).transpose().to_owned()
     }
 
-    fn half_kernel(&self, rule: &Rule, z: faer::MatRef<f64>) -> Mat<f64> {
+    fn half_kernel(&self, rule: &SamplingMap, z: faer::MatRef<f64>) -> Mat<f64> {
         let samples = &rule.maps[1] * z * rule.maps[0].transpose();
         let half = self.half();
         let size = half[0] * half[1];
@@ -170,19 +170,19 @@ impl Sampler {
     }
 
     /// Analyses a frame.
-    pub fn analyse(&mut self, reading: &Reading, bx: &Basis, by: &Basis) -> Option<Pencil> {
-        self.rule(reading, bx, by);
-        let rank = [reading.mx, reading.my];
+    pub fn analyse(&mut self, compressed: &CompressedFrame, bx: &Basis, by: &Basis) -> Option<MatrixPencil> {
+        self.rule(compressed, bx, by);
+        let rank = [compressed.mx, compressed.my];
         let rule = self.rules.iter().find(|r| r.rank == rank)?;
-        let z = faer::MatRef::from_row_major_slice(&reading.z, reading.my, reading.mx);
+        let z = faer::MatRef::from_row_major_slice(&compressed.coefficients, compressed.my, compressed.mx);
         let eigen = self.half_kernel(rule, z).self_adjoint_eigen(Side::Lower).ok()?;
         let half = self.half();
         let size = half[0] * half[1];
         let vectors = Mat::from_fn(size, size, |r, c| eigen.U()[(r, size - 1 - c)]);
-        let strength = (0..size).map(|c| eigen.S()[size - 1 - c] / rule.noise).collect();
-        Some(Pencil {
+        let singular_value_ratio = (0..size).map(|c| eigen.S()[size - 1 - c] / rule.noise).collect();
+        Some(MatrixPencil {
             vectors,
-            strength,
+            singular_value_ratio,
             half,
             spacing: self.spacing,
             first: self.first,
@@ -190,8 +190,8 @@ impl Sampler {
     }
 }
 
-impl Pencil {
-    /// Most emitters that can be told apart.
+impl MatrixPencil {
+    /// Most emitters that can be resolved.
     pub fn most(&self) -> usize {
         ((self.half[0] - 1) * self.half[1]).min((self.half[1] - 1) * self.half[0])
     }
@@ -261,7 +261,7 @@ mod tests {
     use crate::optics::Axis;
 
     #[test]
-    fn recovers_melted_spots_without_noise() {
+    fn recovers_overlapping_spots_without_noise() {
         let basis = || Basis::new(&Axis::centred(60, 0.03), 0.008);
         let (bx, by) = (basis(), basis());
         let truth = [[-1.1, 0.7], [0.2, 0.9], [1.3, -1.2], [-0.4, -0.8]];
@@ -287,15 +287,15 @@ mod tests {
                 }
             }
         }
-        let frame = crate::estimate::preprocess::screening::Screened {
-            is_bad: vec![false; pixels.len()],
+        let frame = crate::estimate::preprocess::screening::PreprocessedFrame {
+            is_masked: vec![false; pixels.len()],
             pixels,
             ..Default::default()
         };
-        let mut reading = Reading::default();
-        reading.load(&frame, &bx, &by);
-        let mut sampler = Sampler::new(&bx, &by).unwrap();
-        let pencil = sampler.analyse(&reading, &bx, &by).unwrap();
+        let mut compressed = CompressedFrame::default();
+        compressed.load(&frame, &bx, &by);
+        let mut sampler = PencilSampler::new(&bx, &by).unwrap();
+        let pencil = sampler.analyse(&compressed, &bx, &by).unwrap();
         let seeds = pencil.seeds(4).unwrap();
         for t in truth {
             let nearest = seeds

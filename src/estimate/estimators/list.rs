@@ -1,10 +1,10 @@
-//! The ladder of estimators: what each rung does, and building one from a config.
+//! The list of estimators: what each one does, cheapest first.
 
 use crate::estimate::config::ConfigError;
 
-/// A rung of the ladder.
+/// An estimator without a learned part, by name.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Rung {
+pub struct EstimatorSpec {
     /// What `[estimator] name` selects it by.
     pub name: &'static str,
     pub summary: &'static str,
@@ -20,16 +20,16 @@ pub(crate) enum Method {
     MaximumPosterior,
 }
 
-impl Rung {
+impl EstimatorSpec {
     /// Whether the number of emitters is chosen by the frame's likelihood.
-    pub(crate) fn is_ordering(&self) -> bool {
+    pub(crate) fn chooses_order(&self) -> bool {
         matches!(self.method, Method::MaximumLikelihood | Method::MaximumPosterior)
     }
 }
 
-/// Every rung offered, cheapest first.
-pub const LADDER: &[Rung] = &[
-    Rung {
+/// Every estimator without a learned part, cheapest first.
+pub const ESTIMATORS: &[EstimatorSpec] = &[
+    EstimatorSpec {
         name: "peak",
         summary: "maxima of the matched filter on its grid, after non-maximum suppression",
         method: Method::Peak {
@@ -37,7 +37,7 @@ pub const LADDER: &[Rung] = &[
             steps: 0,
         },
     },
-    Rung {
+    EstimatorSpec {
         name: "subpixel-peak",
         summary: "the same with a parabola through each maximum",
         method: Method::Peak {
@@ -45,7 +45,7 @@ pub const LADDER: &[Rung] = &[
             steps: 0,
         },
     },
-    Rung {
+    EstimatorSpec {
         name: "peak-fit",
         summary: "the same, and five steps of the joint fit",
         method: Method::Peak {
@@ -53,37 +53,37 @@ pub const LADDER: &[Rung] = &[
             steps: 5,
         },
     },
-    Rung {
+    EstimatorSpec {
         name: "greedy-fit",
         summary: "residual peaks added one round at a time, all emitters refitted jointly",
         method: Method::Greedy,
     },
-    Rung {
+    EstimatorSpec {
         name: "pencil",
         summary: "half-kernel matrix pencil where spots overlap, amplitudes by least squares",
         method: Method::Pencil { steps: 0 },
     },
-    Rung {
+    EstimatorSpec {
         name: "pencil-fit",
         summary: "the pencil's seeds and five steps of the joint fit",
         method: Method::Pencil { steps: 5 },
     },
-    Rung {
+    EstimatorSpec {
         name: "ml",
         summary: "maximum likelihood: pencil or greedy seeds, moves, the number of emitters by a false-alarm test",
         method: Method::MaximumLikelihood,
     },
-    Rung {
+    EstimatorSpec {
         name: "map",
         summary: "the same, then the most probable hypothesis where users' power is known (`[estimator.known_power]`)",
         method: Method::MaximumPosterior,
     },
 ];
 
-/// The rung used when none is named.
+/// The estimator used when none is named.
 pub const DEFAULT: &str = "ml";
 
-/// A rung that a network stands in front of.
+/// An estimator that begins with a heatmap network.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Learned {
     /// The heatmap's maxima as they are.
@@ -113,7 +113,7 @@ impl Learned {
 
 fn names() -> String {
     let learned = Learned::ALL.iter().map(|l| l.name());
-    LADDER
+    ESTIMATORS
         .iter()
         .map(|r| r.name)
         .chain(learned)
@@ -121,15 +121,15 @@ fn names() -> String {
         .join(", ")
 }
 
-/// The rung of that name.
-pub fn rung(name: &str) -> Result<&'static Rung, ConfigError> {
-    LADDER
+/// The estimator of that name; an error names the nearest one.
+pub fn find(name: &str) -> Result<&'static EstimatorSpec, ConfigError> {
+    ESTIMATORS
         .iter()
         .find(|r| r.name == name)
         .ok_or_else(|| ConfigError::UnknownName {
             found: name.to_owned(),
             known: names(),
-            nearest: LADDER
+            nearest: ESTIMATORS
                 .iter()
                 .map(|r| r.name)
                 .max_by(|a, b| strsim::jaro_winkler(name, a).total_cmp(&strsim::jaro_winkler(name, b)))

@@ -1,4 +1,4 @@
-//! Undoes what the calibration says of the pixels before an estimator sees them.
+//! Corrects a frame's gains and dark levels by the calibration before an estimator sees it.
 
 use std::sync::Arc;
 
@@ -8,15 +8,15 @@ use crate::estimate::estimator::Estimator;
 use crate::frame::Frame;
 use crate::optics::PixelMaps;
 
-/// An estimator behind a camera's pixel maps.
-pub(crate) struct Corrected {
+/// An estimator that is given corrected frames.
+pub(crate) struct PixelCorrected {
     inner: Box<dyn Estimator>,
     maps: Arc<PixelMaps>,
     saturation_j: Option<f64>,
     frame: Option<Frame>,
 }
 
-impl Corrected {
+impl PixelCorrected {
     pub fn new(inner: Box<dyn Estimator>, maps: Arc<PixelMaps>, saturation_j: Option<f64>) -> Self {
         Self {
             inner,
@@ -27,7 +27,7 @@ impl Corrected {
     }
 }
 
-impl Estimator for Corrected {
+impl Estimator for PixelCorrected {
     fn name(&self) -> &'static str {
         self.inner.name()
     }

@@ -1,4 +1,4 @@
-//! The fit never ends worse than it began, wherever it begins.
+//! Property: a fit never ends with a larger deviance than it began with.
 
 use ndarray::Array2;
 use proptest::prelude::*;
@@ -6,11 +6,11 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 
-use crate::estimate::fit::levenberg_marquardt::{Fitter, MOST_STEPS, TOGETHER};
-use crate::estimate::model::compressed_frame::Reading;
-use crate::estimate::model::hypothesis::{Model, Nuisances, Spot, Width};
+use crate::estimate::fit::levenberg_marquardt::{Fitter, JOINT_STEPS, MAX_STEP_FACTOR};
+use crate::estimate::model::compressed_frame::CompressedFrame;
+use crate::estimate::model::hypothesis::{Hypothesis, Nuisances, PointSource, Width};
 use crate::estimate::model::svd_basis::Basis;
-use crate::estimate::preprocess::screening::Screened;
+use crate::estimate::preprocess::screening::PreprocessedFrame;
 use crate::frame::Frame;
 use crate::optics::{Config, psf};
 
@@ -44,26 +44,26 @@ proptest! {
         }
         holes.iter().for_each(|&h| pixels[[h / 16, h % 16]] = f64::NAN);
         let frame = Frame { index: 0, time: jiff::Timestamp::UNIX_EPOCH, pixels, masked: None };
-        let mut screened = Screened::default();
-        screened.load(&frame, &camera).expect("a usable frame");
+        let mut preprocessed = PreprocessedFrame::default();
+        preprocessed.load(&frame, &camera).expect("a usable frame");
         let [bx, by] = [&camera.x, &camera.y].map(|axis| Basis::new(axis, sigma));
-        let mut reading = Reading::default();
-        reading.load(&screened, &bx, &by);
+        let mut compressed = CompressedFrame::default();
+        compressed.load(&preprocessed, &bx, &by);
         let mut fitter = Fitter::new(bx, by);
-        let mut model = Model::empty(Nuisances {
+        let mut hypothesis = Hypothesis::empty(Nuisances {
             background,
-            width: [Width::Known, Width::Common, Width::PerAxis, Width::Turned][usize::from(width)],
+            width: [Width::Known, Width::Common, Width::PerAxis, Width::RotatedEllipse][usize::from(width)],
         });
-        model.spots = start.iter().map(|(x, y, e)| Spot::new([x * half / sigma, y * half / sigma], 10f64.powf(*e))).collect();
-        fitter.restart(None);
-        fitter.fit(&reading, &mut model, 0);
-        let before = model.deviance;
-        fitter.fit(&reading, &mut model, steps);
-        let after = model.deviance;
+        hypothesis.sources = start.iter().map(|(x, y, e)| PointSource::new([x * half / sigma, y * half / sigma], 10f64.powf(*e))).collect();
+        fitter.reset(None);
+        fitter.fit(&compressed, &mut hypothesis, 0);
+        let before = hypothesis.deviance;
+        fitter.fit(&compressed, &mut hypothesis, steps);
+        let after = hypothesis.deviance;
         prop_assert!(after.is_finite() && after <= before, "{after} after {before}");
-        // What it says of where it ended is what an evaluation there gives.
-        fitter.fit(&reading, &mut model, 0);
-        prop_assert!((model.deviance - after).abs() <= 1e-9 * (1.0 + before.abs()), "{} is said to be {after}", model.deviance);
-        prop_assert!(fitter.steps <= (MOST_STEPS * (steps + TOGETHER)) as u64);
+        // The reported deviance is that of the reported parameters.
+        fitter.fit(&compressed, &mut hypothesis, 0);
+        prop_assert!((hypothesis.deviance - after).abs() <= 1e-9 * (1.0 + before.abs()), "{} is said to be {after}", hypothesis.deviance);
+        prop_assert!(fitter.steps <= (MAX_STEP_FACTOR * (steps + JOINT_STEPS)) as u64);
     }
 }

@@ -1,77 +1,79 @@
-//! The joint fit of all emitters and nuisances to one reading: Levenberg–Marquardt in separable form.
+//! The joint fit of all sources and nuisances to one compressed frame: Levenberg–Marquardt in separable form.
 //!
 //! A frame is F_y·diag(A)·F_xᵀ, so a residual costs O(m² N) and the normal equations are Hadamard products of small
 //! Gram matrices, O(m N²) (Golub and Pereyra, 1973, for separable least squares). Steps carry geodesic acceleration
-//! (Transtrum and Sethna, 2012, eq. 14), amplitudes are solved anew at each trial, and unusable pixels are taken out of
-//! the normal equations again, which is exact whatever they were filled with.
+//! (Transtrum and Sethna, 2012, eq. 14), amplitudes are solved by linear least squares at each trial, and masked pixels are
+//! removed by a downdate, which is exact whatever they were filled with.
 //!
-//! In the pixel bases every source is touched only where it holds light, and pixels may have weights of their own.
+//! In the pixel bases every component is evaluated only within its reach, and pixels may have weights of their own.
 
 use std::time::Instant;
 
 use crate::estimate::dense_linalg::dot;
 use crate::estimate::fit::source_groups;
-use crate::estimate::fit::work_budget::BEYOND;
-use crate::estimate::model::compressed_frame::Reading;
-use crate::estimate::model::hypothesis::{Model, Nuisances, pull};
-use crate::estimate::model::separable_model::{self, Atoms};
+use crate::estimate::fit::work_budget::OVERRUN;
+use crate::estimate::model::compressed_frame::CompressedFrame;
+use crate::estimate::model::hypothesis::{Hypothesis, Nuisances, prior_penalty};
+use crate::estimate::model::separable_model::{self, SeparableModel};
 use crate::estimate::model::svd_basis::Basis;
-use crate::estimate::uncertainty::posterior_mean::Tether;
+use crate::estimate::uncertainty::posterior_mean::ProfileConstraint;
 
+/// Damping λ: first value, and range.
 const LAMBDA_START: f64 = 1e-3;
 const LAMBDA_FLOOR: f64 = 1e-14;
 const LAMBDA_CEILING: f64 = 1e10;
-/// A fit has converged after two drops of the deviance below this.
-const SMALL_DROP: f64 = 1e-3;
-/// A fit has also converged where the next step promises less than this.
-const NO_DROP: f64 = 1e-4;
-/// Spots farther apart than this, σ, along either axis need no curved steps.
-const OVERLAP: f64 = 3.0;
-/// A bar is out of reach when this many times the drop that a quadratic promises does not get there.
-const HOPE: f64 = 5.0;
-/// A deviance of this many times its expectation says that emitters are missing; the last digits of the others matter little then.
-const FAR_OFF: f64 = 100.0;
-/// So far off, a fit ends after so many steps in a row that each bring less than this share of the deviance.
-const IDLE: f64 = 1e-2;
-const IDLE_STEPS: usize = 3;
-/// A fit goes on past its steps, up to so many times as many, while the last one taken brought more than this share.
-const BRISK: f64 = 0.2;
-pub(crate) const MOST_STEPS: usize = 8;
-/// Steps of all emitters together before those that still move are fitted alone, and how often.
-pub(crate) const TOGETHER: usize = 2;
-const PARTINGS: usize = 2;
+/// Converged after two successive decreases of the deviance below this.
+const CONVERGED_DECREASE: f64 = 1e-3;
+/// Converged when the predicted decrease of the next step is below this.
+const NEGLIGIBLE_DECREASE: f64 = 1e-4;
+/// Sources farther apart than this, σ, along either axis need no geodesic acceleration.
+const ACCELERATION_DISTANCE: f64 = 3.0;
+/// Aborts when this many times the predicted decrease misses the acceptance threshold.
+const ABORT_FACTOR: f64 = 5.0;
+/// From this many times the expected deviance on, sources are missing and the others need no more digits: stalled steps end the fit.
+const POOR_FIT_FACTOR: f64 = 100.0;
+/// A poor fit ends after `STALLED_STEPS` successive steps that each decrease the deviance by less than this share.
+const STALLED_SHARE: f64 = 1e-2;
+const STALLED_STEPS: usize = 3;
+/// A fit exceeds its number of steps, up to `MAX_STEP_FACTOR` times, while each decreases the deviance by more than this share.
+const FAST_SHARE: f64 = 0.2;
+pub(crate) const MAX_STEP_FACTOR: usize = 8;
+/// Steps of all sources together before only the groups that still move are fitted, and how often that is tried.
+pub(crate) const JOINT_STEPS: usize = 2;
+const MAX_REGROUPINGS: usize = 2;
+
 /// The fit's scratch memory. Grows to the largest problem seen and then allocates nothing.
 pub(crate) struct Fitter {
     pub bx: Basis,
     pub by: Basis,
     pub(crate) backgrounds: [[Vec<f64>; 2]; 2],
-    pub(crate) now: Atoms,
-    pub(crate) trial: Atoms,
+    pub(crate) current: SeparableModel,
+    pub(crate) trial: SeparableModel,
     /// Weighted residual, (my, mx).
     pub(crate) residual: Vec<f64>,
     trial_residual: Vec<f64>,
-    /// The frame's derivatives in the widths and the turn, (my, mx), plain and weighted.
-    pub(crate) broadening: [Vec<f64>; 3],
-    pub(crate) weighted: Vec<f64>,
-    /// Where the spots are held together on a line through their places, if they are.
-    pub tether: Option<Tether>,
+    /// The predicted frame's derivatives in the widths and the covariance between the axes, (my, mx), plain and weighted.
+    pub(crate) width_derivatives: [Vec<f64>; 3],
+    pub(crate) weighted_derivative: Vec<f64>,
+    /// Holds the positions near a hyperplane, if set.
+    pub profile_constraint: Option<ProfileConstraint>,
     pub(crate) hessian: Vec<f64>,
     pub(crate) factor: Vec<f64>,
     pub(crate) gradient: Vec<f64>,
     pub(crate) velocity: Vec<f64>,
     pub(crate) acceleration: Vec<f64>,
-    pub(crate) bend: Vec<f64>,
+    pub(crate) second_derivative: Vec<f64>,
     pub(crate) scratch: Vec<f64>,
     pub(crate) strip: Vec<f64>,
-    pub(crate) small: Vec<f64>,
-    pub(crate) active: Vec<bool>,
-    /// Multiplications since the last frame, and the time it must be done by.
+    pub(crate) amplitude_gram: Vec<f64>,
+    pub(crate) is_free: Vec<bool>,
+    /// Multiplications spent on this frame.
     pub(crate) work: f64,
-    /// Work that must not be exceeded, whatever the hypotheses.
-    pub(crate) limit: f64,
-    /// Sources of the largest hypothesis since.
-    pub(crate) most_sources: f64,
-    /// Steps since.
+    /// Limit of the work, whatever the hypotheses.
+    pub(crate) work_limit: f64,
+    /// Components of the largest hypothesis of this frame.
+    pub(crate) max_components: f64,
+    /// Steps spent on this frame.
     pub steps: u64,
     pub(crate) deadline: Option<Instant>,
 }
@@ -83,248 +85,286 @@ impl Fitter {
             backgrounds: [separable_model::background(&bx), separable_model::background(&by)],
             bx,
             by,
-            now: Atoms::default(),
-            trial: Atoms::default(),
+            current: SeparableModel::default(),
+            trial: SeparableModel::default(),
             residual: Vec::new(),
             trial_residual: Vec::new(),
-            broadening: Default::default(),
-            weighted: Vec::new(),
-            tether: None,
+            width_derivatives: Default::default(),
+            weighted_derivative: Vec::new(),
+            profile_constraint: None,
             hessian: Vec::new(),
             factor: Vec::new(),
             gradient: Vec::new(),
             velocity: Vec::new(),
             acceleration: Vec::new(),
-            bend: Vec::new(),
+            second_derivative: Vec::new(),
             scratch,
             strip: Vec::new(),
-            small: Vec::new(),
-            active: Vec::new(),
+            amplitude_gram: Vec::new(),
+            is_free: Vec::new(),
             work: 0.0,
-            limit: f64::INFINITY,
-            most_sources: 0.0,
+            work_limit: f64::INFINITY,
+            max_components: 0.0,
             steps: 0,
             deadline: None,
         }
     }
 
-    /// Fits `model` from where it stands, at most `steps` steps, and up to [`MOST_STEPS`] times as many while each brings much.
-    pub fn fit(&mut self, reading: &Reading, model: &mut Model, steps: usize) {
-        self.fit_below(reading, model, steps, f64::INFINITY);
+    /// Fits `hypothesis` from where it stands, at most `steps` steps, and up to [`MAX_STEP_FACTOR`] times as many while each is large.
+    pub fn fit(&mut self, compressed: &CompressedFrame, hypothesis: &mut Hypothesis, steps: usize) {
+        self.fit_below(compressed, hypothesis, steps, f64::INFINITY);
     }
 
-    /// The same, given up as soon as a deviance below `bar` is out of reach.
-    pub fn fit_below(&mut self, reading: &Reading, model: &mut Model, steps: usize, bar: f64) {
+    /// [`Self::fit`], aborted as soon as a deviance below `acceptance_threshold` is out of reach.
+    pub fn fit_below(
+        &mut self,
+        compressed: &CompressedFrame,
+        hypothesis: &mut Hypothesis,
+        steps: usize,
+        acceptance_threshold: f64,
+    ) {
         let last = self.steps + steps as u64;
-        for _ in 0..PARTINGS {
-            if self.tether.is_some() || self.steps + TOGETHER as u64 >= last {
+        for _ in 0..MAX_REGROUPINGS {
+            if self.profile_constraint.is_some() || self.steps + JOINT_STEPS as u64 >= last {
                 break;
             }
-            let Some(groups) = model.groups() else { break };
-            if !self.dispatch(reading, model, TOGETHER, bar) || model.converged {
+            let Some(groups) = hypothesis.source_groups() else {
+                break;
+            };
+            if !self.run_dispatched(compressed, hypothesis, JOINT_STEPS, acceptance_threshold) || hypothesis.converged {
                 return;
             }
-            let Some(moving) = self.moving(&groups) else { break };
-            let rest = self.part(reading, &moving);
-            let mut part = source_groups::only(model, &moving);
+            let Some(active) = self.active_set(&groups) else { break };
+            let rest = self.restrict_frame(compressed, &active);
+            let mut subset = source_groups::restrict_hypothesis(hypothesis, &active);
             let left = last.saturating_sub(self.steps) as usize;
-            let goes_on = self.dispatch(&rest, &mut part, left, bar);
-            for (&i, spot) in moving.iter().zip(&part.spots) {
-                model.spots[i] = *spot;
+            let is_completed = self.run_dispatched(&rest, &mut subset, left, acceptance_threshold);
+            for (&i, source) in active.iter().zip(&subset.sources) {
+                hypothesis.sources[i] = *source;
             }
-            if !goes_on {
-                model.deviance = part.deviance;
+            if !is_completed {
+                hypothesis.deviance = subset.deviance;
                 return;
             }
         }
         let left = last.saturating_sub(self.steps) as usize;
-        self.dispatch(reading, model, left, bar);
+        self.run_dispatched(compressed, hypothesis, left, acceptance_threshold);
     }
 
-    /// `false` where the fit is given up.
-    fn dispatch(&mut self, reading: &Reading, model: &mut Model, steps: usize, bar: f64) -> bool {
+    /// `false` where the fit was aborted.
+    fn run_dispatched(
+        &mut self,
+        compressed: &CompressedFrame,
+        hypothesis: &mut Hypothesis,
+        steps: usize,
+        acceptance_threshold: f64,
+    ) -> bool {
         pulp::Arch::new().dispatch(Job {
             fitter: self,
-            reading,
-            model,
+            compressed,
+            hypothesis,
             steps,
-            bar,
+            acceptance_threshold,
             wants_information: false,
         })
     }
 
-    /// Sets the information matrix at `model` over (x, y, energy) of each spot, then nuisances; units σ and noise. Row-major,
-    /// upper triangle; see `Model::parameters`.
-    pub fn information(&mut self, reading: &Reading, model: &mut Model) {
+    /// Sets the information matrix at `hypothesis` over (x, y, energy) of each source, then nuisances; units σ and noise. Row-major,
+    /// upper triangle; see `Hypothesis::parameters`.
+    pub fn compute_information(&mut self, compressed: &CompressedFrame, hypothesis: &mut Hypothesis) {
         pulp::Arch::new().dispatch(Job {
             fitter: self,
-            reading,
-            model,
+            compressed,
+            hypothesis,
             steps: 0,
-            bar: f64::INFINITY,
+            acceptance_threshold: f64::INFINITY,
             wants_information: true,
         });
     }
 
-    /// Weighted residual of `model` in the bases, (my, mx), with the deviance set.
-    pub fn residual_of(&mut self, reading: &Reading, model: &mut Model) -> &[f64] {
-        self.fit(reading, model, 0);
+    /// Weighted residual of `hypothesis` in the bases, (my, mx), with the deviance set.
+    pub fn weighted_residual(&mut self, compressed: &CompressedFrame, hypothesis: &mut Hypothesis) -> &[f64] {
+        self.fit(compressed, hypothesis, 0);
         &self.residual
     }
 
-    /// What `model` expects of the frame, (my, mx).
-    pub fn expectation(&mut self, reading: &Reading, model: &mut Model) -> Vec<f64> {
-        self.fit(reading, model, 0);
-        let mut sum = vec![0.0; reading.mx * reading.my];
-        for i in 0..self.now.sources() {
-            self.now.add(i, 0, 0, self.now.amplitude(i), &mut sum);
+    /// The light that `hypothesis` predicts, (my, mx).
+    pub fn expected_light(&mut self, compressed: &CompressedFrame, hypothesis: &mut Hypothesis) -> Vec<f64> {
+        self.fit(compressed, hypothesis, 0);
+        let mut sum = vec![0.0; compressed.mx * compressed.my];
+        for i in 0..self.current.components() {
+            self.current.accumulate(i, 0, 0, self.current.amplitude(i), &mut sum);
         }
         sum
     }
 
-    /// `false` where it is given up.
+    /// `false` where the fit was aborted.
     #[inline(always)]
-    fn run(&mut self, reading: &Reading, model: &mut Model, steps: usize, bar: f64) -> bool {
-        let nuisances = model.nuisances;
-        self.now.spots.clone_from(&model.spots);
-        self.now.background = model.background;
-        self.now.width = model.width;
-        self.now.turn = model.turn;
-        for s in &mut self.now.spots {
-            s.u[0] = s.u[0].clamp(self.bx.lowest(), self.bx.highest());
-            s.u[1] = s.u[1].clamp(self.by.lowest(), self.by.highest());
+    fn iterate(
+        &mut self,
+        compressed: &CompressedFrame,
+        hypothesis: &mut Hypothesis,
+        steps: usize,
+        acceptance_threshold: f64,
+    ) -> bool {
+        let nuisances = hypothesis.nuisances;
+        self.current.sources.clone_from(&hypothesis.sources);
+        self.current.background = hypothesis.background;
+        self.current.width = hypothesis.width;
+        self.current.covariance_xy = hypothesis.covariance_xy;
+        for s in &mut self.current.sources {
+            s.u[0] = s.u[0].clamp(self.bx.min_position(), self.bx.max_position());
+            s.u[1] = s.u[1].clamp(self.by.min_position(), self.by.max_position());
         }
-        let mut deviance = self.evaluate(reading, nuisances, false);
-        let parameters = model.parameters();
+        let mut deviance = self.evaluate(compressed, nuisances, false);
+        let parameters = hypothesis.parameters();
         let mut lambda = LAMBDA_START;
-        let mut small_drops = 0;
-        let mut converged = parameters == nuisances.background_atoms();
-        let mut fresh = false;
-        let overlap = self.now.spots.iter().enumerate().any(|(i, s)| {
-            self.now.spots[..i]
-                .iter()
-                .any(|t| (s.u[0] - t.u[0]).abs() < OVERLAP && (s.u[1] - t.u[1]).abs() < OVERLAP)
+        let mut small_decreases = 0;
+        let mut converged = parameters == nuisances.background_terms();
+        let mut is_linearised = false;
+        let has_overlap = self.current.sources.iter().enumerate().any(|(i, s)| {
+            self.current.sources[..i].iter().any(|t| {
+                (s.u[0] - t.u[0]).abs() < ACCELERATION_DISTANCE && (s.u[1] - t.u[1]).abs() < ACCELERATION_DISTANCE
+            })
         });
-        let mut goes_on = true;
-        let mut is_brisk = false;
-        let mut idle = 0;
-        for k in 0..MOST_STEPS * steps {
-            if converged || k >= steps && !is_brisk || idle >= IDLE_STEPS {
+        let mut is_completed = true;
+        let mut is_fast = false;
+        let mut stalled = 0;
+        for k in 0..MAX_STEP_FACTOR * steps {
+            if converged || k >= steps && !is_fast || stalled >= STALLED_STEPS {
                 break;
             }
-            if self.work > BEYOND * self.most_work() {
-                goes_on = false;
+            if self.work > OVERRUN * self.max_work() {
+                is_completed = false;
                 break;
             }
-            self.most_sources = self.most_sources.max(self.now.sources() as f64);
-            self.work += self.step_work(reading);
+            self.max_components = self.max_components.max(self.current.components() as f64);
+            self.work += self.step_cost(compressed);
             self.steps += 1;
-            if !fresh {
-                self.linearise(reading, nuisances);
-                fresh = true;
+            if !is_linearised {
+                self.compute_normal_equations(compressed, nuisances);
+                is_linearised = true;
             }
-            let moved = self.step(reading, nuisances, lambda, overlap);
+            let moved = self.step(compressed, nuisances, lambda, has_overlap);
             if moved && lambda <= LAMBDA_START {
                 let expected = dot(&self.velocity[..parameters], &self.gradient[..parameters]);
-                if expected < NO_DROP {
+                if expected < NEGLIGIBLE_DECREASE {
                     converged = true;
                     break;
                 }
-                let is_hopeless = |drop: f64| deviance - HOPE * drop > bar;
-                // Damping hides what lies along a narrow valley.
-                if is_hopeless(expected) && is_hopeless(self.promise(parameters)) {
-                    goes_on = false;
+                let is_unreachable = |decrease: f64| deviance - ABORT_FACTOR * decrease > acceptance_threshold;
+                // Damping hides the decrease along ill-determined directions.
+                if is_unreachable(expected) && is_unreachable(self.predicted_decrease(parameters)) {
+                    is_completed = false;
                     break;
                 }
             }
             let accepted = moved && {
-                let next = self.evaluate(reading, nuisances, true);
-                let drop = deviance - next;
-                if drop >= 0.0 {
-                    small_drops = if drop < SMALL_DROP && lambda < 1e-3 {
-                        small_drops + 1
+                let next = self.evaluate(compressed, nuisances, true);
+                let decrease = deviance - next;
+                if decrease >= 0.0 {
+                    small_decreases = if decrease < CONVERGED_DECREASE && lambda < 1e-3 {
+                        small_decreases + 1
                     } else {
                         0
                     };
-                    let is_far = next > FAR_OFF * reading.numbers;
-                    is_brisk = drop > BRISK * deviance;
-                    idle = if is_far && drop < IDLE * deviance { idle + 1 } else { 0 };
+                    let is_poor_fit = next > POOR_FIT_FACTOR * compressed.data_count;
+                    is_fast = decrease > FAST_SHARE * deviance;
+                    stalled = if is_poor_fit && decrease < STALLED_SHARE * deviance {
+                        stalled + 1
+                    } else {
+                        0
+                    };
                     deviance = next;
                 }
-                drop >= 0.0
+                decrease >= 0.0
             };
             if accepted {
-                std::mem::swap(&mut self.now, &mut self.trial);
+                std::mem::swap(&mut self.current, &mut self.trial);
                 std::mem::swap(&mut self.residual, &mut self.trial_residual);
                 lambda = (lambda * 0.15).max(LAMBDA_FLOOR);
-                fresh = false;
-                converged = small_drops >= 2;
+                is_linearised = false;
+                converged = small_decreases >= 2;
             } else {
                 lambda *= 4.0;
-                // Rounding, not curvature, is what refuses a step this short.
+                // Steps this short fail by rounding, not by curvature.
                 if lambda > LAMBDA_CEILING {
                     converged = true;
                 }
             }
         }
-        model.spots.clone_from(&self.now.spots);
-        model.background = self.now.background;
-        model.width = self.now.width;
-        model.turn = self.now.turn;
-        model.deviance = deviance - pull(&model.spots) - self.strain(&model.spots);
-        // A fit of no steps only evaluates: it says nothing new about convergence.
-        model.converged = converged || steps == 0 && model.converged;
-        goes_on
+        hypothesis.sources.clone_from(&self.current.sources);
+        hypothesis.background = self.current.background;
+        hypothesis.width = self.current.width;
+        hypothesis.covariance_xy = self.current.covariance_xy;
+        hypothesis.deviance =
+            deviance - prior_penalty(&hypothesis.sources) - self.constraint_deviance(&hypothesis.sources);
+        // A fit of no steps only evaluates the deviance.
+        hypothesis.converged = converged || steps == 0 && hypothesis.converged;
+        is_completed
     }
 
-    /// Places the atoms of the present or the trial hypothesis, solves their amplitudes, and returns the deviance.
+    /// Evaluates the current or the trial model, solves its amplitudes, and returns the penalised deviance.
     #[inline(always)]
-    fn evaluate(&mut self, reading: &Reading, nuisances: Nuisances, is_trial: bool) -> f64 {
-        let atoms = if is_trial { &mut self.trial } else { &mut self.now };
+    fn evaluate(&mut self, compressed: &CompressedFrame, nuisances: Nuisances, is_trial: bool) -> f64 {
+        let separable = if is_trial { &mut self.trial } else { &mut self.current };
         let backgrounds = [&self.backgrounds[0], &self.backgrounds[1]];
-        atoms.place([&self.bx, &self.by], backgrounds, reading, nuisances, &mut self.scratch);
-        self.solve_amplitudes(reading, is_trial);
-        let spots = if is_trial { &self.trial.spots } else { &self.now.spots };
-        pull(spots) + self.strain(spots) + self.subtract(reading, is_trial)
+        separable.place(
+            [&self.bx, &self.by],
+            backgrounds,
+            compressed,
+            nuisances,
+            &mut self.scratch,
+        );
+        self.solve_amplitudes(compressed, is_trial);
+        let sources = if is_trial {
+            &self.trial.sources
+        } else {
+            &self.current.sources
+        };
+        prior_penalty(sources) + self.constraint_deviance(sources) + self.compute_residual(compressed, is_trial)
     }
 
-    /// Weighted residual and deviance of the present or the trial hypothesis.
+    /// Sets the weighted residual of the current or the trial model and returns its deviance.
     #[inline(always)]
-    fn subtract(&mut self, reading: &Reading, is_trial: bool) -> f64 {
-        let (atoms, residual) = if is_trial {
+    fn compute_residual(&mut self, compressed: &CompressedFrame, is_trial: bool) -> f64 {
+        let (separable, residual) = if is_trial {
             (&self.trial, &mut self.trial_residual)
         } else {
-            (&self.now, &mut self.residual)
+            (&self.current, &mut self.residual)
         };
         residual.clear();
-        residual.extend_from_slice(&reading.z);
-        for i in 0..atoms.sources() {
-            atoms.add(i, 0, 0, -atoms.amplitude(i), residual);
+        residual.extend_from_slice(&compressed.coefficients);
+        for i in 0..separable.components() {
+            separable.accumulate(i, 0, 0, -separable.amplitude(i), residual);
         }
-        reading.weight(residual, [&self.bx, &self.by], true, &mut self.scratch)
+        compressed.apply_weights(residual, [&self.bx, &self.by], true, &mut self.scratch)
     }
 }
 
 struct Job<'a> {
     fitter: &'a mut Fitter,
-    reading: &'a Reading,
-    model: &'a mut Model,
+    compressed: &'a CompressedFrame,
+    hypothesis: &'a mut Hypothesis,
     steps: usize,
-    bar: f64,
+    acceptance_threshold: f64,
     wants_information: bool,
 }
 
 impl pulp::NullaryFnOnce for Job<'_> {
-    /// `false` where the fit was given up.
+    /// `false` where the fit was aborted.
     type Output = bool;
 
     #[inline(always)]
     fn call(self) -> bool {
-        let goes_on = self.fitter.run(self.reading, self.model, self.steps, self.bar);
+        let is_completed = self
+            .fitter
+            .iterate(self.compressed, self.hypothesis, self.steps, self.acceptance_threshold);
         if self.wants_information {
-            self.fitter.work += self.fitter.step_work(self.reading);
-            self.fitter.linearise(self.reading, self.model.nuisances);
+            self.fitter.work += self.fitter.step_cost(self.compressed);
+            self.fitter
+                .compute_normal_equations(self.compressed, self.hypothesis.nuisances);
         }
-        goes_on
+        is_completed
     }
 }

@@ -1,31 +1,31 @@
-//! The normal equations: a hypothesis's gradient and information.
+//! The normal equations: gradient and information matrix of a hypothesis.
 
 use crate::estimate::dense_linalg::{axpy, dot};
 use crate::estimate::fit::levenberg_marquardt::Fitter;
-use crate::estimate::model::compressed_frame::Reading;
+use crate::estimate::model::compressed_frame::CompressedFrame;
 use crate::estimate::model::hypothesis::Nuisances;
 
 impl Fitter {
-    /// Gradient Jᵀr and information JᵀJ at the present hypothesis.
+    /// Sets gradient Jᵀr and information JᵀJ of the current model.
     #[inline(always)]
-    pub(crate) fn linearise(&mut self, reading: &Reading, nuisances: Nuisances) {
-        let (mx, my) = (reading.mx, reading.my);
-        let n = self.now.spots.len();
+    pub(crate) fn compute_normal_equations(&mut self, compressed: &CompressedFrame, nuisances: Nuisances) {
+        let (mx, my) = (compressed.mx, compressed.my);
+        let n = self.current.sources.len();
         let p = 3 * n + nuisances.count();
-        let atoms = &self.now;
-        let sources = atoms.sources();
+        let separable = &self.current;
+        let components = separable.components();
         let h = &mut self.hessian;
         h.resize(p * p, 0.0);
         let g = &mut self.gradient;
         g.resize(p.max(g.len()), 0.0);
-        let runs = reading.bad.runs();
-        for i in 0..sources {
-            let ai = atoms.amplitude(i);
-            for j in i..sources {
-                let aj = atoms.amplitude(j);
-                let mut c = atoms.couple(i, j, &reading.weights, &mut self.strip);
+        let runs = compressed.masked.runs();
+        for i in 0..components {
+            let ai = separable.amplitude(i);
+            for j in i..components {
+                let aj = separable.amplitude(j);
+                let mut c = separable.gram_block(i, j, &compressed.weights, &mut self.strip);
                 if !runs.is_empty() {
-                    let taken = atoms.couple_at(i, j, runs, &mut self.strip);
+                    let taken = separable.gram_block_over_runs(i, j, runs, &mut self.strip);
                     for k in 0..9 {
                         c[k] -= taken[k];
                     }
@@ -55,51 +55,51 @@ impl Fitter {
                 }
             }
         }
-        atoms.slopes(&self.residual, &mut self.strip, &mut g[..p]);
-        for (i, spot) in atoms.spots.iter().enumerate() {
-            if let Some(power) = spot.power {
+        separable.transposed_jacobian_times(&self.residual, &mut self.strip, &mut g[..p]);
+        for (i, source) in separable.sources.iter().enumerate() {
+            if let Some(power) = source.power {
                 h[(3 * i + 2) * (p + 1)] += power.precision;
-                g[3 * i + 2] += power.precision * (power.mean - spot.a);
+                g[3 * i + 2] += power.precision * (power.mean - source.a);
             }
         }
-        if let Some(tether) = &self.tether {
-            tether.linearise(&atoms.spots, g, h, p);
+        if let Some(profile_constraint) = &self.profile_constraint {
+            profile_constraint.add_normal_equations(&separable.sources, g, h, p);
         }
         let widths = nuisances.widths();
         let first_width = p - widths;
-        for d in &mut self.broadening[..widths] {
+        for d in &mut self.width_derivatives[..widths] {
             d.clear();
             d.resize(mx * my, 0.0);
         }
-        // ∂/∂ln w of a spot is w² f″ (the heat equation).
+        // ∂/∂ln w of a source is w² f″ (the heat equation).
         for i in 0..if widths > 0 { n } else { 0 } {
-            let [ax, ay] = atoms.width.map(|w| atoms.spots[i].a * w * w);
-            atoms.add(i, 2, 0, ax, &mut self.broadening[0]);
-            atoms.add(i, 0, 2, ay, &mut self.broadening[(widths - 1).min(1)]);
+            let [ax, ay] = separable.width.map(|w| separable.sources[i].a * w * w);
+            separable.accumulate(i, 2, 0, ax, &mut self.width_derivatives[0]);
+            separable.accumulate(i, 0, 2, ay, &mut self.width_derivatives[(widths - 1).min(1)]);
             if widths > 2 {
-                atoms.add(i, 1, 1, atoms.spots[i].a, &mut self.broadening[2]);
+                separable.accumulate(i, 1, 1, separable.sources[i].a, &mut self.width_derivatives[2]);
             }
         }
         for w in 0..widths {
-            let weighted = &mut self.weighted;
-            weighted.clone_from(&self.broadening[w]);
-            reading.weight(weighted, [&self.bx, &self.by], false, &mut self.scratch);
+            let weighted = &mut self.weighted_derivative;
+            weighted.clone_from(&self.width_derivatives[w]);
+            compressed.apply_weights(weighted, [&self.bx, &self.by], false, &mut self.scratch);
             let column = first_width + w;
             let shared = &mut self.velocity;
             shared.resize(p.max(shared.len()), 0.0);
-            atoms.slopes(weighted, &mut self.strip, shared);
+            separable.transposed_jacobian_times(weighted, &mut self.strip, shared);
             for i in 0..first_width {
                 h[i * p + column] = shared[i];
             }
             for v in 0..=w {
-                h[(first_width + v) * p + column] = dot(weighted, &self.broadening[v]);
+                h[(first_width + v) * p + column] = dot(weighted, &self.width_derivatives[v]);
             }
-            g[first_width + w] = dot(&self.broadening[w], &self.residual);
+            g[first_width + w] = dot(&self.width_derivatives[w], &self.residual);
         }
-        for bad in reading.bad.scattered() {
+        for bad in compressed.masked.scattered() {
             let row = &mut self.velocity;
             row.resize(p.max(row.len()), 0.0);
-            atoms.slopes_at([bad.x, bad.y], row);
+            separable.jacobian_row_at([bad.x, bad.y], row);
             for i in 0..first_width {
                 if row[i] != 0.0 {
                     let s = -row[i];

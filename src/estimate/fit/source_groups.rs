@@ -1,33 +1,33 @@
-//! The emitters that still move, fitted alone: groups of others, at rest meanwhile and far from them, are taken out of the frame.
+//! Source grouping: groups that no longer move are subtracted from the frame, and only the active set is fitted on.
 
 use crate::estimate::fit::levenberg_marquardt::Fitter;
-use crate::estimate::model::compressed_frame::Reading;
-use crate::estimate::model::hypothesis::{Model, Nuisances, Spot};
+use crate::estimate::model::compressed_frame::CompressedFrame;
+use crate::estimate::model::hypothesis::{Hypothesis, Nuisances, PointSource};
 
-/// A spot is at rest when the square of a step, over its variance, is below this.
-const REST: f64 = 1e-2;
-/// Emitters from which on a fit is worth parting.
-const FEWEST: usize = 4;
-/// Spots nearer than this, σ, move together.
-const TIED: f64 = 4.0;
+/// A source is at rest when its squared step over the step's variance is below this.
+const AT_REST: f64 = 1e-2;
+/// Fewest sources for which grouping pays.
+const MIN_SOURCES: usize = 4;
+/// Sources within this distance, σ, belong to one group.
+const GROUP_DISTANCE: f64 = 4.0;
 
-impl Model {
-    /// Its emitters in groups that can be fitted one without the other; `None` where they cannot.
-    pub(crate) fn groups(&self) -> Option<Vec<Vec<usize>>> {
-        let n = self.spots.len();
-        if n < FEWEST || self.nuisances != Nuisances::default() || self.spots.iter().any(|s| s.power.is_some()) {
+impl Hypothesis {
+    /// The sources in groups that can be fitted separately (single linkage); `None` where there is one group, or parameters are shared.
+    pub(crate) fn source_groups(&self) -> Option<Vec<Vec<usize>>> {
+        let n = self.sources.len();
+        if n < MIN_SOURCES || self.nuisances != Nuisances::default() || self.sources.iter().any(|s| s.power.is_some()) {
             return None;
         }
-        let is_tied = |i: usize, j: usize| {
-            let d = [0, 1].map(|k| self.spots[i].u[k] - self.spots[j].u[k]);
-            d[0].hypot(d[1]) < TIED
+        let is_linked = |i: usize, j: usize| {
+            let d = [0, 1].map(|k| self.sources[i].u[k] - self.sources[j].u[k]);
+            d[0].hypot(d[1]) < GROUP_DISTANCE
         };
         let mut groups: Vec<Vec<usize>> = Vec::new();
         for i in 0..n {
-            let (tied, mut apart): (Vec<_>, Vec<_>) = groups
+            let (linked, mut apart): (Vec<_>, Vec<_>) = groups
                 .into_iter()
-                .partition(|g: &Vec<usize>| g.iter().any(|&j| is_tied(i, j)));
-            let mut group = tied.concat();
+                .partition(|g: &Vec<usize>| g.iter().any(|&j| is_linked(i, j)));
+            let mut group = linked.concat();
             group.push(i);
             apart.push(group);
             groups = apart;
@@ -37,39 +37,42 @@ impl Model {
 }
 
 impl Fitter {
-    /// The spots of groups that the last step moved, where they are no more than half of all; `None` also without a step.
-    pub(crate) fn moving(&self, groups: &[Vec<usize>]) -> Option<Vec<usize>> {
-        let n = self.now.spots.len();
+    /// The sources of groups that the last step moved; `None` without a step, and where they are more than half of all.
+    pub(crate) fn active_set(&self, groups: &[Vec<usize>]) -> Option<Vec<usize>> {
+        let n = self.current.sources.len();
         if self.velocity.len() != 3 * n {
             return None;
         }
-        let is_moving = |i: usize| {
+        let is_active = |i: usize| {
             let along = |k: usize| self.hessian[(3 * i + k) * (3 * n + 1)] * self.velocity[3 * i + k].powi(2);
-            !(along(0) + along(1) < REST)
+            !(along(0) + along(1) < AT_REST)
         };
-        let moving: Vec<usize> = groups
+        let active: Vec<usize> = groups
             .iter()
-            .filter(|g| g.iter().any(|&i| is_moving(i)))
+            .filter(|g| g.iter().any(|&i| is_active(i)))
             .flatten()
             .copied()
             .collect();
-        (!moving.is_empty() && 2 * moving.len() <= n).then_some(moving)
+        (!active.is_empty() && 2 * active.len() <= n).then_some(active)
     }
 
-    /// What `reading` shows of the spots at `kept`, without the others of the present hypothesis.
-    pub(crate) fn part(&self, reading: &Reading, kept: &[usize]) -> Reading {
-        let mut part = reading.clone();
-        for i in (0..self.now.spots.len()).filter(|i| !kept.contains(i)) {
-            let amplitude = self.now.amplitude(i);
-            self.now.add(i, 0, 0, -amplitude, &mut part.z);
+    /// `compressed` less all sources of the current model but those at `kept`.
+    pub(crate) fn restrict_frame(&self, compressed: &CompressedFrame, kept: &[usize]) -> CompressedFrame {
+        let mut subset = compressed.clone();
+        for i in (0..self.current.sources.len()).filter(|i| !kept.contains(i)) {
+            let amplitude = self.current.amplitude(i);
+            self.current.accumulate(i, 0, 0, -amplitude, &mut subset.coefficients);
         }
-        part.reweight([&self.bx, &self.by]);
-        part
+        subset.update_weighted([&self.bx, &self.by]);
+        subset
     }
 }
 
-/// The spots of `model` at `kept`.
-pub(crate) fn only(model: &Model, kept: &[usize]) -> Model {
-    let spots: Vec<Spot> = kept.iter().map(|&i| model.spots[i]).collect();
-    Model { spots, ..model.clone() }
+/// The sources of `hypothesis` at `kept`.
+pub(crate) fn restrict_hypothesis(hypothesis: &Hypothesis, kept: &[usize]) -> Hypothesis {
+    let sources: Vec<PointSource> = kept.iter().map(|&i| hypothesis.sources[i]).collect();
+    Hypothesis {
+        sources,
+        ..hypothesis.clone()
+    }
 }

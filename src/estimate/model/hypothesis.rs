@@ -1,35 +1,35 @@
-//! A hypothesis about a frame: its emitters and what is fitted beside them.
+//! A hypothesis about a frame: its point sources and nuisance parameters.
 
-/// A user's energy in units of the noise: mean and precision of a normal density.
+/// Normal prior of a source's energy where it is assigned to a user, in units of the noise.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct Power {
+pub(crate) struct EnergyPrior {
     pub mean: f64,
     pub precision: f64,
 }
 
-impl Power {
+impl EnergyPrior {
     /// Squared distance of an energy in standard deviations.
-    pub fn pull(&self, a: f64) -> f64 {
+    pub fn prior_penalty(&self, a: f64) -> f64 {
         (a - self.mean).powi(2) * self.precision
     }
 }
 
-/// An emitter on the sensor: centre in σ, energy in units of the noise.
+/// An emitter on the sensor: centre `u` in σ, energy `a` in units of the noise.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub(crate) struct Spot {
+pub(crate) struct PointSource {
     pub u: [f64; 2],
     pub a: f64,
-    /// What is known of its energy where it is taken for a user's.
-    pub power: Option<Power>,
+    /// Prior of its energy, if it is assigned to a user.
+    pub power: Option<EnergyPrior>,
 }
 
-impl Spot {
+impl PointSource {
     pub fn new(u: [f64; 2], a: f64) -> Self {
         Self { u, a, power: None }
     }
 }
 
-/// What is fitted beside the emitters.
+/// Nuisance parameters fitted beside the sources.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) struct Nuisances {
     /// A constant and two slopes.
@@ -37,19 +37,19 @@ pub(crate) struct Nuisances {
     pub width: Width,
 }
 
-/// Whether the spot's width is known.
+/// Which widths of the common PSF are fitted.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) enum Width {
     #[default]
     Known,
     Common,
     PerAxis,
-    /// The same with a covariance between the axes: an ellipse that is turned against them.
-    Turned,
+    /// Both widths and the covariance between the axes: a rotated ellipse.
+    RotatedEllipse,
 }
 
 impl Nuisances {
-    pub fn background_atoms(self) -> usize {
+    pub fn background_terms(self) -> usize {
         if self.background { 3 } else { 0 }
     }
 
@@ -58,69 +58,69 @@ impl Nuisances {
             Width::Known => 0,
             Width::Common => 1,
             Width::PerAxis => 2,
-            Width::Turned => 3,
+            Width::RotatedEllipse => 3,
         }
     }
 
     pub fn count(self) -> usize {
-        self.background_atoms() + self.widths()
+        self.background_terms() + self.widths()
     }
 }
 
 #[derive(Clone, Debug)]
-pub(crate) struct Model {
-    pub spots: Vec<Spot>,
+pub(crate) struct Hypothesis {
+    pub sources: Vec<PointSource>,
     pub nuisances: Nuisances,
     pub background: [f64; 3],
-    /// Relative to the configured σ.
+    /// Widths along x and y, relative to the configured σ.
     pub width: [f64; 2],
-    /// The spot's covariance between the axes, σ².
-    pub turn: f64,
-    /// Squared residual over the usable numbers, in units of the noise.
+    /// The PSF's covariance between the axes, σ².
+    pub covariance_xy: f64,
+    /// Squared residual over the usable data, in units of the noise.
     pub deviance: f64,
-    /// What the number of emitters costs where known powers are weighed in.
-    pub occam: f64,
+    /// −2 ln of the Occam factor and the prior of the number of sources; 0 without a power prior.
+    pub log_evidence_term: f64,
     pub converged: bool,
 }
 
-impl Model {
+impl Hypothesis {
     pub fn empty(nuisances: Nuisances) -> Self {
         Self {
-            spots: Vec::new(),
+            sources: Vec::new(),
             nuisances,
             background: [0.0; 3],
             width: [1.0; 2],
-            turn: 0.0,
+            covariance_xy: 0.0,
             deviance: f64::INFINITY,
-            occam: 0.0,
+            log_evidence_term: 0.0,
             converged: false,
         }
     }
 
-    /// Takes out all nuisances but these.
-    pub fn confine(&mut self, nuisances: Nuisances) {
+    /// Removes all nuisances but these.
+    pub fn restrict_nuisances(&mut self, nuisances: Nuisances) {
         self.nuisances = nuisances;
         if nuisances.width == Width::Known {
             self.width = [1.0; 2];
         }
-        if nuisances.width != Width::Turned {
-            self.turn = 0.0;
+        if nuisances.width != Width::RotatedEllipse {
+            self.covariance_xy = 0.0;
         }
         if !nuisances.background {
             self.background = [0.0; 3];
         }
     }
 
-    /// Squared distances of the energies from what is known of them, in standard deviations.
-    pub fn pull(&self) -> f64 {
-        pull(&self.spots)
+    /// Squared distances of the energies from their priors' means, in standard deviations.
+    pub fn prior_penalty(&self) -> f64 {
+        prior_penalty(&self.sources)
     }
 
     pub fn parameters(&self) -> usize {
-        3 * self.spots.len() + self.nuisances.count()
+        3 * self.sources.len() + self.nuisances.count()
     }
 }
 
-pub(crate) fn pull(spots: &[Spot]) -> f64 {
-    spots.iter().filter_map(|s| Some(s.power?.pull(s.a))).sum()
+pub(crate) fn prior_penalty(sources: &[PointSource]) -> f64 {
+    sources.iter().filter_map(|s| Some(s.power?.prior_penalty(s.a))).sum()
 }

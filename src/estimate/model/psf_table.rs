@@ -1,4 +1,4 @@
-//! The spot along one axis in units of σ: pixel fractions with first and second derivatives, from tables of Φ and φ.
+//! The PSF along one axis in units of σ: pixel fractions with first and second derivatives, from tables of Φ and φ.
 //!
 //! Absolute accuracy 1e-15, which is what a fit needs; `optics::psf` is the reference with relative accuracy in
 //! the tails.
@@ -48,7 +48,7 @@ fn normal(table: &[[f64; 2]], t: f64) -> (f64, f64) {
 
 /// Writes f, f′, f″ (derivatives in the centre) of a spot of relative width `w` at `u` for the pixels between
 /// `edges`, as far out as `reach` widths; all in units of σ. `f.len() + 1 == edges.len()`. Returns the range of pixels
-/// that hold anything; outside it nothing is written.
+/// that are non-zero; outside it nothing is written.
 #[inline(always)]
 pub(crate) fn profile(
     edges: &[f64],

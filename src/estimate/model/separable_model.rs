@@ -1,16 +1,16 @@
-//! The sources of a hypothesis: spots, then background atoms, each a sum of separable parts.
+//! The predicted frame of a hypothesis: components (sources, then background terms), each a sum of separable terms.
 //!
-//! An upright spot is one part. One whose ellipse is turned against the axes is no product of profiles: it is an upright one
-//! smeared along a diagonal, and Gauss–Hermite quadrature (Abramowitz and Stegun, 1964, 25.4.46) makes that a sum of few.
+//! A source whose PSF is aligned with the axes is one term. A rotated ellipse is no product of profiles: it is an aligned PSF smeared
+//! along a diagonal, which Gauss–Hermite quadrature (Abramowitz and Stegun, 1964, 25.4.46) turns into a sum of five.
 
-use crate::estimate::model::compressed_frame::Reading;
-use crate::estimate::model::hypothesis::{Nuisances, Spot};
-use crate::estimate::model::separable_terms::Parts;
+use crate::estimate::model::compressed_frame::CompressedFrame;
+use crate::estimate::model::hypothesis::{Nuisances, PointSource};
+use crate::estimate::model::separable_terms::SeparableTerms;
 use crate::estimate::model::svd_basis::Basis;
 use crate::estimate::preprocess::masked_pixels::Run;
 
-/// Places along the smear, in its σ, and their shares; exact for the first nine moments.
-const SMEAR: [(f64, f64); 5] = [
+/// Nodes in σ of the smear, and weights; exact for the first nine moments.
+const QUADRATURE: [(f64, f64); 5] = [
     (0.0, 0.533_333_333_333_333_3),
     (1.355_626_179_974_266, 0.222_075_922_005_612_66),
     (-1.355_626_179_974_266, 0.222_075_922_005_612_66),
@@ -19,23 +19,23 @@ const SMEAR: [(f64, f64); 5] = [
 ];
 const WHOLE: [(f64, f64); 1] = [(0.0, 1.0)];
 
-/// What goes with a spot's energy, x and y.
+/// Orders of the derivatives along x and y that go with a source's energy, x and y.
 pub(crate) const SLOPES: [[usize; 2]; 3] = [[0, 0], [1, 0], [0, 1]];
 
-/// Sources in the bases. Spots come first, then background atoms.
+/// Components in the bases: sources first, then background terms.
 #[derive(Default)]
-pub(crate) struct Atoms {
-    pub spots: Vec<Spot>,
+pub(crate) struct SeparableModel {
+    pub sources: Vec<PointSource>,
     pub background: [f64; 3],
     /// Relative to the configured σ.
     pub width: [f64; 2],
-    /// The spots' covariance between the axes, σ².
-    pub turn: f64,
-    sources: usize,
-    parts: Parts,
+    /// The sources' covariance between the axes, σ².
+    pub covariance_xy: f64,
+    components: usize,
+    terms: SeparableTerms,
 }
 
-/// Constant and sloped profiles along one axis, of about a spot's norm, so that the normal equations are well scaled.
+/// Constant and sloped profiles along one axis, of about a source's norm, so that the normal equations are well scaled.
 pub(crate) fn background(b: &Basis) -> [Vec<f64>; 2] {
     let (half, norm) = (0.5 * b.n as f64, (b.n as f64).sqrt());
     let mut pair = [vec![0.0; b.stride], vec![0.0; b.stride]];
@@ -44,84 +44,88 @@ pub(crate) fn background(b: &Basis) -> [Vec<f64>; 2] {
     pair
 }
 
-impl Atoms {
-    pub fn sources(&self) -> usize {
-        self.sources
+impl SeparableModel {
+    pub fn components(&self) -> usize {
+        self.components
     }
 
-    /// Numbers that all sources touch together.
+    /// Numbers within all components' spans together: the cost of one pass over them.
     pub fn footprint(&self) -> f64 {
-        self.parts.footprint()
+        self.terms.footprint()
     }
 
-    /// Products that a spot is a sum of.
-    pub fn parts_a_spot(&self) -> f64 {
-        self.smear(0).len() as f64
+    /// Separable terms of a source.
+    pub fn terms_per_source(&self) -> f64 {
+        self.quadrature(0).len() as f64
     }
 
-    /// Amplitude of a source.
+    /// Amplitude of a component.
     #[inline(always)]
     pub fn amplitude(&self, i: usize) -> f64 {
-        let n = self.spots.len();
-        if i < n { self.spots[i].a } else { self.background[i - n] }
+        let n = self.sources.len();
+        if i < n {
+            self.sources[i].a
+        } else {
+            self.background[i - n]
+        }
     }
 
-    /// Fills the atoms for the present spots, shape and kinds of background.
+    /// Evaluates all terms for the present sources, widths and background.
     #[inline(always)]
     pub fn place(
         &mut self,
         axes: [&Basis; 2],
         backgrounds: [&[Vec<f64>; 2]; 2],
-        reading: &Reading,
+        compressed: &CompressedFrame,
         nuisances: Nuisances,
         scratch: &mut [f64],
     ) {
-        let n = self.spots.len();
-        let smear = self.smear(0);
-        self.sources = n + nuisances.background_atoms();
-        let count = n * smear.len() + nuisances.background_atoms();
-        self.parts.clear(count, reading.mx, reading.my);
-        let along = self.turn.abs().sqrt();
-        let width = self.width.map(|w| (w * w - self.turn.abs()).max(0.0).sqrt());
-        for s in &self.spots {
-            for (t, _) in smear {
-                let u = [s.u[0] + t * along, s.u[1] + t * along * self.turn.signum()];
-                self.parts.push(axes, u, width, reading.reach, scratch);
+        let n = self.sources.len();
+        let quadrature = self.quadrature(0);
+        self.components = n + nuisances.background_terms();
+        let count = n * quadrature.len() + nuisances.background_terms();
+        self.terms.clear(count, compressed.mx, compressed.my);
+        let along = self.covariance_xy.abs().sqrt();
+        let width = self.width.map(|w| (w * w - self.covariance_xy.abs()).max(0.0).sqrt());
+        for s in &self.sources {
+            for (t, _) in quadrature {
+                let u = [s.u[0] + t * along, s.u[1] + t * along * self.covariance_xy.signum()];
+                self.terms.push(axes, u, width, compressed.reach, scratch);
             }
         }
-        for b in 0..nuisances.background_atoms() {
+        for b in 0..nuisances.background_terms() {
             let kinds = [usize::from(b == 1), usize::from(b == 2)];
-            self.parts
-                .push_flat([0, 1].map(|k| backgrounds[k][kinds[k]].as_slice()));
+            self.terms
+                .push_profiles([0, 1].map(|k| backgrounds[k][kinds[k]].as_slice()));
         }
-        self.parts.expand(axes, &reading.bad.lines);
+        self.terms.evaluate_lines(axes, &compressed.masked.lines);
     }
 
-    /// The parts' places and shares in a source.
+    /// Nodes and weights of a component's terms.
     #[inline(always)]
-    fn smear(&self, i: usize) -> &'static [(f64, f64)] {
-        if self.turn != 0.0 && i < self.spots.len() {
-            &SMEAR
+    fn quadrature(&self, i: usize) -> &'static [(f64, f64)] {
+        if self.covariance_xy != 0.0 && i < self.sources.len() {
+            &QUADRATURE
         } else {
             &WHOLE
         }
     }
 
-    /// A source's first part, and the shares of all of them in it.
+    /// A component's first term, and the nodes and weights of all of its terms.
     #[inline(always)]
-    fn parts(&self, i: usize) -> (usize, &'static [(f64, f64)]) {
-        let n = self.spots.len();
-        let each = self.smear(0).len();
-        (if i < n { i * each } else { n * each + i - n }, self.smear(i))
+    fn terms(&self, i: usize) -> (usize, &'static [(f64, f64)]) {
+        let n = self.sources.len();
+        let each = self.quadrature(0).len();
+        (if i < n { i * each } else { n * each + i - n }, self.quadrature(i))
     }
 
-    /// Derivatives of source `i` at an unusable pixel, each so many times along x and y.
+    /// Derivatives of component `i` at a masked pixel, of the given orders along x and y.
     #[inline(always)]
-    pub fn at(&self, i: usize, [x, y]: [usize; 2], derivatives: [[usize; 2]; 3]) -> [f64; 3] {
-        let (first, shares) = self.parts(i);
+    pub fn derivatives_at(&self, i: usize, [x, y]: [usize; 2], derivatives: [[usize; 2]; 3]) -> [f64; 3] {
+        let (first, shares) = self.terms(i);
         let mut sum = [0.0; 3];
         for (k, (_, share)) in shares.iter().enumerate() {
-            let [fx, fy] = self.parts.at(first + k, x, y);
+            let [fx, fy] = self.terms.at(first + k, x, y);
             for (s, [a, b]) in sum.iter_mut().zip(derivatives) {
                 *s += share * fx[a] * fy[b];
             }
@@ -129,106 +133,119 @@ impl Atoms {
         sum
     }
 
-    /// [`Atoms::couple`] over unusable pixels alone.
+    /// [`SeparableModel::gram_block`] over masked pixels alone.
     #[inline(always)]
-    pub fn couple_at(&self, i: usize, j: usize, runs: &[Run], scratch: &mut Vec<f64>) -> [f64; 9] {
-        let ((first, shares), (other, others)) = (self.parts(i), self.parts(j));
+    pub fn gram_block_over_runs(&self, i: usize, j: usize, runs: &[Run], scratch: &mut Vec<f64>) -> [f64; 9] {
+        let ((first, shares), (other, others)) = (self.terms(i), self.terms(j));
         let mut sum = [0.0; 9];
         for (k, (_, share)) in shares.iter().enumerate() {
             for (l, (_, of)) in others.iter().enumerate() {
                 add(
                     &mut sum,
                     share * of,
-                    self.parts.couple_at(first + k, other + l, runs, scratch),
+                    self.terms.gram_block_over_runs(first + k, other + l, runs, scratch),
                 );
             }
         }
         sum
     }
 
-    /// Adds `scale`·f_y⁽ᵇ⁾⊗f_x⁽ᵃ⁾ of source `i` to a matrix (my, mx).
+    /// Adds `scale`·f_y⁽ᵇ⁾⊗f_x⁽ᵃ⁾ of component `i` to a matrix (my, mx).
     #[inline(always)]
-    pub fn add(&self, i: usize, a: usize, b: usize, scale: f64, matrix: &mut [f64]) {
-        let (first, shares) = self.parts(i);
+    pub fn accumulate(&self, i: usize, a: usize, b: usize, scale: f64, matrix: &mut [f64]) {
+        let (first, shares) = self.terms(i);
         for (k, (_, share)) in shares.iter().enumerate() {
-            self.parts.add(first + k, a, b, share * scale, matrix);
+            self.terms.accumulate(first + k, a, b, share * scale, matrix);
         }
     }
 
-    /// Adds `f_y⊗(q0[0] f″_x + q0[1] f′_x) + f′_y⊗(q1[0] f′_x + q1[1] f_x) + q2 f″_y⊗f_x` of source `i` to a matrix (my, mx).
+    /// Adds `f_y⊗(q0[0] f″_x + q0[1] f′_x) + f′_y⊗(q1[0] f′_x + q1[1] f_x) + q2 f″_y⊗f_x` of component `i` to a matrix (my, mx).
     #[inline(always)]
-    pub fn add_bent(&self, i: usize, q0: [f64; 2], q1: [f64; 2], q2: f64, scratch: &mut Vec<f64>, matrix: &mut [f64]) {
-        let (first, shares) = self.parts(i);
+    pub fn accumulate_second_derivative(
+        &self,
+        i: usize,
+        q0: [f64; 2],
+        q1: [f64; 2],
+        q2: f64,
+        scratch: &mut Vec<f64>,
+        matrix: &mut [f64],
+    ) {
+        let (first, shares) = self.terms(i);
         for (k, (_, share)) in shares.iter().enumerate() {
             let (q0, q1) = ([share * q0[0], share * q0[1]], [share * q1[0], share * q1[1]]);
-            self.parts.add_bent(first + k, q0, q1, share * q2, scratch, matrix);
+            self.terms
+                .accumulate_second_derivative(first + k, q0, q1, share * q2, scratch, matrix);
         }
     }
 
-    /// Inner products of a matrix (my, mx) with f_y⊗f_x, f_y⊗f′_x and f′_y⊗f_x of source `i`.
+    /// Inner products of a matrix (my, mx) with f_y⊗f_x, f_y⊗f′_x and f′_y⊗f_x of component `i`.
     #[inline(always)]
     pub fn project(&self, i: usize, matrix: &[f64], scratch: &mut Vec<f64>) -> [f64; 3] {
-        let (first, shares) = self.parts(i);
+        let (first, shares) = self.terms(i);
         let mut sum = [0.0; 3];
         for (k, (_, share)) in shares.iter().enumerate() {
-            add(&mut sum, *share, self.parts.project(first + k, matrix, scratch));
+            add(&mut sum, *share, self.terms.project(first + k, matrix, scratch));
         }
         sum
     }
 
-    /// Inner products of a matrix (my, mx) with the model's slopes in every spot's x, y and energy, then in the background.
+    /// Jᵀ times a matrix (my, mx): J's columns are every source's x, y and energy, then the background's amplitudes.
     #[inline(always)]
-    pub fn slopes(&self, matrix: &[f64], scratch: &mut Vec<f64>, out: &mut [f64]) {
-        for i in 0..self.sources {
-            self.set_slope(i, self.project(i, matrix, scratch), out);
+    pub fn transposed_jacobian_times(&self, matrix: &[f64], scratch: &mut Vec<f64>, out: &mut [f64]) {
+        for i in 0..self.components {
+            self.set_jacobian(i, self.project(i, matrix, scratch), out);
         }
     }
 
-    /// The same at an unusable pixel.
+    /// The row of J at a masked pixel.
     #[inline(always)]
-    pub fn slopes_at(&self, pixel: [usize; 2], out: &mut [f64]) {
-        for i in 0..self.sources {
-            self.set_slope(i, self.at(i, pixel, SLOPES), out);
+    pub fn jacobian_row_at(&self, pixel: [usize; 2], out: &mut [f64]) {
+        for i in 0..self.components {
+            self.set_jacobian(i, self.derivatives_at(i, pixel, SLOPES), out);
         }
     }
 
     #[inline(always)]
-    fn set_slope(&self, i: usize, [value, along_x, along_y]: [f64; 3], out: &mut [f64]) {
-        let n = self.spots.len();
+    fn set_jacobian(&self, i: usize, [value, along_x, along_y]: [f64; 3], out: &mut [f64]) {
+        let n = self.sources.len();
         if i < n {
-            let a = self.spots[i].a;
+            let a = self.sources[i].a;
             (out[3 * i], out[3 * i + 1], out[3 * i + 2]) = (a * along_x, a * along_y, value);
         } else {
             out[2 * n + i] = value;
         }
     }
 
-    /// The first of these alone.
+    /// The first value of [`Self::project`] alone.
     #[inline(always)]
     pub fn project_value(&self, i: usize, matrix: &[f64], scratch: &mut Vec<f64>) -> f64 {
-        let (first, shares) = self.parts(i);
+        let (first, shares) = self.terms(i);
         let mut sum = 0.0;
         for (k, (_, share)) in shares.iter().enumerate() {
-            sum += share * self.parts.project_value(first + k, matrix, scratch);
+            sum += share * self.terms.project_value(first + k, matrix, scratch);
         }
         sum
     }
 
     /// Inner products with the second derivatives: xx, xy, yy.
     #[inline(always)]
-    pub fn bend(&self, i: usize, matrix: &[f64], scratch: &mut Vec<f64>) -> [f64; 3] {
-        let (first, shares) = self.parts(i);
+    pub fn project_second_derivatives(&self, i: usize, matrix: &[f64], scratch: &mut Vec<f64>) -> [f64; 3] {
+        let (first, shares) = self.terms(i);
         let mut sum = [0.0; 3];
         for (k, (_, share)) in shares.iter().enumerate() {
-            add(&mut sum, *share, self.parts.bend(first + k, matrix, scratch));
+            add(
+                &mut sum,
+                *share,
+                self.terms.project_second_derivatives(first + k, matrix, scratch),
+            );
         }
         sum
     }
 
-    /// Inner product of source `i`'s derivative, `a[0]` times along x and `a[1]` times along y, with source `j`'s under `weights`
+    /// Inner product of component `i`'s derivative, `a[0]` times along x and `a[1]` times along y, with component `j`'s under `weights`
     /// (my, mx), even where that is empty.
     #[inline(always)]
-    pub fn inner(
+    pub fn inner_product(
         &self,
         i: usize,
         a: [usize; 2],
@@ -237,34 +254,34 @@ impl Atoms {
         weights: &[f64],
         scratch: &mut Vec<f64>,
     ) -> f64 {
-        let ((first, shares), (other, others)) = (self.parts(i), self.parts(j));
+        let ((first, shares), (other, others)) = (self.terms(i), self.terms(j));
         let mut sum = 0.0;
         for (k, (_, share)) in shares.iter().enumerate() {
             for (l, (_, of)) in others.iter().enumerate() {
-                sum += share * of * self.parts.inner(first + k, a, other + l, b, weights, scratch);
+                sum += share * of * self.terms.inner_product(first + k, a, other + l, b, weights, scratch);
             }
         }
         sum
     }
 
-    /// Inner products along x and along y of source `i`'s f, f′ and f″ with source `j`'s f and f′; `None` where they share nothing.
-    /// Only of spots that are upright.
+    /// Inner products along x and along y of component `i`'s f, f′ and f″ with component `j`'s f and f′; `None` where they share nothing.
+    /// Only of sources that are upright.
     #[inline(always)]
-    pub fn grams(&self, i: usize, j: usize) -> Option<[[[f64; 2]; 3]; 2]> {
-        self.parts.grams(i, j)
+    pub fn axis_inner_products(&self, i: usize, j: usize) -> Option<[[[f64; 2]; 3]; 2]> {
+        self.terms.axis_inner_products(i, j)
     }
 
-    /// Inner products of (f′_x f_y, f_x f′_y, f_x f_y) of source `i` with those of source `j`, 3 × 3 row-major.
+    /// Inner products of (f′_x f_y, f_x f′_y, f_x f_y) of component `i` with those of component `j`, 3 × 3 row-major.
     #[inline(always)]
-    pub fn couple(&self, i: usize, j: usize, weights: &[f64], scratch: &mut Vec<f64>) -> [f64; 9] {
-        let ((first, shares), (other, others)) = (self.parts(i), self.parts(j));
+    pub fn gram_block(&self, i: usize, j: usize, weights: &[f64], scratch: &mut Vec<f64>) -> [f64; 9] {
+        let ((first, shares), (other, others)) = (self.terms(i), self.terms(j));
         let mut sum = [0.0; 9];
         for (k, (_, share)) in shares.iter().enumerate() {
             for (l, (_, of)) in others.iter().enumerate() {
                 add(
                     &mut sum,
                     share * of,
-                    self.parts.couple(first + k, other + l, weights, scratch),
+                    self.terms.gram_block(first + k, other + l, weights, scratch),
                 );
             }
         }

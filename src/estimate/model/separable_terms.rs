@@ -1,4 +1,4 @@
-//! Products of a profile along x and one along y, with their derivatives, kept where they hold anything.
+//! Separable terms: products of a profile along x and one along y, with first and second derivatives, stored only where non-zero.
 
 use std::ops::Range;
 
@@ -6,28 +6,28 @@ use crate::estimate::dense_linalg::{axpy, combine, dot};
 use crate::estimate::model::svd_basis::Basis;
 use crate::estimate::preprocess::masked_pixels::Run;
 
-/// Which derivative of i and of j, along x and along y, makes each of the nine products of a pair.
+/// Orders of the derivatives of i and of j, along x and along y, in each of the nine inner products of a pair.
 const ALONG_X: [[usize; 2]; 9] = [[1, 1], [1, 0], [1, 0], [0, 1], [0, 0], [0, 0], [0, 1], [0, 0], [0, 0]];
 const ALONG_Y: [[usize; 2]; 9] = [[0, 0], [0, 1], [0, 0], [1, 0], [1, 1], [1, 0], [0, 0], [0, 1], [0, 0]];
 
-/// Separable parts in the bases, in the order they were pushed.
+/// Separable terms in the bases, in the order they were pushed.
 #[derive(Default)]
-pub(crate) struct Parts {
+pub(crate) struct SeparableTerms {
     mx: usize,
     my: usize,
-    /// (parts, 3, mx): f, f′, f″.
+    /// (terms, 3, mx): f, f′, f″.
     x: Vec<f64>,
     y: Vec<f64>,
-    /// Columns and rows outside which a part is zero.
+    /// Columns and rows outside which a term is zero.
     spans: Vec<[[usize; 2]; 2]>,
-    /// f, f′, f″ at pixels along each axis, (parts, pixels); only at the lines of unusable pixels.
+    /// f, f′, f″ at pixels along each axis, (terms, pixels); only at the lines of masked pixels.
     at: [Vec<[f64; 3]>; 2],
     lines: [usize; 2],
 }
 
 // Loops over arrays, not `map` and `from_fn`: a closure is not compiled for the instructions that its caller was dispatched to.
-impl Parts {
-    /// Forgets all parts, and makes room for so many in bases of so many columns.
+impl SeparableTerms {
+    /// Removes all terms and reserves room for `count` in bases of (mx, my) columns.
     #[inline(always)]
     pub fn clear(&mut self, count: usize, mx: usize, my: usize) {
         (self.mx, self.my) = (mx, my);
@@ -36,14 +36,14 @@ impl Parts {
         self.spans.clear();
     }
 
-    /// A part of a spot at `u`, relative widths `w`.
+    /// A term of a spot at `u`, relative widths `w`.
     #[inline(always)]
     pub fn push(&mut self, axes: [&Basis; 2], u: [f64; 2], w: [f64; 2], reach: f64, scratch: &mut [f64]) {
         let (i, mx, my) = (self.count(), self.mx, self.my);
         let x = &mut self.x[i * 3 * mx..(i + 1) * 3 * mx];
-        let columns = axes[0].atom(u[0], w[0], reach, mx, scratch, x);
+        let columns = axes[0].profile(u[0], w[0], reach, mx, scratch, x);
         let y = &mut self.y[i * 3 * my..(i + 1) * 3 * my];
-        let rows = axes[1].atom(u[1], w[1], reach, my, scratch, y);
+        let rows = axes[1].profile(u[1], w[1], reach, my, scratch, y);
         // Whole vectors of four: padding holds zeros.
         let span = |r: Range<usize>, m: usize| [r.start & !3, r.end.next_multiple_of(4).min(m)];
         self.spans.push(match columns.is_empty() || rows.is_empty() {
@@ -52,9 +52,9 @@ impl Parts {
         });
     }
 
-    /// A part of given profiles without derivatives.
+    /// A term of given profiles without derivatives.
     #[inline(always)]
-    pub fn push_flat(&mut self, profiles: [&[f64]; 2]) {
+    pub fn push_profiles(&mut self, profiles: [&[f64]; 2]) {
         let (i, mx, my) = (self.count(), self.mx, self.my);
         let x = &mut self.x[i * 3 * mx..(i + 1) * 3 * mx];
         x.fill(0.0);
@@ -69,13 +69,13 @@ impl Parts {
         self.spans.len()
     }
 
-    /// Numbers that all parts touch together.
+    /// Numbers within all terms' spans together.
     pub fn footprint(&self) -> f64 {
         let area = |s: &[[usize; 2]; 2]| ((s[0][1] - s[0][0]) * (s[1][1] - s[1][0])) as f64;
         self.spans.iter().map(area).sum()
     }
 
-    /// Profile `d` (0 to 2: f, f′, f″) of part `i` along x within its span.
+    /// Profile `d` (0 to 2: f, f′, f″) of term `i` along x within its span.
     #[inline(always)]
     pub fn x(&self, i: usize, d: usize) -> &[f64] {
         let [lo, hi] = self.spans[i][0];
@@ -90,14 +90,14 @@ impl Parts {
         &self.y[start + lo..start + hi]
     }
 
-    /// Values of part `i` at an unusable pixel along each axis: f, f′, f″ each.
+    /// f, f′, f″ of term `i` at a masked pixel, along x and along y.
     #[inline(always)]
     pub fn at(&self, i: usize, x: usize, y: usize) -> [[f64; 3]; 2] {
         [self.at[0][i * self.lines[0] + x], self.at[1][i * self.lines[1] + y]]
     }
 
     #[inline(always)]
-    pub fn expand(&mut self, axes: [&Basis; 2], lines: &[Vec<usize>; 2]) {
+    pub fn evaluate_lines(&mut self, axes: [&Basis; 2], lines: &[Vec<usize>; 2]) {
         for k in 0..2 {
             let n = if lines[k].is_empty() { 0 } else { axes[k].n };
             let mut at = std::mem::take(&mut self.at[k]);
@@ -125,9 +125,9 @@ impl Parts {
         }
     }
 
-    /// Adds `scale`·f_y⁽ᵇ⁾⊗f_x⁽ᵃ⁾ of part `i` to a matrix (my, mx).
+    /// Adds `scale`·f_y⁽ᵇ⁾⊗f_x⁽ᵃ⁾ of term `i` to a matrix (my, mx).
     #[inline(always)]
-    pub fn add(&self, i: usize, a: usize, b: usize, scale: f64, matrix: &mut [f64]) {
+    pub fn accumulate(&self, i: usize, a: usize, b: usize, scale: f64, matrix: &mut [f64]) {
         let [[x0, x1], [y0, _]] = self.spans[i];
         let fx = self.x(i, a);
         for (c, &w) in self.y(i, b).iter().enumerate() {
@@ -136,9 +136,17 @@ impl Parts {
         }
     }
 
-    /// Adds `f_y⊗(q0[0] f″_x + q0[1] f′_x) + f′_y⊗(q1[0] f′_x + q1[1] f_x) + q2 f″_y⊗f_x` of part `i` to a matrix (my, mx).
+    /// Adds `f_y⊗(q0[0] f″_x + q0[1] f′_x) + f′_y⊗(q1[0] f′_x + q1[1] f_x) + q2 f″_y⊗f_x` of term `i` to a matrix (my, mx).
     #[inline(always)]
-    pub fn add_bent(&self, i: usize, q0: [f64; 2], q1: [f64; 2], q2: f64, scratch: &mut Vec<f64>, matrix: &mut [f64]) {
+    pub fn accumulate_second_derivative(
+        &self,
+        i: usize,
+        q0: [f64; 2],
+        q1: [f64; 2],
+        q2: f64,
+        scratch: &mut Vec<f64>,
+        matrix: &mut [f64],
+    ) {
         let [[x0, x1], [y0, _]] = self.spans[i];
         let m = x1 - x0;
         scratch.resize(scratch.len().max(3 * m), 0.0);
@@ -161,32 +169,32 @@ impl Parts {
         }
     }
 
-    /// Inner products of a matrix (my, mx) with f_y⊗f_x, f_y⊗f′_x and f′_y⊗f_x of part `i`.
+    /// Inner products of a matrix (my, mx) with f_y⊗f_x, f_y⊗f′_x and f′_y⊗f_x of term `i`.
     #[inline(always)]
     pub fn project(&self, i: usize, matrix: &[f64], scratch: &mut Vec<f64>) -> [f64; 3] {
-        let [t, t1] = self.fold(i, [0, 1], matrix, scratch);
+        let [t, t1] = self.contract_y(i, [0, 1], matrix, scratch);
         [dot(t, self.x(i, 0)), dot(t, self.x(i, 1)), dot(t1, self.x(i, 0))]
     }
 
-    /// The first of these alone.
+    /// The first value of [`Self::project`] alone.
     #[inline(always)]
     pub fn project_value(&self, i: usize, matrix: &[f64], scratch: &mut Vec<f64>) -> f64 {
-        let [t] = self.fold(i, [0], matrix, scratch);
+        let [t] = self.contract_y(i, [0], matrix, scratch);
         dot(t, self.x(i, 0))
     }
 
     /// Inner products with the second derivatives: xx, xy, yy.
     #[inline(always)]
-    pub fn bend(&self, i: usize, matrix: &[f64], scratch: &mut Vec<f64>) -> [f64; 3] {
-        let [t, t1] = self.fold(i, [0, 1], matrix, scratch);
+    pub fn project_second_derivatives(&self, i: usize, matrix: &[f64], scratch: &mut Vec<f64>) -> [f64; 3] {
+        let [t, t1] = self.contract_y(i, [0, 1], matrix, scratch);
         let (xx, xy) = (dot(t, self.x(i, 2)), dot(t1, self.x(i, 1)));
-        let [t2] = self.fold(i, [2], matrix, scratch);
+        let [t2] = self.contract_y(i, [2], matrix, scratch);
         [xx, xy, dot(t2, self.x(i, 0))]
     }
 
-    /// Rows of a matrix (my, mx) summed under profiles along y of part `i`, over its columns.
+    /// Rows of a matrix (my, mx) summed under profiles along y of term `i`, over its columns.
     #[inline(always)]
-    fn fold<'a, const K: usize>(
+    fn contract_y<'a, const K: usize>(
         &self,
         i: usize,
         profiles: [usize; K],
@@ -200,20 +208,20 @@ impl Parts {
         if m > 0 {
             combine(weights, 1, &matrix[y0 * self.mx + x0..], self.mx, m, scratch);
         }
-        let mut parts = scratch.chunks_exact(m.max(1));
-        std::array::from_fn(|_| parts.next().unwrap_or_default())
+        let mut terms = scratch.chunks_exact(m.max(1));
+        std::array::from_fn(|_| terms.next().unwrap_or_default())
     }
 
     #[inline(always)]
-    fn shared(&self, i: usize, j: usize) -> [[usize; 2]; 2] {
+    fn overlap(&self, i: usize, j: usize) -> [[usize; 2]; 2] {
         let (p, q) = (&self.spans[i], &self.spans[j]);
         [0, 1].map(|k| [p[k][0].max(q[k][0]), p[k][1].min(q[k][1])])
     }
 
-    /// Inner product of part `i`'s derivative, `a[0]` times along x and `a[1]` times along y, with part `j`'s under `weights`
+    /// Inner product of term `i`'s derivative, `a[0]` times along x and `a[1]` times along y, with term `j`'s under `weights`
     /// (my, mx), even where that is empty.
     #[inline(always)]
-    pub fn inner(
+    pub fn inner_product(
         &self,
         i: usize,
         a: [usize; 2],
@@ -222,7 +230,7 @@ impl Parts {
         weights: &[f64],
         scratch: &mut Vec<f64>,
     ) -> f64 {
-        let [[x0, x1], [y0, y1]] = self.shared(i, j);
+        let [[x0, x1], [y0, y1]] = self.overlap(i, j);
         if x0 >= x1 || y0 >= y1 {
             return 0.0;
         }
@@ -241,30 +249,30 @@ impl Parts {
         triple(scratch, x(i, a[0]), x(j, b[0]))
     }
 
-    /// Inner products along x and along y of part `i`'s f, f′ and f″ with part `j`'s f and f′; `None` where they share nothing.
+    /// Inner products along x and along y of term `i`'s f, f′ and f″ with term `j`'s f and f′; `None` where they share nothing.
     #[inline(always)]
-    pub fn grams(&self, i: usize, j: usize) -> Option<[[[f64; 2]; 3]; 2]> {
-        let [[x0, x1], [y0, y1]] = self.shared(i, j);
+    pub fn axis_inner_products(&self, i: usize, j: usize) -> Option<[[[f64; 2]; 3]; 2]> {
+        let [[x0, x1], [y0, y1]] = self.overlap(i, j);
         if x0 >= x1 || y0 >= y1 {
             return None;
         }
         let (mx, my) = (self.mx, self.my);
         let x = |i: usize, d: usize| &self.x[(3 * i + d) * mx + x0..(3 * i + d) * mx + x1];
         let y = |i: usize, d: usize| &self.y[(3 * i + d) * my + y0..(3 * i + d) * my + y1];
-        let mut grams = [[[0.0; 2]; 3]; 2];
+        let mut axis_inner_products = [[[0.0; 2]; 3]; 2];
         for a in 0..3 {
             for b in 0..2 {
-                grams[0][a][b] = dot(x(i, a), x(j, b));
-                grams[1][a][b] = dot(y(i, a), y(j, b));
+                axis_inner_products[0][a][b] = dot(x(i, a), x(j, b));
+                axis_inner_products[1][a][b] = dot(y(i, a), y(j, b));
             }
         }
-        Some(grams)
+        Some(axis_inner_products)
     }
 
-    /// Inner products of (f′_x f_y, f_x f′_y, f_x f_y) of part `i` with those of part `j`, 3 × 3 row-major.
+    /// Inner products of (f′_x f_y, f_x f′_y, f_x f_y) of term `i` with those of term `j`, 3 × 3 row-major.
     #[inline(always)]
-    pub fn couple(&self, i: usize, j: usize, weights: &[f64], scratch: &mut Vec<f64>) -> [f64; 9] {
-        let [[x0, x1], [y0, y1]] = self.shared(i, j);
+    pub fn gram_block(&self, i: usize, j: usize, weights: &[f64], scratch: &mut Vec<f64>) -> [f64; 9] {
+        let [[x0, x1], [y0, y1]] = self.overlap(i, j);
         if x0 >= x1 || y0 >= y1 {
             return [0.0; 9];
         }
@@ -310,10 +318,10 @@ impl Parts {
         out
     }
 
-    /// [`Parts::couple`] over the pixels of `runs` alone, each run a difference of running sums along x.
+    /// [`SeparableTerms::gram_block`] over the pixels of `runs` alone, each run a difference of running sums along x.
     #[inline(always)]
-    pub fn couple_at(&self, i: usize, j: usize, runs: &[Run], scratch: &mut Vec<f64>) -> [f64; 9] {
-        let [[x0, x1], [y0, y1]] = self.shared(i, j);
+    pub fn gram_block_over_runs(&self, i: usize, j: usize, runs: &[Run], scratch: &mut Vec<f64>) -> [f64; 9] {
+        let [[x0, x1], [y0, y1]] = self.overlap(i, j);
         if x0 >= x1 || y0 >= y1 {
             return [0.0; 9];
         }

@@ -1,8 +1,8 @@
-//! One axis of the frame in an orthonormal basis that holds every spot the axis can see.
+//! One axis of the frame in an orthonormal basis (left singular vectors) that spans every spot the axis can see.
 //!
 //! A blurred frame has far fewer degrees of freedom than pixels: the kernels of all positions span, to any given
 //! accuracy, a space of m ≪ n dimensions when σ is wider than a pixel. Fitting there is lossless for white noise
-//! and costs m² instead of n²; what lies outside is pure noise and measures it without a model.
+//! and costs m² instead of n²; the rest of the frame is pure noise and measures it without a model.
 
 use std::ops::Range;
 
@@ -11,12 +11,12 @@ use faer::Mat;
 use crate::estimate::model::psf_table;
 use crate::optics::Axis;
 
-/// How far outside the sensor a spot's centre may lie, σ. Not less: an emitter just outside ruins the others.
+/// How far outside the sensor a centre may lie, σ. With less, an emitter just outside biases the others.
 const MARGIN: f64 = 2.0;
 const KNOTS_PER_SIGMA: f64 = 16.0;
-/// Wider than this many σ the axis is fitted in pixels: spots are small against it and the basis would be too large.
+/// Axes wider than this many σ are fitted in pixels: spots are small against them and the basis would be too large.
 const WIDEST: f64 = 120.0;
-/// Relative widths that the basis must also hold, so that a misjudged σ can be fitted.
+/// Relative widths that the basis must span too, so that a wrong σ can be fitted.
 const WIDTHS: [f64; 5] = [0.85, 0.93, 1.0, 1.08, 1.18];
 
 /// An axis in units of σ, with its basis.
@@ -25,7 +25,7 @@ pub(crate) struct Basis {
     pub n: usize,
     /// Pixel edges, σ.
     pub edges: Vec<f64>,
-    /// Doubles between rows of `u`, a multiple of 4; also the length of an atom.
+    /// Doubles between rows of `u`, a multiple of 4; also the length of a profile.
     pub stride: usize,
     /// Pixels to coefficients, (n, stride) row-major; unused columns are zero.
     u: Vec<f64>,
@@ -71,11 +71,11 @@ impl Basis {
         basis
     }
 
-    pub fn lowest(&self) -> f64 {
+    pub fn min_position(&self) -> f64 {
         self.edges[0] - MARGIN
     }
 
-    pub fn highest(&self) -> f64 {
+    pub fn max_position(&self) -> f64 {
         self.edges[self.n] + MARGIN
     }
 
@@ -83,7 +83,7 @@ impl Basis {
         self.edges[1] - self.edges[0]
     }
 
-    /// Columns that hold anything.
+    /// Columns in use.
     pub fn columns(&self) -> usize {
         if self.is_pixels { self.n } else { self.tail.len() - 1 }
     }
@@ -153,7 +153,7 @@ impl Basis {
                 }
             }
         }
-        // Background atoms: a slope over the sensor and a constant.
+        // Background profiles: a constant and a slope over the sensor.
         let spot_norm = (self.pitch() / (2.0 * std::f64::consts::PI.sqrt())).sqrt().min(1.0);
         let half = 0.5 * n as f64;
         for k in 0..n {
@@ -178,7 +178,7 @@ impl Basis {
             }
             self.tail[m] = left.iter().fold(0.0, |a: f64, &l| a.max(l)).sqrt();
         }
-        // Below rounding nothing is gained.
+        // Columns below rounding are dropped.
         let kept = self.tail.iter().position(|&t| t < 1e-13).unwrap_or(rank).max(1);
         self.stride = kept.next_multiple_of(4);
         self.u = vec![0.0; n * self.stride];
@@ -197,17 +197,17 @@ impl Basis {
         let mut scratch = vec![0.0; 3 * n];
         for (k, row) in table.chunks_exact_mut(3 * stride).enumerate() {
             let u = self.first_knot + k as f64 / KNOTS_PER_SIGMA;
-            self.direct(u, 1.0, psf_table::REACH, stride, &mut scratch, row);
+            self.profile_direct(u, 1.0, psf_table::REACH, stride, &mut scratch, row);
         }
         self.table = table;
     }
 
     /// f, f′, f″ of a spot of relative width `w` at `u`, as far out as `reach` widths, in the first `m` columns; `out` is
-    /// (3, m), `scratch` 3 n. Returns the columns that hold anything.
+    /// (3, m), `scratch` 3 n. Returns the columns that are non-zero.
     #[inline(always)]
-    pub fn atom(&self, u: f64, w: f64, reach: f64, m: usize, scratch: &mut [f64], out: &mut [f64]) -> Range<usize> {
+    pub fn profile(&self, u: f64, w: f64, reach: f64, m: usize, scratch: &mut [f64], out: &mut [f64]) -> Range<usize> {
         if w != 1.0 || self.table.is_empty() {
-            return self.direct(u, w, reach, m, scratch, out);
+            return self.profile_direct(u, w, reach, m, scratch, out);
         }
         // Quintic Hermite interpolation: the error is h⁶/46080·f⁽⁶⁾, 2e-11 of the spot.
         let position = (u - self.first_knot) * KNOTS_PER_SIGMA;
@@ -233,12 +233,12 @@ impl Basis {
             t2 * (-12.0 + t * (28.0 - 15.0 * t)),
             0.5 * h * t2 * (3.0 - t * (8.0 - 5.0 * t)),
         ];
-        let bend = t * (60.0 - t * (180.0 - 120.0 * t)) / (h * h);
+        let second = t * (60.0 - t * (180.0 - 120.0 * t)) / (h * h);
         let curvature = [
-            -bend,
+            -second,
             -t * (36.0 - t * (96.0 - 60.0 * t)) / h,
             0.5 * (2.0 - t * (18.0 - t * (36.0 - 20.0 * t))),
-            bend,
+            second,
             t * (-24.0 + t * (84.0 - 60.0 * t)) / h,
             0.5 * t * (6.0 - t * (24.0 - 20.0 * t)),
         ];
@@ -267,7 +267,15 @@ impl Basis {
     }
 
     #[inline(always)]
-    fn direct(&self, u: f64, w: f64, reach: f64, m: usize, scratch: &mut [f64], out: &mut [f64]) -> Range<usize> {
+    fn profile_direct(
+        &self,
+        u: f64,
+        w: f64,
+        reach: f64,
+        m: usize,
+        scratch: &mut [f64],
+        out: &mut [f64],
+    ) -> Range<usize> {
         let n = self.n;
         let (f, rest) = scratch.split_at_mut(n);
         let (f1, f2) = rest.split_at_mut(n);
@@ -313,9 +321,9 @@ mod tests {
         let m = basis.stride;
         let (mut scratch, mut a, mut b) = (vec![0.0; 180], vec![0.0; 3 * m], vec![0.0; 3 * m]);
         for k in 0..200 {
-            let u = basis.lowest() + (basis.highest() - basis.lowest()) * (k as f64 + 0.37) / 200.0;
-            basis.atom(u, 1.0, psf_table::REACH, m, &mut scratch, &mut a);
-            basis.direct(u, 1.0, psf_table::REACH, m, &mut scratch, &mut b);
+            let u = basis.min_position() + (basis.max_position() - basis.min_position()) * (k as f64 + 0.37) / 200.0;
+            basis.profile(u, 1.0, psf_table::REACH, m, &mut scratch, &mut a);
+            basis.profile_direct(u, 1.0, psf_table::REACH, m, &mut scratch, &mut b);
             for c in 0..m {
                 // Interpolation errors h⁶, h⁵, h⁴ with h = 1/16 and their small constants.
                 assert!((a[c] - b[c]).abs() < 1e-10);

@@ -1,79 +1,84 @@
-//! Noise that grows with the light (shot noise, gain scatter): measured from what a model leaves of a frame, after which
-//! every pixel weighs as much as it says and an emitter must stand out of the noise where it stands.
+//! Heteroscedastic reweighting: noise that grows with the light (shot noise, gain scatter) is estimated from a fit's residual, every
+//! pixel is weighted by its inverse variance, and the hypothesis is refitted.
 
-use crate::estimate::model::compressed_frame::Reading;
-use crate::estimate::model::hypothesis::Model;
+use crate::estimate::model::compressed_frame::CompressedFrame;
+use crate::estimate::model::hypothesis::Hypothesis;
 use crate::estimate::model::svd_basis::Basis;
 use crate::estimate::model_order::search::Search;
-use crate::estimate::preprocess::noise_variance::Growth;
-use crate::estimate::preprocess::screening::Screened;
+use crate::estimate::preprocess::noise_variance::VarianceFunction;
+use crate::estimate::preprocess::screening::PreprocessedFrame;
 use crate::optics::Camera;
 
-/// Times that the weights follow the model they were made from.
+/// Alternations of weighting and fitting.
 const PASSES: usize = 2;
-/// Rounds of moves under weights.
+/// Rounds of proposals under weights.
 const ROUNDS: usize = 3;
 
-/// The search in pixels, each with its own weight.
-pub(crate) struct Weighing {
+/// A search in the pixel bases, where each pixel has a weight.
+pub(crate) struct Reweighting {
     pub search: Search,
-    pub reading: Reading,
+    pub compressed: CompressedFrame,
 }
 
-impl Weighing {
+impl Reweighting {
     pub fn new(camera: &Camera) -> Self {
         let basis = |axis| Basis::pixels(axis, camera.spot_sigma_m);
         Self {
             search: Search::new([&camera.x, &camera.y].map(basis)),
-            reading: Reading::default(),
+            compressed: CompressedFrame::default(),
         }
     }
 
-    /// Refits `model` under weights that follow `growth`, or what the model leaves where that is not known. `false`,
-    /// with `model` untouched, where even noise explains the frame as well.
-    pub fn run(&mut self, frame: &Screened, growth: Option<Growth>, model: &mut Model) -> bool {
-        let Self { search, reading } = self;
+    /// Refits `hypothesis` under the weights of a variance function, which is estimated from the residual if not given. Returns `false`
+    /// and leaves `hypothesis` unchanged where constant noise explains the frame as well.
+    pub fn run(
+        &mut self,
+        frame: &PreprocessedFrame,
+        variance: Option<VarianceFunction>,
+        hypothesis: &mut Hypothesis,
+    ) -> bool {
+        let Self { search, compressed } = self;
         let nx = search.fitter.bx.n;
-        reading.load(frame, &search.fitter.bx, &search.fitter.by);
-        let mut next = model.clone();
-        let residual = search.fitter.residual_of(reading, &mut next).to_vec();
+        compressed.load(frame, &search.fitter.bx, &search.fitter.by);
+        let mut next = hypothesis.clone();
+        let residual = search.fitter.weighted_residual(compressed, &mut next).to_vec();
         let even = search.score(&next);
-        let signal = search.fitter.expectation(reading, &mut next);
-        let mut growth = growth.unwrap_or_else(|| {
-            Growth::fit(
+        let signal = search.fitter.expected_light(compressed, &mut next);
+        let mut variance = variance.unwrap_or_else(|| {
+            VarianceFunction::fit(
                 frame,
-                [reading.rank[0], reading.mx],
+                [compressed.rank[0], compressed.mx],
                 &residual,
                 &signal,
-                next.spots.len(),
+                next.sources.len(),
             )
         });
-        if growth.is_flat() {
+        if variance.is_constant() {
             return false;
         }
         let mut signal = signal;
         for _ in 0..PASSES {
-            let mx = reading.mx;
+            let mx = compressed.mx;
             let at = |k: usize| k / nx * mx + k % nx;
             let fitter = &search.fitter;
-            reading.weigh(frame, [&fitter.bx, &fitter.by], |k| growth.at(signal[at(k)]));
-            search.settle(reading, &mut next, ROUNDS);
-            signal = search.fitter.expectation(reading, &mut next);
-            let mut residual = search.fitter.residual_of(reading, &mut next).to_vec();
-            for (r, w) in residual.iter_mut().zip(&reading.weights) {
+            compressed.set_weights(frame, [&fitter.bx, &fitter.by], |k| variance.at(signal[at(k)]));
+            search.refit_reweighted(compressed, &mut next, ROUNDS);
+            signal = search.fitter.expected_light(compressed, &mut next);
+            let mut residual = search.fitter.weighted_residual(compressed, &mut next).to_vec();
+            for (r, w) in residual.iter_mut().zip(&compressed.weights) {
                 *r /= w.max(1e-300);
             }
-            growth = Growth::fit(
+            variance = VarianceFunction::fit(
                 frame,
-                [reading.rank[0], reading.mx],
+                [compressed.rank[0], compressed.mx],
                 &residual,
                 &signal,
-                next.spots.len(),
+                next.sources.len(),
             );
         }
-        let is_better = search.score(&next) + reading.log_det + Growth::PRICE < even;
+        let is_better = search.score(&next) + compressed.log_det + VarianceFunction::PENALTY < even;
         if is_better {
-            *model = next;
+            *hypothesis = next;
         }
         is_better
     }

@@ -1,286 +1,311 @@
-//! The search for the number of emitters: hypotheses are fitted jointly and held against each other.
+//! The search for the number of emitters: hypotheses are fitted jointly and compared by a penalised likelihood.
 
 use std::time::Instant;
 
-use crate::estimate::detect::matched_filter::Heatmap;
-use crate::estimate::detect::matrix_pencil::{Pencil, Sampler};
+use crate::estimate::detect::matched_filter::MatchedFilter;
+use crate::estimate::detect::matrix_pencil::{MatrixPencil, PencilSampler};
 use crate::estimate::fit::levenberg_marquardt::Fitter;
-use crate::estimate::model::compressed_frame::Reading;
-use crate::estimate::model::hypothesis::{Model, Nuisances, Spot, Width};
+use crate::estimate::model::compressed_frame::CompressedFrame;
+use crate::estimate::model::hypothesis::{Hypothesis, Nuisances, PointSource, Width};
 use crate::estimate::model::svd_basis::Basis;
-use crate::estimate::model_order::nuisance_selection::{WIDE, is_doubled};
-use crate::estimate::model_order::power_prior::Prior;
-use crate::estimate::model_order::proposals::Certainty;
-use crate::estimate::preprocess::noise_variance::Growth;
-use crate::estimate::preprocess::screening::Screened;
+use crate::estimate::model_order::nuisance_selection::{BACKGROUND_AND_WIDTH, has_paired_sources};
+use crate::estimate::model_order::power_prior::PowerPrior;
+use crate::estimate::model_order::proposals::CovarianceCache;
+use crate::estimate::preprocess::noise_variance::VarianceFunction;
+use crate::estimate::preprocess::screening::PreprocessedFrame;
 
-/// Steps that a candidate may take before it is judged.
+/// Steps of a candidate's fit before it is compared.
 pub(crate) const TRIAL_STEPS: usize = 30;
-/// So many further emitters that explain a frame are not asked for another explanation.
-const FEW: usize = 2;
-/// Steps that the pencil's seeds are polished by.
-const POLISH: usize = 100;
-/// Rounds of moves, and of those before another explanation than more emitters is tried.
+/// Extra emitters accepted before testing a background or width.
+const ACCEPTED_EXTRA: usize = 2;
+/// Steps of a fit from the pencil's positions.
+const PENCIL_FIT_STEPS: usize = 100;
+/// Rounds of proposals, and rounds before nuisances are tried.
 pub(crate) const ROUNDS: usize = 8;
 pub(crate) const EARLY_ROUNDS: usize = 3;
-/// A misfit of this many standard deviations is worth another start.
-const FAR: f64 = 5.0;
-/// Emitters of a candidate may be this much cheaper, together, than those of the present hypothesis are on average.
-const CHEAPER: f64 = 30.0;
-/// More overlapping emitters than these are first taken for something else.
-const BLOB: usize = 10;
-/// Where more than this share of the pixels is unusable, the pencil would see what was filled in, and turned spots cost too much.
-const TORN: f64 = 0.03;
-/// Least drop of the deviance that a nuisance parameter must bring.
-pub(crate) const NUISANCE_PRICE: f64 = 5.0;
+/// Misfit in standard deviations from which nuisances are tried.
+const MISFIT_DEVIATIONS: f64 = 5.0;
+/// Slack on the acceptance bound for the unknown evidence term.
+const ACCEPTANCE_SLACK: f64 = 30.0;
+/// Overlapping sources above this number are first tested for nuisances.
+const MAX_CLUSTER: usize = 10;
+/// Largest masked fraction for which the matrix pencil and rotated ellipses are used: the pencil sees the fill values.
+const MAX_MASKED_SHARE: f64 = 0.03;
+/// Least decrease of the deviance for a nuisance parameter.
+pub(crate) const NUISANCE_PENALTY: f64 = 5.0;
 
-/// The search with its settings that follow from the camera.
+/// The search for the number of sources in one pair of bases.
 pub(crate) struct Search {
     pub fitter: Fitter,
-    pub heatmap: Heatmap,
-    /// Where spots are wide enough against the sensor for the pencil.
-    pub(crate) sampler: Option<Sampler>,
-    /// Least drop of the deviance that an emitter must bring.
-    pub price: f64,
-    /// What the noise of the frame's light multiplies prices by.
-    pub factor: f64,
-    /// How the noise seems to grow, where that explains a frame better than more emitters do.
-    pub suspected: Option<Growth>,
-    /// What is known of powers, where that is to be weighed in.
-    pub prior: Option<Prior>,
+    pub matched_filter: MatchedFilter,
+    /// The matrix pencil, where spots are wide enough against the sensor.
+    pub(crate) pencil: Option<PencilSampler>,
+    /// Least decrease of the deviance for a source.
+    pub source_penalty: f64,
+    /// Noise variance weighted by the frame's light: multiplies all penalties.
+    pub noise_inflation: f64,
+    /// The variance function, where noise that grows with the light explains a frame better than more sources.
+    pub suspected_variance: Option<VarianceFunction>,
+    /// The prior of energies, for the maximum a posteriori.
+    pub prior: Option<PowerPrior>,
     pub(crate) residual: Vec<f64>,
-    pub(crate) certainty: Certainty,
+    pub(crate) covariance_cache: CovarianceCache,
 }
 
 impl Search {
     pub fn new([bx, by]: [Basis; 2]) -> Self {
-        let sampler = Sampler::new(&bx, &by);
-        Self::with(sampler, bx, by)
+        let pencil = PencilSampler::new(&bx, &by);
+        Self::with(pencil, bx, by)
     }
 
-    /// For a first look by the pencil where [`Search::new`] goes by residual peaks.
-    pub fn for_a_look([bx, by]: [Basis; 2]) -> Option<Self> {
-        let sampler = Sampler::for_a_look(&bx, &by)?;
-        Some(Self::with(Some(sampler), bx, by))
+    /// For a first try by the pencil where [`Search::new`] begins with residual peaks.
+    pub fn for_pencil_start([bx, by]: [Basis; 2]) -> Option<Self> {
+        let pencil = PencilSampler::for_pencil_start(&bx, &by)?;
+        Some(Self::with(Some(pencil), bx, by))
     }
 
-    fn with(sampler: Option<Sampler>, bx: Basis, by: Basis) -> Self {
+    fn with(pencil: Option<PencilSampler>, bx: Basis, by: Basis) -> Self {
         let fitter = Fitter::new(bx, by);
-        let heatmap = Heatmap::new(&fitter.bx, &fitter.by);
+        let matched_filter = MatchedFilter::new(&fitter.bx, &fitter.by);
         let area = |b: &Basis| b.edges[b.n] - b.edges[0];
-        // The matched filter has about area/σ² independent positions; the price keeps the chance that any of
+        // The matched filter has about area/σ² independent positions; the penalty keeps the probability that any of
         // them exceeds it in an empty frame below 1e-3.
-        let price = (10.0 + 2.0 * (area(&fitter.bx) * area(&fitter.by)).ln()).max(14.0);
+        let source_penalty = (10.0 + 2.0 * (area(&fitter.bx) * area(&fitter.by)).ln()).max(14.0);
         Self {
             fitter,
-            heatmap,
-            sampler,
-            price,
-            factor: 1.0,
-            suspected: None,
+            matched_filter,
+            pencil,
+            source_penalty,
+            noise_inflation: 1.0,
+            suspected_variance: None,
             prior: None,
             residual: Vec::new(),
-            certainty: Certainty::default(),
+            covariance_cache: CovarianceCache::default(),
         }
     }
 
-    /// Forgets the work done for the last frame.
-    pub fn restart(&mut self, deadline: Option<Instant>) {
-        self.fitter.restart(deadline);
-        self.factor = 1.0;
-        self.suspected = None;
-        self.certainty = Certainty::default();
+    /// Starts a new frame.
+    pub fn reset(&mut self, deadline: Option<Instant>) {
+        self.fitter.reset(deadline);
+        self.noise_inflation = 1.0;
+        self.suspected_variance = None;
+        self.covariance_cache = CovarianceCache::default();
     }
 
-    /// Whether the frame has had its share of work, or of time where a budget is set.
+    /// Whether the frame's budget of work or time is spent.
     pub fn is_exhausted(&self) -> bool {
         self.fitter.is_exhausted()
     }
 
-    /// Deviance that `next` must get below to score better than `best`.
-    pub(crate) fn bar(&self, best: &Model, next: &Model) -> f64 {
+    /// Deviance below which `next` scores better than `best`.
+    pub(crate) fn acceptance_threshold(&self, best: &Hypothesis, next: &Hypothesis) -> f64 {
         let penalty = match &self.prior {
             None => self.penalty(next),
-            // What emitters cost is known only once they are fitted: one more, of a known power, may cost less than none.
-            Some(_) if best.spots.is_empty() => return f64::INFINITY,
-            Some(_) => best.occam * (next.spots.len() as f64 / best.spots.len() as f64).min(1.0) - CHEAPER,
+            // The evidence term is known only after the fit: one more source of a known power may even lower it.
+            Some(_) if best.sources.is_empty() => return f64::INFINITY,
+            Some(_) => {
+                best.log_evidence_term * (next.sources.len() as f64 / best.sources.len() as f64).min(1.0)
+                    - ACCEPTANCE_SLACK
+            }
         };
         self.score(best) - penalty
     }
 
-    /// What is held against each other: −2 ln likelihood plus the price of the emitters and nuisances; with powers
-    /// weighed in, −2 ln of the posterior probability.
-    pub fn score(&self, model: &Model) -> f64 {
-        model.deviance + model.pull() + self.penalty(model)
+    /// The criterion: −2 ln likelihood plus the penalties of sources and nuisances; with a power prior, −2 ln of the posterior
+    /// probability.
+    pub fn score(&self, hypothesis: &Hypothesis) -> f64 {
+        hypothesis.deviance + hypothesis.prior_penalty() + self.penalty(hypothesis)
     }
 
-    fn penalty(&self, model: &Model) -> f64 {
+    fn penalty(&self, hypothesis: &Hypothesis) -> f64 {
         if self.prior.is_some() {
-            return self.factor * model.occam;
+            return self.noise_inflation * hypothesis.log_evidence_term;
         }
-        let nuisances = NUISANCE_PRICE * model.nuisances.count() as f64;
-        // A pair makes a turned ellipse of one spot, and is likelier than a lens that makes one of all.
-        let priced = model.spots.len() + usize::from(model.nuisances.width == Width::Turned);
-        self.factor * (self.price * priced as f64 + nuisances)
+        let nuisances = NUISANCE_PENALTY * hypothesis.nuisances.count() as f64;
+        // A pair explains one elliptical spot too, and is likelier than an elliptical PSF: an ellipse costs a source more.
+        let penalised = hypothesis.sources.len() + usize::from(hypothesis.nuisances.width == Width::RotatedEllipse);
+        self.noise_inflation * (self.source_penalty * penalised as f64 + nuisances)
     }
 
     /// Maximum likelihood with the number of emitters unknown. Nuisances are fitted only where the frame cannot be
     /// explained without, and then within every hypothesis.
-    pub fn maximum_likelihood(&mut self, reading: &Reading, frame: &Screened, look: Model) -> Model {
-        self.factor = reading.lit_variance;
-        let plain = look.nuisances;
-        let first = look.clone();
-        let mut model = if self.sampler.is_some() {
-            look
+    pub fn maximum_likelihood(
+        &mut self,
+        compressed: &CompressedFrame,
+        frame: &PreprocessedFrame,
+        initial: Hypothesis,
+    ) -> Hypothesis {
+        self.noise_inflation = compressed.light_weighted_variance;
+        let plain = initial.nuisances;
+        let first = initial.clone();
+        let mut hypothesis = if self.pencil.is_some() {
+            initial
         } else {
-            self.greedy(reading, frame, look)
+            self.add_residual_peaks(compressed, frame, initial)
         };
-        if self.suspected.is_some() {
-            return model;
+        if self.suspected_variance.is_some() {
+            return hypothesis;
         }
-        let mut is_settled = reading.is_explained(&model);
+        let mut is_settled = compressed.is_explained_by(&hypothesis);
         if is_settled {
-            self.refine(reading, &mut model, ROUNDS);
+            self.refine(compressed, &mut hypothesis, ROUNDS);
         } else {
-            self.start_anew(reading, &mut model);
+            self.reinitialise(compressed, &mut hypothesis);
         }
-        let is_far = reading.misfit(&model) > 1.0 + FAR * (2.0 / reading.numbers).sqrt();
-        if is_far || model.nuisances != plain || self.is_odd(&model) && self.would_do_otherwise(reading, &model) {
-            self.explain_otherwise(reading, frame, &mut model);
+        let is_far = compressed.misfit(&hypothesis) > 1.0 + MISFIT_DEVIATIONS * (2.0 / compressed.data_count).sqrt();
+        if is_far
+            || hypothesis.nuisances != plain
+            || self.has_unequal_energies(&hypothesis) && self.nuisances_can_replace_sources(compressed, &hypothesis)
+        {
+            self.select_nuisances(compressed, frame, &mut hypothesis);
             is_settled = false;
         }
-        // What a turned lens makes of one emitter takes several.
-        let may_be_turned = match self.sampler {
-            None => is_doubled(&model),
-            Some(_) => !is_settled && self.is_odd(&model) && 3 * model.spots.len() > 4 * first.spots.len(),
+        // An elliptical PSF takes several sources for one emitter.
+        let may_be_turned = match self.pencil {
+            None => has_paired_sources(&hypothesis),
+            Some(_) => {
+                !is_settled
+                    && self.has_unequal_energies(&hypothesis)
+                    && 3 * hypothesis.sources.len() > 4 * first.sources.len()
+            }
         };
-        if may_be_turned || !is_settled && !reading.is_explained(&model) {
-            self.turn(reading, frame, first, &mut model);
+        if may_be_turned || !is_settled && !compressed.is_explained_by(&hypothesis) {
+            self.try_rotated_ellipse(compressed, frame, first, &mut hypothesis);
             is_settled = false;
         }
         if !is_settled {
-            self.fitter.reserve(0.3);
-            self.refine(reading, &mut model, ROUNDS);
+            self.fitter.reserve_work(0.3);
+            self.refine(compressed, &mut hypothesis, ROUNDS);
         }
-        self.simplify(reading, &mut model);
-        if !reading.is_explained(&model) {
-            self.lay_ghosts(reading, frame, &mut model);
+        self.drop_nuisances(compressed, &mut hypothesis);
+        if !compressed.is_explained_by(&hypothesis) {
+            self.prune_spurious(compressed, frame, &mut hypothesis);
         }
-        self.finish(reading, &mut model);
-        model
+        self.converge(compressed, &mut hypothesis);
+        hypothesis
     }
 
-    /// Another way to the frame from where a first start ended: nuisances free it from a false minimum and are taken out again,
-    /// then moves. What needs more emitters than a few beyond the first start's is not a matter of moves. Where none of that
-    /// explains the frame and the nuisances alone did, they stay.
-    fn start_anew(&mut self, reading: &Reading, model: &mut Model) {
-        let first = model.clone();
+    /// Escapes a local minimum: frees nuisances, refits, removes them, then applies proposals. A result with more than one further source
+    /// is discarded. Where only the fit with nuisances explains the frame, they stay.
+    fn reinitialise(&mut self, compressed: &CompressedFrame, hypothesis: &mut Hypothesis) {
+        let first = hypothesis.clone();
         let mut wide = None;
-        if self.sampler.is_some() {
+        if self.pencil.is_some() {
             let mut free = first.clone();
-            free.nuisances = WIDE;
-            self.fitter.fit(reading, &mut free, TRIAL_STEPS);
-            wide = Some(free.clone()).filter(|w| reading.is_explained(w));
-            free.confine(first.nuisances);
-            self.fitter.fit(reading, &mut free, TRIAL_STEPS);
-            if self.score(&free) < self.score(model) {
-                *model = free;
+            free.nuisances = BACKGROUND_AND_WIDTH;
+            self.fitter.fit(compressed, &mut free, TRIAL_STEPS);
+            wide = Some(free.clone()).filter(|w| compressed.is_explained_by(w));
+            free.restrict_nuisances(first.nuisances);
+            self.fitter.fit(compressed, &mut free, TRIAL_STEPS);
+            if self.score(&free) < self.score(hypothesis) {
+                *hypothesis = free;
             }
         }
-        if !reading.is_explained(model) && first.spots.len() <= BLOB {
-            self.refine(reading, model, EARLY_ROUNDS);
+        if !compressed.is_explained_by(hypothesis) && first.sources.len() <= MAX_CLUSTER {
+            self.refine(compressed, hypothesis, EARLY_ROUNDS);
         }
-        if model.spots.len() > first.spots.len() + 1 {
-            *model = first;
+        if hypothesis.sources.len() > first.sources.len() + 1 {
+            *hypothesis = first;
         }
-        if let Some(mut wide) = wide.filter(|_| !reading.is_explained(model)) {
-            self.refine(reading, &mut wide, EARLY_ROUNDS);
-            if !self.is_odd(&wide) && self.score(&wide) < self.score(model) {
-                *model = wide;
+        if let Some(mut wide) = wide.filter(|_| !compressed.is_explained_by(hypothesis)) {
+            self.refine(compressed, &mut wide, EARLY_ROUNDS);
+            if !self.has_unequal_energies(&wide) && self.score(&wide) < self.score(hypothesis) {
+                *hypothesis = wide;
             }
         }
     }
 
-    /// The pencil's emitters, or those that stand out at once with a background where the frame looks lit: enough to tell what
-    /// in the residual cannot be light.
-    pub fn first_look(&mut self, reading: &Reading, frame: &Screened) -> Model {
-        self.factor = reading.lit_variance;
-        if self.sampler.is_some() {
-            return self.start(reading, frame, Nuisances::default(), POLISH);
+    /// The initial hypothesis: the pencil's sources, or the residual peaks of one round, with a background where one is visible. Good
+    /// enough to find isolated outliers in the residual.
+    pub fn initial_hypothesis(&mut self, compressed: &CompressedFrame, frame: &PreprocessedFrame) -> Hypothesis {
+        self.noise_inflation = compressed.light_weighted_variance;
+        if self.pencil.is_some() {
+            return self.initialise(compressed, frame, Nuisances::default(), PENCIL_FIT_STEPS);
         }
-        let mut model = Model::empty(Nuisances {
-            background: self.looks_lit(frame),
+        let mut hypothesis = Hypothesis::empty(Nuisances {
+            background: self.has_visible_background(frame),
             width: Width::Known,
         });
-        let peaks = self.residual_peaks(reading, &mut model);
+        let peaks = self.residual_peaks(compressed, &mut hypothesis);
         let least = peaks.first().map_or(0.0, |p| 0.1 * p.significance);
-        let spots = peaks
+        let sources = peaks
             .iter()
             .take_while(|p| p.significance >= least)
-            .take(reading.most_spots());
-        model.spots = spots.map(|p| Spot::new(p.u, p.a)).collect();
-        self.fitter.fit(reading, &mut model, TRIAL_STEPS);
-        model
+            .take(compressed.max_sources());
+        hypothesis.sources = sources.map(|p| PointSource::new(p.u, p.a)).collect();
+        self.fitter.fit(compressed, &mut hypothesis, TRIAL_STEPS);
+        hypothesis
     }
 
-    /// Adds peaks of the residual to `model` until none is significant, refitting all emitters each time.
-    pub fn greedy(&mut self, reading: &Reading, frame: &Screened, mut model: Model) -> Model {
-        while model.spots.len() < reading.most_spots() && (model.spots.is_empty() || !reading.is_explained(&model)) {
-            let room = reading.most_spots() - model.spots.len();
-            let mut next = model.clone();
-            let peaks = self.residual_peaks(reading, &mut model);
+    /// Adds peaks of the residual to `hypothesis` until none is significant, refitting all emitters each time.
+    pub fn add_residual_peaks(
+        &mut self,
+        compressed: &CompressedFrame,
+        frame: &PreprocessedFrame,
+        mut hypothesis: Hypothesis,
+    ) -> Hypothesis {
+        while hypothesis.sources.len() < compressed.max_sources()
+            && (hypothesis.sources.is_empty() || !compressed.is_explained_by(&hypothesis))
+        {
+            let room = compressed.max_sources() - hypothesis.sources.len();
+            let mut next = hypothesis.clone();
+            let peaks = self.residual_peaks(compressed, &mut hypothesis);
             let least = peaks.first().map_or(0.0, |p| 0.1 * p.significance);
             let strong = peaks.iter().take_while(|p| p.significance >= least).take(room);
-            next.spots.extend(strong.map(|p| Spot::new(p.u, p.a)));
-            if next.spots.len() == model.spots.len() {
+            next.sources.extend(strong.map(|p| PointSource::new(p.u, p.a)));
+            if next.sources.len() == hypothesis.sources.len() {
                 break;
             }
-            self.fitter.fit(reading, &mut next, TRIAL_STEPS);
-            // What looks like more emitters may be a background or another width: the better explanation stands.
-            if !reading.is_explained(&next) || next.spots.len() > model.spots.len() + FEW {
-                let wider = self.widened(reading, &model, &next);
+            self.fitter.fit(compressed, &mut next, TRIAL_STEPS);
+            // Apparent sources may be a background or another width: the better score decides.
+            if !compressed.is_explained_by(&next) || next.sources.len() > hypothesis.sources.len() + ACCEPTED_EXTRA {
+                let wider = self.with_more_nuisances(compressed, &hypothesis, &next);
                 if let Some(wider) = wider.filter(|w| self.score(w) < self.score(&next)) {
                     next = wider;
                 }
             }
-            if !reading.is_explained(&next) {
-                self.suspected = self.suspect(reading, frame, &mut model, &next);
+            if !compressed.is_explained_by(&next) {
+                self.suspected_variance = self.test_variance_growth(compressed, frame, &mut hypothesis, &next);
             }
-            if self.suspected.is_some() || self.score(&next) > self.score(&model) {
+            if self.suspected_variance.is_some() || self.score(&next) > self.score(&hypothesis) {
                 break;
             }
-            model = next;
+            hypothesis = next;
             if self.is_exhausted() {
                 break;
             }
         }
-        model
+        hypothesis
     }
 
-    pub(crate) fn is_torn(&self, reading: &Reading) -> bool {
-        reading.bad.len() as f64 > TORN * (self.fitter.bx.n * self.fitter.by.n) as f64
+    pub(crate) fn is_heavily_masked(&self, compressed: &CompressedFrame) -> bool {
+        compressed.masked.len() as f64 > MAX_MASKED_SHARE * (self.fitter.bx.n * self.fitter.by.n) as f64
     }
 
-    /// Seeds by the pencil for rising N until the frame is explained: as configured first, then with a background and
-    /// another width, both of which have singular values of their own.
-    fn pencil(&mut self, reading: &Reading, nuisances: Nuisances, polish: usize) -> Option<Model> {
-        if self.is_torn(reading) {
+    /// Fits the pencil's positions for rising numbers of sources until the frame is explained.
+    fn initialise_by_pencil(
+        &mut self,
+        compressed: &CompressedFrame,
+        nuisances: Nuisances,
+        polish: usize,
+    ) -> Option<Hypothesis> {
+        if self.is_heavily_masked(compressed) {
             return None;
         }
         let pencil = self
-            .sampler
+            .pencil
             .as_mut()?
-            .analyse(reading, &self.fitter.bx, &self.fitter.by)?;
-        let sure = pencil.strength.iter().take_while(|&&s| s > 4.0).count();
-        let likely = pencil.strength.iter().take_while(|&&s| s > 0.5).count();
-        let last = (likely + 2).min(pencil.most()).min(reading.most_spots());
-        let mut best = Model::empty(nuisances);
-        self.fitter.fit(reading, &mut best, TRIAL_STEPS);
+            .analyse(compressed, &self.fitter.bx, &self.fitter.by)?;
+        let sure = pencil.singular_value_ratio.iter().take_while(|&&s| s > 4.0).count();
+        let likely = pencil.singular_value_ratio.iter().take_while(|&&s| s > 0.5).count();
+        let last = (likely + 2).min(pencil.most()).min(compressed.max_sources());
+        let mut best = Hypothesis::empty(nuisances);
+        self.fitter.fit(compressed, &mut best, TRIAL_STEPS);
         // A background and another width have singular values of their own.
         let is_plain = nuisances == Nuisances::default();
         let (first, beyond) = if is_plain { (sure, 2) } else { (sure / 3, 3) };
-        self.climb(
-            reading,
+        self.fit_pencil_orders(
+            compressed,
             &pencil,
             &mut best,
             nuisances,
@@ -290,12 +315,12 @@ impl Search {
         Some(best)
     }
 
-    /// Fits the pencil's seeds for each count until `best`, which takes what scores better, explains the frame.
-    fn climb(
+    /// Fits the pencil's positions for each count until `best`, which keeps the better score, explains the frame.
+    fn fit_pencil_orders(
         &mut self,
-        reading: &Reading,
-        pencil: &Pencil,
-        best: &mut Model,
+        compressed: &CompressedFrame,
+        pencil: &MatrixPencil,
+        best: &mut Hypothesis,
         nuisances: Nuisances,
         counts: std::ops::RangeInclusive<usize>,
         polish: usize,
@@ -303,15 +328,18 @@ impl Search {
         let patience = if nuisances == Nuisances::default() { 1 } else { 3 };
         let mut worse = 0;
         for count in counts {
-            if reading.is_explained(best) || worse == patience || !best.spots.is_empty() && self.is_exhausted() {
+            if compressed.is_explained_by(best) || worse == patience || !best.sources.is_empty() && self.is_exhausted()
+            {
                 break;
             }
             let Some(seeds) = pencil.seeds(count) else { break };
-            let mut model = Model::empty(nuisances);
-            model.spots.extend(seeds.into_iter().map(|u| Spot::new(u, 0.0)));
-            self.fitter.fit(reading, &mut model, polish);
-            if self.score(&model) < self.score(best) {
-                *best = model;
+            let mut hypothesis = Hypothesis::empty(nuisances);
+            hypothesis
+                .sources
+                .extend(seeds.into_iter().map(|u| PointSource::new(u, 0.0)));
+            self.fitter.fit(compressed, &mut hypothesis, polish);
+            if self.score(&hypothesis) < self.score(best) {
+                *best = hypothesis;
                 worse = 0;
             } else if best.nuisances == nuisances {
                 worse += 1;
@@ -319,49 +347,62 @@ impl Search {
         }
     }
 
-    /// Seeds by the pencil where spots overlap, by residual peaks elsewhere.
-    pub fn start(&mut self, reading: &Reading, frame: &Screened, nuisances: Nuisances, polish: usize) -> Model {
-        self.pencil(reading, nuisances, polish).unwrap_or_else(|| {
-            let mut dark = Model::empty(nuisances);
-            self.fitter.fit(reading, &mut dark, TRIAL_STEPS);
-            self.greedy(reading, frame, dark)
-        })
+    /// A hypothesis from the pencil where spots overlap, from residual peaks elsewhere.
+    pub fn initialise(
+        &mut self,
+        compressed: &CompressedFrame,
+        frame: &PreprocessedFrame,
+        nuisances: Nuisances,
+        polish: usize,
+    ) -> Hypothesis {
+        self.initialise_by_pencil(compressed, nuisances, polish)
+            .unwrap_or_else(|| {
+                let mut dark = Hypothesis::empty(nuisances);
+                self.fitter.fit(compressed, &mut dark, TRIAL_STEPS);
+                self.add_residual_peaks(compressed, frame, dark)
+            })
     }
 
-    /// Fits `model` under new weights: nuisances where the frame cannot be explained without, then moves.
-    pub fn settle(&mut self, reading: &Reading, model: &mut Model, rounds: usize) {
-        self.fitter.fit(reading, model, TRIAL_STEPS);
-        if !reading.is_explained(model)
-            && let Some(wider) = self.widened(reading, model, model)
+    /// Refits `hypothesis` under new weights: nuisances where the frame is not explained, then proposals.
+    pub fn refit_reweighted(&mut self, compressed: &CompressedFrame, hypothesis: &mut Hypothesis, rounds: usize) {
+        self.fitter.fit(compressed, hypothesis, TRIAL_STEPS);
+        if !compressed.is_explained_by(hypothesis)
+            && let Some(wider) = self.with_more_nuisances(compressed, hypothesis, hypothesis)
         {
-            *model = wider;
+            *hypothesis = wider;
         }
-        self.refine(reading, model, rounds);
-        self.simplify(reading, model);
+        self.refine(compressed, hypothesis, rounds);
+        self.drop_nuisances(compressed, hypothesis);
     }
 
-    /// How the noise grows where that explains the frame better than `rival` does; only in the pixel bases.
-    fn suspect(&mut self, reading: &Reading, frame: &Screened, model: &mut Model, rival: &Model) -> Option<Growth> {
-        let is_even = self.fitter.bx.is_pixels && self.fitter.by.is_pixels && reading.weights.is_empty();
-        if !is_even || rival.deviance < 0.5 * model.deviance {
+    /// The variance function, where it explains the frame better than `rival` does; only in the pixel bases.
+    fn test_variance_growth(
+        &mut self,
+        compressed: &CompressedFrame,
+        frame: &PreprocessedFrame,
+        hypothesis: &mut Hypothesis,
+        rival: &Hypothesis,
+    ) -> Option<VarianceFunction> {
+        let is_even = self.fitter.bx.is_pixels && self.fitter.by.is_pixels && compressed.weights.is_empty();
+        if !is_even || rival.deviance < 0.5 * hypothesis.deviance {
             return None;
         }
-        let residual = self.fitter.residual_of(reading, model).to_vec();
-        let signal = self.fitter.expectation(reading, model);
-        let growth = Growth::fit(
+        let residual = self.fitter.weighted_residual(compressed, hypothesis).to_vec();
+        let signal = self.fitter.expected_light(compressed, hypothesis);
+        let variance = VarianceFunction::fit(
             frame,
-            [reading.rank[0], reading.mx],
+            [compressed.rank[0], compressed.mx],
             &residual,
             &signal,
-            model.spots.len(),
+            hypothesis.sources.len(),
         );
         let nx = self.fitter.bx.n;
-        let cost: f64 = (0..frame.is_bad.len())
-            .filter(|&k| !frame.is_bad[k])
-            .map(|k| k / nx * reading.mx + k % nx)
-            .map(|k| growth.at(signal[k]).ln() + residual[k].powi(2) / growth.at(signal[k]))
+        let cost: f64 = (0..frame.is_masked.len())
+            .filter(|&k| !frame.is_masked[k])
+            .map(|k| k / nx * compressed.mx + k % nx)
+            .map(|k| variance.at(signal[k]).ln() + residual[k].powi(2) / variance.at(signal[k]))
             .sum();
-        let score = self.score(model) - model.deviance + cost + Growth::PRICE;
-        (score < self.score(rival)).then_some(growth)
+        let score = self.score(hypothesis) - hypothesis.deviance + cost + VarianceFunction::PENALTY;
+        (score < self.score(rival)).then_some(variance)
     }
 }

@@ -1,4 +1,4 @@
-//! Pixels that tell nothing, taken out of the fit again, which is exact whatever they were filled with.
+//! Masked pixels: an exact downdate of the normal equations, whatever value the pixels were filled with.
 
 use std::collections::BTreeSet;
 use std::ops::Range;
@@ -6,23 +6,23 @@ use std::ops::Range;
 use crate::estimate::dense_linalg::{axpy, combine, dot};
 use crate::estimate::model::svd_basis::Basis;
 
-/// Runs of so many pixels each, on average, are summed over as a whole.
+/// Mean length of a run from which sums over runs are cheaper than sums over pixels.
 const LONG: usize = 4;
-/// Fewer pixels than this are taken out one by one.
+/// Fewer masked pixels than this are downdated one by one.
 const MANY: usize = 64;
-/// A further change of the deviance that is not worth another round of filling.
+/// Conjugate gradients stop when an iteration changes the deviance by less than this, or after so many iterations.
 const SMALL: f64 = 1e-3;
 const ROUNDS: usize = 500;
 
-/// An unusable pixel with what it was filled with.
+/// A masked pixel and the value it was filled with.
 #[derive(Clone, Copy)]
-pub(crate) struct BadPixel {
+pub(crate) struct MaskedPixel {
     pub x: usize,
     pub y: usize,
     pub value: f64,
 }
 
-/// Neighbours in one row.
+/// Adjacent masked pixels of one row.
 #[derive(Clone)]
 pub(crate) struct Run {
     pub y: usize,
@@ -30,21 +30,29 @@ pub(crate) struct Run {
     first: usize,
 }
 
-/// A frame's unusable pixels, row by row.
+/// A frame's masked pixels, row by row.
 #[derive(Clone, Default)]
-pub(crate) struct Unusable {
-    pub pixels: Vec<BadPixel>,
+pub(crate) struct MaskedPixels {
+    pub pixels: Vec<MaskedPixel>,
     runs: Vec<Run>,
-    /// Their columns and rows, each once.
+    /// Distinct columns and rows of the masked pixels.
     pub lines: [Vec<usize>; 2],
-    /// What they were filled with beyond what the bases hold there.
-    beyond: Vec<f64>,
+    /// Fill values less what the bases hold at the pixels.
+    fill_excess: Vec<f64>,
 }
 
-impl Unusable {
-    /// The unusable pixels of a frame of coefficients `z`, (my, mx), which are filled in.
+impl MaskedPixels {
+    /// Loads the masked pixels of a frame with coefficients `z`, (my, mx); where the frame is compressed both are changed so that the
+    /// fill lies within the bases.
     #[inline(always)]
-    pub fn load(&mut self, pixels: impl Iterator<Item = BadPixel>, z: &mut [f64], mx: usize, bx: &Basis, by: &Basis) {
+    pub fn load(
+        &mut self,
+        pixels: impl Iterator<Item = MaskedPixel>,
+        z: &mut [f64],
+        mx: usize,
+        bx: &Basis,
+        by: &Basis,
+    ) {
         self.clear();
         self.pixels.extend(pixels);
         if self.pixels.is_empty() {
@@ -66,9 +74,9 @@ impl Unusable {
             columns.into_iter().collect(),
             self.runs.chunk_by(|a, b| a.y == b.y).map(|row| row[0].y).collect(),
         ];
-        self.beyond.resize(self.pixels.len(), 0.0);
+        self.fill_excess.resize(self.pixels.len(), 0.0);
         if !(bx.is_pixels && by.is_pixels) {
-            self.fill(z, mx, [bx, by]);
+            self.fill_consistently(z, mx, [bx, by]);
         }
     }
 
@@ -76,7 +84,7 @@ impl Unusable {
         self.pixels.clear();
         self.runs.clear();
         self.lines = Default::default();
-        self.beyond.clear();
+        self.fill_excess.clear();
     }
 
     pub fn len(&self) -> usize {
@@ -88,29 +96,29 @@ impl Unusable {
     }
 
     /// Whether sums over runs cost less than sums over pixels.
-    fn is_long(&self) -> bool {
+    fn prefers_runs(&self) -> bool {
         self.len() >= MANY && self.len() >= LONG * self.runs.len()
     }
 
-    /// Their runs, where these are long.
+    /// The runs, if sums over runs are cheaper; otherwise none.
     pub fn runs(&self) -> &[Run] {
-        if self.is_long() { &self.runs } else { &[] }
+        if self.prefers_runs() { &self.runs } else { &[] }
     }
 
-    /// The pixels one by one, elsewhere.
-    pub fn scattered(&self) -> &[BadPixel] {
-        if self.is_long() { &[] } else { &self.pixels }
+    /// The single pixels, if sums over pixels are cheaper; otherwise none.
+    pub fn scattered(&self) -> &[MaskedPixel] {
+        if self.prefers_runs() { &[] } else { &self.pixels }
     }
 
-    /// Multiplications of [`Unusable::take_out`].
-    pub fn work(&self, mx: usize, my: usize) -> f64 {
+    /// Multiplications of [`MaskedPixels::project_out`].
+    pub fn project_out_cost(&self, mx: usize, my: usize) -> f64 {
         (2 * mx * (self.len() + my * self.lines[1].len())) as f64
     }
 
-    /// Takes what the pixels hold of a matrix (my, mx) out of it, M − UᵦᵀUᵦM; of a frame's residual also what they were filled
-    /// with. Returns the square of what they held.
+    /// Removes the masked pixels' part from a matrix (my, mx): M − UᵦᵀUᵦM. From a frame's residual (`is_residual`) the fill values are
+    /// removed too. Returns the removed square.
     #[inline(always)]
-    pub fn take_out(
+    pub fn project_out(
         &self,
         matrix: &mut [f64],
         mx: usize,
@@ -139,9 +147,9 @@ impl Unusable {
             combine([uy], 1, whole, mx, mx, row);
             sum.fill(0.0);
             for run in line {
-                let held = run.show(row, bx, held);
+                let held = run.evaluate(row, bx, held);
                 if is_residual {
-                    axpy(1.0, &self.beyond[run.first..], held);
+                    axpy(1.0, &self.fill_excess[run.first..], held);
                 }
                 square += dot(held, held);
                 combine([&*held], 1, &bx.rows()[run.x.start * bx.stride..], bx.stride, mx, part);
@@ -154,38 +162,38 @@ impl Unusable {
         square
     }
 
-    /// Notes what the pixels were filled with beyond what `z` holds there.
+    /// Sets `fill_excess`: the fill values less what `z` holds at the pixels.
     #[inline(always)]
-    fn compare(&mut self, z: &[f64], mx: usize, [bx, by]: [&Basis; 2]) {
+    fn record_fill_excess(&mut self, z: &[f64], mx: usize, [bx, by]: [&Basis; 2]) {
         let my = z.len() / mx;
         let (mut row, mut held) = (vec![0.0; mx], vec![0.0; bx.width()]);
         for run in &self.runs {
             combine([&by.row(run.y)[..my]], 1, z, mx, mx, &mut row);
-            let held = run.show(&row, bx, &mut held);
+            let held = run.evaluate(&row, bx, &mut held);
             for (k, shown) in held.iter().enumerate() {
-                self.beyond[run.first + k] = self.pixels[run.first + k].value - shown;
+                self.fill_excess[run.first + k] = self.pixels[run.first + k].value - shown;
             }
         }
     }
 
-    /// Fills the pixels with what the usable ones let the bases say there, and `z`, (my, mx), accordingly: then nothing of them lies
-    /// outside the bases, where it would pass for noise.
+    /// Fills the pixels with the value that the bases predict there from the usable pixels, and updates `z`, (my, mx): then no part of
+    /// the fill lies outside the bases, where it would count as noise.
     ///
     /// The usable pixels' coefficients solve (I − UᵦᵀUᵦ) z = Uᵀ y over them; conjugate gradients (Hestenes and Stiefel, 1952).
     #[inline(always)]
-    fn fill(&mut self, z: &mut [f64], mx: usize, axes: [&Basis; 2]) {
+    fn fill_consistently(&mut self, z: &mut [f64], mx: usize, axes: [&Basis; 2]) {
         let mut scratch = Vec::new();
-        self.compare(z, mx, axes);
+        self.record_fill_excess(z, mx, axes);
         let mut usable = z.to_vec();
-        self.take_out(&mut usable, mx, axes, true, &mut scratch);
+        self.project_out(&mut usable, mx, axes, true, &mut scratch);
         let mut change = z.to_vec();
-        self.take_out(&mut change, mx, axes, false, &mut scratch);
+        self.project_out(&mut change, mx, axes, false, &mut scratch);
         let mut left: Vec<f64> = usable.iter().zip(&change).map(|(u, c)| u - c).collect();
         let mut direction = left.clone();
         let mut square = dot(&left, &left);
         for _ in 0..ROUNDS {
             change.clone_from(&direction);
-            self.take_out(&mut change, mx, axes, false, &mut scratch);
+            self.project_out(&mut change, mx, axes, false, &mut scratch);
             let curvature = dot(&direction, &change);
             if !(curvature > 1e-12 * dot(&direction, &direction)) {
                 break;
@@ -201,24 +209,24 @@ impl Unusable {
                 *d = l + square / before * *d;
             }
         }
-        self.compare(z, mx, axes);
-        for (b, beyond) in self.pixels.iter_mut().zip(&self.beyond) {
-            b.value -= beyond;
+        self.record_fill_excess(z, mx, axes);
+        for (b, fill_excess) in self.pixels.iter_mut().zip(&self.fill_excess) {
+            b.value -= fill_excess;
         }
-        // Of what the pixels hold now, whether or not the rounds came to an end.
+        // Consistent with the fill as it is now, whether or not the iteration converged.
         change.copy_from_slice(z);
-        self.take_out(&mut change, mx, axes, false, &mut scratch);
+        self.project_out(&mut change, mx, axes, false, &mut scratch);
         for ((z, c), u) in z.iter_mut().zip(&change).zip(&usable) {
             *z += u - c;
         }
-        self.compare(z, mx, axes);
+        self.record_fill_excess(z, mx, axes);
     }
 }
 
 impl Run {
-    /// What a row of coefficients, (mx), holds at its pixels; `out` has room for a row of the frame.
+    /// Values of a row of coefficients, (mx), at the run's pixels; `out` has room for a row of the frame.
     #[inline(always)]
-    fn show<'a>(&self, row: &[f64], bx: &Basis, out: &'a mut [f64]) -> &'a mut [f64] {
+    fn evaluate<'a>(&self, row: &[f64], bx: &Basis, out: &'a mut [f64]) -> &'a mut [f64] {
         let length = self.x.len();
         let columns = bx.columns_from(self.x.start);
         combine([row], 1, columns, bx.width(), length.next_multiple_of(4), out);
@@ -232,14 +240,14 @@ mod tests {
     use crate::optics::Axis;
 
     #[test]
-    fn what_is_taken_out_is_what_the_pixels_hold() {
+    fn projecting_out_agrees_with_the_definition() {
         let b = Basis::new(&Axis::centred(20, 0.02), 0.004);
         let m = b.columns().next_multiple_of(4).min(b.stride);
         let mut z: Vec<f64> = (0..m * m).map(|k| ((k * 37 % 101) as f64 / 50.0) - 1.0).collect();
         let blob = (0..6).flat_map(|y| (0..5).map(move |x| (x + 7, y + 9)));
         let pixels: Vec<_> = blob.chain([(0, 0), (19, 3), (4, 19)]).collect();
-        let filled = pixels.iter().map(|&(x, y)| BadPixel { x, y, value: 40.0 });
-        let mut bad = Unusable::default();
+        let filled = pixels.iter().map(|&(x, y)| MaskedPixel { x, y, value: 40.0 });
+        let mut bad = MaskedPixels::default();
         bad.load(filled, &mut z, m, &b, &b);
         let mut expected = z.clone();
         let mut square = 0.0;
@@ -252,7 +260,7 @@ mod tests {
             }
         }
         let mut taken = z.clone();
-        let found = bad.take_out(&mut taken, m, [&b, &b], false, &mut Vec::new());
+        let found = bad.project_out(&mut taken, m, [&b, &b], false, &mut Vec::new());
         assert!((found - square).abs() < 1e-9 * square, "{found} {square}");
         for (t, e) in taken.iter().zip(&expected) {
             assert!((t - e).abs() < 1e-9, "{t} {e}");

@@ -1,20 +1,21 @@
 //! The variance of a pixel's noise as a function of its expected light.
 
-use crate::estimate::preprocess::screening::Screened;
+use crate::estimate::preprocess::screening::PreprocessedFrame;
 
-/// Largest share of a pixel's noise that a fit is taken to have absorbed, and steps of the growth's own fit.
+/// Largest share of a pixel's noise that a fit is taken to have absorbed, and Fisher scoring steps of the fit.
 const LEVERAGE: f64 = 0.6;
 const SCORING: usize = 8;
 
-/// Variance of a pixel's noise in units of the configured: c + a s + b s², s the signal in units of the noise.
+/// Variance of a pixel's noise in units of the configured variance: c + a s + b s², s the expected light in units of the noise. a is
+/// shot noise, b gain scatter.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) struct Growth {
+pub(crate) struct VarianceFunction {
     pub floor: f64,
     pub linear: f64,
     pub square: f64,
 }
 
-impl Default for Growth {
+impl Default for VarianceFunction {
     fn default() -> Self {
         Self {
             floor: 1.0,
@@ -24,27 +25,34 @@ impl Default for Growth {
     }
 }
 
-impl Growth {
-    /// Least gain in −2 ln likelihood for which noise is taken to grow.
-    pub const PRICE: f64 = 10.0;
+impl VarianceFunction {
+    /// Least gain in −2 ln likelihood for which the noise is taken to depend on the light.
+    pub const PENALTY: f64 = 10.0;
 
     pub fn at(self, signal: f64) -> f64 {
         let s = signal.max(0.0);
         self.floor + s * (self.linear + s * self.square)
     }
 
-    /// Maximum likelihood from what a model of `spots` emitters leaves (Fisher scoring for a variance that is linear in
-    /// its parameters), shot noise or gain scatter, whichever explains more. `residual` and `signal` (my, mx) in pixels.
-    pub fn fit(frame: &Screened, [nx, stride]: [usize; 2], residual: &[f64], signal: &[f64], spots: usize) -> Self {
+    /// Maximum-likelihood fit to the residual of a model of `sources` emitters (Fisher scoring for a variance that is linear in
+    /// its parameters), shot noise or gain scatter, whichever explains more. `residual` and `signal` are rows of `nx` pixels,
+    /// `stride` numbers apart.
+    pub fn fit(
+        frame: &PreprocessedFrame,
+        [nx, stride]: [usize; 2],
+        residual: &[f64],
+        signal: &[f64],
+        sources: usize,
+    ) -> Self {
         let total: f64 = signal.iter().map(|s| s.max(0.0)).sum();
         let brightest = signal.iter().fold(0.0, |a: f64, &s| a.max(s));
         let mut points = Vec::with_capacity(frame.pixels.len());
-        for (k, _) in frame.is_bad.iter().enumerate().filter(|(_, bad)| !**bad) {
+        for (k, _) in frame.is_masked.iter().enumerate().filter(|(_, bad)| !**bad) {
             let at = k / nx * stride + k % nx;
             let s = signal[at].max(0.0);
-            // What the fit's own parameters have absorbed there.
+            // The share of the noise that the fit's own parameters absorb there.
             let leverage = if total > 0.0 {
-                (3.0 * spots as f64 * s / total).min(LEVERAGE)
+                (3.0 * sources as f64 * s / total).min(LEVERAGE)
             } else {
                 0.0
             };
@@ -91,7 +99,7 @@ impl Growth {
         best.0
     }
 
-    pub fn is_flat(self) -> bool {
+    pub fn is_constant(self) -> bool {
         self == Self::default()
     }
 }

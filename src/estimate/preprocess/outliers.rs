@@ -1,64 +1,71 @@
-//! What a frame itself says about its noise, without a model of its emitters.
+//! Measures the noise and finds hot and dead pixels from the part of a frame outside the basis, where no spot can reach.
 //!
-//! No spot can reach outside the basis, so what lies there is noise: its mean square is the noise's, a single pixel
-//! that stands out of it is hot or dead, and where it grows with the signal the noise is shot noise or gain scatter.
+//! The mean square out there is the noise's variance, a single pixel that exceeds it is hot or dead, and where it grows with the
+//! signal the noise is shot noise or gain scatter.
 
-use crate::estimate::model::compressed_frame::Reading;
+use crate::estimate::model::compressed_frame::CompressedFrame;
 use crate::estimate::model::svd_basis::Basis;
-use crate::estimate::preprocess::noise_variance::Growth;
-use crate::estimate::preprocess::screening::Screened;
+use crate::estimate::preprocess::noise_variance::VarianceFunction;
+use crate::estimate::preprocess::screening::PreprocessedFrame;
 
-/// Numbers outside the basis below which they are too few to judge by.
+/// Fewest numbers outside the basis from which the noise is measured.
 const FEWEST: f64 = 100.0;
-/// Standard deviations by which the noise must differ from the configured before it is believed.
+/// Standard deviations by which the measured noise must differ from the configured noise to replace it.
 const DIFFERENT: f64 = 4.0;
-/// Standard deviations at which a single pixel is taken for hot or dead.
+/// Standard deviations from which a single pixel is hot or dead.
 const OUTLIER: f64 = 6.0;
+/// Passes of rejection; each reloads the frame without the pixels found.
 const PASSES: usize = 14;
-/// One pass rejects what stands out at least this share of the worst: the worst hide the rest.
+/// One pass rejects pixels of at least this share of the worst one's deviation: the worst hide the rest.
 const SHARE: f64 = 0.5;
-/// Pixels wider than this, σ, can be lit alone by a spot.
+/// Pixels wider than this, σ, can be lit alone by a spot and are not tested for isolation.
 const WIDEST_PIXEL: f64 = 0.5;
-/// Signal levels that the noise is measured at.
+/// Signal levels at which the noise is measured.
 const LEVELS: usize = 8;
 
-/// Scratch memory of the inspection.
+/// The inspection's scratch memory and its last verdict.
 #[derive(Default)]
-pub(crate) struct Inspection {
+pub(crate) struct NoiseInspection {
     smooth: Vec<f64>,
     leverage: [Vec<f64>; 2],
     squares: Vec<(f64, f64)>,
-    /// Nothing but noise lies outside the basis.
-    pub is_clean: bool,
+    /// Whether the part outside the basis is white noise of the configured variance.
+    pub is_white: bool,
 }
 
-impl Inspection {
-    /// Finds hot and dead pixels, measures the noise, and loads `reading` anew where that changes it: the frame is
-    /// divided by the noise measured (returned, in units of the configured), bad pixels are listed and filled in.
-    pub fn run(&mut self, frame: &mut Screened, reading: &mut Reading, bx: &Basis, by: &Basis) -> f64 {
-        let z = |reading: &Reading| (reading.outside.0 - 1.0) * (reading.outside.1 / 2.0).sqrt();
-        self.is_clean = z(reading).abs() < DIFFERENT;
-        if self.is_clean || reading.outside.1 < FEWEST {
+impl NoiseInspection {
+    /// Masks hot and dead pixels, measures the noise, and reloads `compressed` where that changes it: the frame is divided by the
+    /// measured noise, which is returned in units of the configured noise.
+    pub fn run(
+        &mut self,
+        frame: &mut PreprocessedFrame,
+        compressed: &mut CompressedFrame,
+        bx: &Basis,
+        by: &Basis,
+    ) -> f64 {
+        let z = |compressed: &CompressedFrame| (compressed.outside.0 - 1.0) * (compressed.outside.1 / 2.0).sqrt();
+        self.is_white = z(compressed).abs() < DIFFERENT;
+        if self.is_white || compressed.outside.1 < FEWEST {
             return 1.0;
         }
         for _ in 0..PASSES {
-            reading.expand(bx, by, &mut self.smooth);
-            self.measure(frame, reading, bx, by);
-            if !self.reject(frame, reading, bx.n) {
+            compressed.expand(bx, by, &mut self.smooth);
+            self.measure_out_of_basis(frame, compressed, bx, by);
+            if !self.mask_outliers(frame, compressed, bx.n) {
                 break;
             }
-            reading.load(frame, bx, by);
+            compressed.load(frame, bx, by);
         }
-        reading.expand(bx, by, &mut self.smooth);
-        self.measure(frame, reading, bx, by);
-        let dark = self.grow(reading);
-        // Even noise is best measured by all of it; a median would take it for Gaussian.
-        let floor = if reading.growth.is_flat() {
-            reading.outside.0
+        compressed.expand(bx, by, &mut self.smooth);
+        self.measure_out_of_basis(frame, compressed, bx, by);
+        let dark = self.estimate_variance(compressed);
+        // Constant noise is measured by its mean square; a median would assume it Gaussian.
+        let floor = if compressed.variance.is_constant() {
+            compressed.outside.0
         } else {
             dark
         };
-        let floor = if (floor - 1.0).abs() * (reading.outside.1 / 2.0).sqrt() < DIFFERENT {
+        let floor = if (floor - 1.0).abs() * (compressed.outside.1 / 2.0).sqrt() < DIFFERENT {
             1.0
         } else {
             floor
@@ -67,33 +74,33 @@ impl Inspection {
         for p in &mut frame.pixels {
             *p /= scale;
         }
-        let growth = reading.growth;
-        reading.load(frame, bx, by);
+        let variance = compressed.variance;
+        compressed.load(frame, bx, by);
         // Of (1 + a s + b s²)·floor with s in the old units.
-        reading.growth = Growth {
+        compressed.variance = VarianceFunction {
             floor: 1.0,
-            linear: growth.linear * scale,
-            square: growth.square * floor,
+            linear: variance.linear * scale,
+            square: variance.square * floor,
         };
         let (mut all, mut lit, mut weight) = (0.0, 0.0, 0.0);
         for &s in &self.smooth {
             let s = (s / scale).max(0.0);
-            let v = reading.growth.at(s);
+            let v = compressed.variance.at(s);
             all += v;
             lit += v * s;
             weight += s;
         }
-        reading.mean_variance = all / self.smooth.len() as f64;
-        reading.lit_variance = if weight > 0.0 { (lit / weight).max(1.0) } else { 1.0 };
+        compressed.mean_variance = all / self.smooth.len() as f64;
+        compressed.light_weighted_variance = if weight > 0.0 { (lit / weight).max(1.0) } else { 1.0 };
         scale
     }
 
-    /// Rejects pixels that stand out of what a first model expects, (my, mx), alone, as no spot or misfit of one can.
-    /// `true` where there were any.
-    pub fn reject_lone(
+    /// Masks isolated pixels that deviate from the light expected by a first hypothesis, (my, mx), as neither a spot nor its misfit can.
+    /// Returns whether there were any.
+    pub fn mask_isolated_outliers(
         &mut self,
-        frame: &mut Screened,
-        reading: &mut Reading,
+        frame: &mut PreprocessedFrame,
+        compressed: &mut CompressedFrame,
         expected: Vec<f64>,
         bx: &Basis,
         by: &Basis,
@@ -102,25 +109,25 @@ impl Inspection {
             return false;
         }
         let (nx, ny) = (bx.n, by.n);
-        reading.expand_matrix(&expected, bx, by, &mut self.smooth);
+        compressed.expand_matrix(&expected, bx, by, &mut self.smooth);
         let left: Vec<f64> = frame.pixels.iter().zip(&self.smooth).map(|(p, m)| p - m).collect();
         let mut found = Vec::new();
         for y in 0..ny {
             for x in 0..nx {
                 let k = y * nx + x;
-                if frame.is_bad[k] {
+                if frame.is_masked[k] {
                     continue;
                 }
                 let (mut sum, mut count, mut most) = (0.0, 0.0, 0.0f64);
                 for (a, b) in [(x.wrapping_sub(1), y), (x + 1, y), (x, y.wrapping_sub(1)), (x, y + 1)] {
-                    if a < nx && b < ny && !frame.is_bad[b * nx + a] {
+                    if a < nx && b < ny && !frame.is_masked[b * nx + a] {
                         sum += left[b * nx + a];
                         count += 1.0;
                         most = most.max(left[b * nx + a].abs());
                     }
                 }
                 let beyond = (left[k] - if count > 0.0 { sum / count } else { 0.0 }).abs();
-                let noise = reading.growth.at(self.smooth[k]).sqrt();
+                let noise = compressed.variance.at(self.smooth[k]).sqrt();
                 // The mean of four neighbours adds a quarter of their variance.
                 let is_alone = beyond > 0.8 * left[k].abs() && left[k].abs() > 0.6 * beyond.max(most);
                 if is_alone && beyond > OUTLIER * noise * 1.12 {
@@ -129,25 +136,39 @@ impl Inspection {
             }
         }
         for &(x, y) in &found {
-            frame.reject(x, y, nx);
+            frame.mask(x, y, nx);
             frame.pixels[y * nx + x] = self.smooth[y * nx + x];
         }
         if !found.is_empty() {
-            let noise = (reading.growth, reading.mean_variance, reading.lit_variance);
-            reading.load(frame, bx, by);
-            (reading.growth, reading.mean_variance, reading.lit_variance) = noise;
+            let noise = (
+                compressed.variance,
+                compressed.mean_variance,
+                compressed.light_weighted_variance,
+            );
+            compressed.load(frame, bx, by);
+            (
+                compressed.variance,
+                compressed.mean_variance,
+                compressed.light_weighted_variance,
+            ) = noise;
         }
         !found.is_empty()
     }
 
-    /// Squares of what lies outside, each over the share of a pixel that does, with the signal there.
-    fn measure(&mut self, frame: &Screened, reading: &Reading, bx: &Basis, by: &Basis) {
+    /// Sets `squares`: for each pixel the signal and the squared out-of-basis part over the pixel's out-of-basis share.
+    fn measure_out_of_basis(
+        &mut self,
+        frame: &PreprocessedFrame,
+        compressed: &CompressedFrame,
+        bx: &Basis,
+        by: &Basis,
+    ) {
         let share = |b: &Basis, m: usize| (0..b.n).map(|k| b.row(k)[..m].iter().map(|u| u * u).sum()).collect();
-        self.leverage = [share(bx, reading.mx), share(by, reading.my)];
+        self.leverage = [share(bx, compressed.mx), share(by, compressed.my)];
         self.squares.clear();
         for (k, (&p, &s)) in frame.pixels.iter().zip(&self.smooth).enumerate() {
             let outside = (1.0 - self.leverage[0][k % bx.n] * self.leverage[1][k / bx.n]).max(1e-3);
-            let square = if frame.is_bad[k] {
+            let square = if frame.is_masked[k] {
                 f64::NAN
             } else {
                 (p - s).powi(2) / outside
@@ -156,16 +177,16 @@ impl Inspection {
         }
     }
 
-    /// Rejects pixels that stand out. `false` where there was none.
-    fn reject(&mut self, frame: &mut Screened, reading: &mut Reading, nx: usize) -> bool {
-        let floor = self.grow(reading);
+    /// Masks the pixels with the largest out-of-basis part. Returns whether there were any.
+    fn mask_outliers(&mut self, frame: &mut PreprocessedFrame, compressed: &mut CompressedFrame, nx: usize) -> bool {
+        let floor = self.estimate_variance(compressed);
         let ny = frame.pixels.len() / nx;
         let excess = |k: usize| {
             let (s, square) = self.squares[k];
             if square.is_nan() {
                 0.0
             } else {
-                square / (floor * reading.growth.at(s))
+                square / (floor * compressed.variance.at(s))
             }
         };
         let worst = (0..self.squares.len()).map(excess).fold(0.0, f64::max);
@@ -187,19 +208,19 @@ impl Inspection {
             }
         }
         for &(x, y) in &found {
-            frame.reject(x, y, nx);
+            frame.mask(x, y, nx);
         }
         !found.is_empty()
     }
 
-    /// Variance in the dark, with its growth with the signal set in `reading`. Medians, so that outliers count for
-    /// little: the median of a χ² variate of one degree of freedom is 0.4549.
-    fn grow(&mut self, reading: &mut Reading) -> f64 {
+    /// Returns the variance in the dark and sets `compressed.variance`. Uses medians, which outliers hardly change: the median of a χ²
+    /// variate of one degree of freedom is 0.4549.
+    fn estimate_variance(&mut self, compressed: &mut CompressedFrame) -> f64 {
         let mut points: Vec<(f64, f64)> = self.squares.iter().copied().filter(|s| !s.1.is_nan()).collect();
         if points.len() < 8 * LEVELS {
             return 1.0;
         }
-        // Half the pixels make the dark level, the rest levels of rising signal and falling number.
+        // The darkest half of the pixels is the dark level; the other levels rise in signal and fall in size.
         let mut levels = Vec::with_capacity(LEVELS);
         let mut rest = points.as_mut_slice();
         for _ in 0..LEVELS {
@@ -223,9 +244,9 @@ impl Inspection {
             .copied()
             .fold((0.0, 0.0, 1.0), |a, b| if b.1 > a.1 { b } else { a });
         let excess = brightest.1 / dark - 1.0;
-        reading.growth = Growth::default();
+        compressed.variance = VarianceFunction::default();
         if brightest.0 <= 0.0 || excess < DIFFERENT * 2.3 / (brightest.2).sqrt() {
-            // One level: all pixels together say it best.
+            // One level: use all pixels together.
             return median_variance(&mut points).max(1e-6);
         }
         let fit = |power: i32| {
@@ -243,15 +264,15 @@ impl Inspection {
             (slope, misfit)
         };
         let ((linear, a), (square, b)) = (fit(1), fit(2));
-        reading.growth = if a < b {
-            Growth {
+        compressed.variance = if a < b {
+            VarianceFunction {
                 linear,
-                ..Growth::default()
+                ..VarianceFunction::default()
             }
         } else {
-            Growth {
+            VarianceFunction {
                 square,
-                ..Growth::default()
+                ..VarianceFunction::default()
             }
         };
         dark

@@ -1,32 +1,32 @@
-//! Validation: which pixels of a frame may be used, in units of the noise.
+//! Validates a frame: divides it by the noise, lists the pixels that cannot be used and interpolates over them.
 
 use crate::estimate::error::Error;
 use crate::frame::Frame;
 use crate::optics::Camera;
 
-/// A pixel of this many standard deviations of the noise is no measurement.
+/// Values of this many standard deviations or more count as non-finite: their squares approach the range of f64.
 const OVERFLOWS: f64 = 1e100;
 
-/// A frame divided by the noise, with its unusable pixels listed and filled in.
+/// A frame in units of the noise's standard deviation, with its masked pixels listed and filled in.
 #[derive(Clone, Default)]
-pub(crate) struct Screened {
-    /// (Ny, Nx) row-major. Unusable pixels hold the mean of their usable neighbours, or `ceiling`; a fit must not
-    /// look at them.
+pub(crate) struct PreprocessedFrame {
+    /// (Ny, Nx) row-major. Masked pixels hold the mean of their usable neighbours, or `ceiling`; a fit must not
+    /// use them.
     pub pixels: Vec<f64>,
-    pub bad: Vec<Bad>,
-    pub is_bad: Vec<bool>,
+    pub flagged: Vec<FlaggedPixel>,
+    pub is_masked: Vec<bool>,
     pub saturated: usize,
 }
 
-/// A pixel that carries no usable value.
+/// A pixel that must not be used, and why.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) struct Bad {
+pub(crate) struct FlaggedPixel {
     pub x: usize,
     pub y: usize,
     pub is_saturated: bool,
 }
 
-impl Screened {
+impl PreprocessedFrame {
     /// Checks and normalises a frame.
     pub fn load(&mut self, frame: &Frame, camera: &Camera) -> Result<(), Error> {
         let (ny, nx) = frame.pixels.dim();
@@ -39,16 +39,16 @@ impl Screened {
             });
         }
         self.pixels.clear();
-        self.bad.clear();
-        self.is_bad.clear();
+        self.flagged.clear();
+        self.is_masked.clear();
         self.saturated = 0;
         let (mut nan, mut masked) = (0, 0);
         let scale = 1.0 / camera.noise_std_j;
         let ceiling = camera.saturation_j.unwrap_or(f64::INFINITY);
         self.pixels.extend(frame.pixels.iter().map(|value| value * scale));
-        self.is_bad.resize(self.pixels.len(), false);
+        self.is_masked.resize(self.pixels.len(), false);
         let is_sound = |value: f64| (value * scale).abs() < OVERFLOWS && value < ceiling;
-        // Most frames are: no branch, so that the compiler takes several pixels at a time.
+        // The common case: without branches, so that the loop is vectorised.
         if frame.masked.is_none() && frame.pixels.iter().fold(true, |all, &value| all & is_sound(value)) {
             return Ok(());
         }
@@ -58,15 +58,15 @@ impl Screened {
                 continue;
             }
             let is_saturated = value >= ceiling;
-            // Squares of such a value leave the range of f64: it is as little light as ∞.
+            // Values whose square overflows count as non-finite.
             nan += usize::from(!((value * scale).abs() < OVERFLOWS));
             masked += usize::from(is_masked);
             self.saturated += usize::from(is_saturated);
-            self.bad.push(Bad { x, y, is_saturated });
-            self.is_bad[k] = true;
+            self.flagged.push(FlaggedPixel { x, y, is_saturated });
+            self.is_masked[k] = true;
             self.pixels[k] = ceiling * scale;
         }
-        if self.bad.len() == self.pixels.len() {
+        if self.flagged.len() == self.pixels.len() {
             return Err(Error::NoUsablePixel {
                 total: self.pixels.len(),
                 nan,
@@ -74,14 +74,14 @@ impl Screened {
                 masked,
             });
         }
-        self.fill(nx, ny);
+        self.interpolate_masked(nx, ny);
         Ok(())
     }
 
-    /// Marks one more pixel as unusable. The caller fills it.
-    pub fn reject(&mut self, x: usize, y: usize, nx: usize) {
-        if !std::mem::replace(&mut self.is_bad[y * nx + x], true) {
-            self.bad.push(Bad {
+    /// Masks one more pixel; the caller fills it.
+    pub fn mask(&mut self, x: usize, y: usize, nx: usize) {
+        if !std::mem::replace(&mut self.is_masked[y * nx + x], true) {
+            self.flagged.push(FlaggedPixel {
                 x,
                 y,
                 is_saturated: false,
@@ -89,9 +89,9 @@ impl Screened {
         }
     }
 
-    /// Gives every unusable pixel that is not saturated the mean of the usable ones nearest to it.
-    fn fill(&mut self, nx: usize, ny: usize) {
-        for bad in &self.bad {
+    /// Gives every masked pixel that is not saturated the mean of the nearest usable ones.
+    fn interpolate_masked(&mut self, nx: usize, ny: usize) {
+        for bad in &self.flagged {
             if bad.is_saturated && self.pixels[bad.y * nx + bad.x].is_finite() {
                 continue;
             }
@@ -100,7 +100,7 @@ impl Screened {
                 let (mut sum, mut count) = (0.0, 0);
                 for y in bad.y.saturating_sub(radius)..=(bad.y + radius).min(ny - 1) {
                     for x in bad.x.saturating_sub(radius)..=(bad.x + radius).min(nx - 1) {
-                        if !self.is_bad[y * nx + x] {
+                        if !self.is_masked[y * nx + x] {
                             sum += self.pixels[y * nx + x];
                             count += 1;
                         }

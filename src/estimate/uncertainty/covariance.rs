@@ -1,17 +1,17 @@
-//! What an information matrix says: the covariance, how well it is conditioned, its determinant.
+//! The covariance, condition number and determinant of an information matrix.
 
 use crate::estimate::dense_linalg::{cholesky, invert};
 use crate::estimate::fit::levenberg_marquardt::Fitter;
 
-/// What the diagonal of an information matrix is raised by, so that a singular one can be factorised.
+/// Relative increase of the diagonal of an information matrix before it is factorised: singular ones are regularised.
 pub(crate) const RIDGE: f64 = 1e-13;
 
 impl Fitter {
-    /// Inverse of an information matrix of `n` parameters with `prior` precision added to the spots' positions.
-    pub fn covariance(&mut self, n: usize, spots: usize, prior: f64, out: &mut Vec<f64>) -> bool {
+    /// Inverse of an information matrix of `n` parameters with `prior` precision added to the sources' positions.
+    pub fn covariance(&mut self, n: usize, sources: usize, prior: f64, out: &mut Vec<f64>) -> bool {
         self.factor.clear();
         self.factor.extend_from_slice(&self.hessian[..n * n]);
-        for i in 0..spots {
+        for i in 0..sources {
             self.factor[3 * i * n + 3 * i] += prior;
             self.factor[(3 * i + 1) * n + 3 * i + 1] += prior;
         }
@@ -26,7 +26,7 @@ impl Fitter {
 
     /// Condition number (1-norm) of an information matrix of `n` parameters, scaled to a unit diagonal (van der Sluis, 1969: no
     /// other scaling does much better), given its inverse.
-    pub fn condition(&self, n: usize, inverse: &[f64]) -> f64 {
+    pub fn condition_number(&self, n: usize, inverse: &[f64]) -> f64 {
         let scale = |i: usize| self.hessian[i * n + i].max(1e-300).sqrt();
         let column = |j: usize| {
             let (mut direct, mut inverted) = (0.0, 0.0);
@@ -43,7 +43,7 @@ impl Fitter {
         (direct * inverted).max(1.0)
     }
 
-    /// ln det of an information matrix of `n` parameters over the places and energies of its spots, with each spot's `floor` added
+    /// ln det of an information matrix of `n` parameters over the places and energies of its sources, with each source's `floor` added
     /// to the precisions.
     pub fn log_det(&mut self, n: usize, floor: &[[f64; 3]]) -> Option<f64> {
         let size = 3 * floor.len();

@@ -5,22 +5,22 @@ use faer::{Mat, Side};
 use crate::optics::psf::PixelResponse;
 use crate::optics::{Camera, psf};
 
-/// What is fitted, and what cannot be used, beside positions and energies.
+/// What the bound assumes beside unknown positions and energies: further parameters, masked pixels, prior knowledge.
 #[derive(Clone, Copy, Debug, Default)]
-pub struct Beside<'a> {
-    pub shape: Shape,
+pub struct BoundAssumptions<'a> {
+    pub shape: PsfShape,
     /// A constant and two slopes.
     pub background: bool,
-    /// Pixels (Ny × Nx, row-major) that tell nothing.
-    pub unusable: Option<&'a [bool]>,
+    /// Masked pixels (Ny × Nx, row-major).
+    pub masked: Option<&'a [bool]>,
     /// Standard deviation of each emitter's energy, J, where it is known beforehand as well as that; every emitter is then
     /// known to be in view too. Good while errors are small: an estimator may go below where a position is hardly known.
     pub known: Option<&'a [f64]>,
 }
 
-/// What is unknown of the spots' common shape.
+/// Which parameters of the common PSF are unknown.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum Shape {
+pub enum PsfShape {
     #[default]
     Known,
     /// A width.
@@ -37,20 +37,25 @@ const DARK: PixelResponse = PixelResponse {
 
 /// Bound on the squared error of each emitter's ground position, both axes summed, m², with all positions and energies
 /// unknown: the position blocks of (JᵀJ/σ_n²)⁻¹ (Kay, 1993, eq. 3.31). `positions` on the ground, m; `energies` J.
-/// Emitters that the frame cannot tell apart get a finite but enormous bound.
+/// Unresolved emitters get a finite but enormous bound.
 pub fn position_bound(camera: &Camera, positions: &[[f64; 2]], energies: &[f64]) -> Vec<f64> {
-    position_bound_beside(camera, positions, energies, Beside::default())
+    position_bound_with(camera, positions, energies, BoundAssumptions::default())
 }
 
 /// [`position_bound`] where more is unknown than positions and energies, and where pixels are missing.
-pub fn position_bound_beside(camera: &Camera, positions: &[[f64; 2]], energies: &[f64], beside: Beside) -> Vec<f64> {
+pub fn position_bound_with(
+    camera: &Camera,
+    positions: &[[f64; 2]],
+    energies: &[f64],
+    assumptions: BoundAssumptions,
+) -> Vec<f64> {
     let n = positions.len().min(energies.len());
-    let jacobian = jacobian(camera, &positions[..n], energies, beside);
+    let jacobian = jacobian(camera, &positions[..n], energies, assumptions);
     let p = jacobian.ncols();
     let sigma = camera.spot_sigma_m;
     let mut information = jacobian.transpose() * &jacobian;
     // Bayesian information adds to Fisher's (Van Trees, 1968, ch. 2), as if what is known were Gaussian.
-    for (i, std) in beside.known.iter().flat_map(|k| k.iter()).enumerate().take(n) {
+    for (i, std) in assumptions.known.iter().flat_map(|k| k.iter()).enumerate().take(n) {
         for (k, axis) in [&camera.x, &camera.y].into_iter().enumerate() {
             information[(3 * i + k, 3 * i + k)] += 3.0 * (sigma / axis.half_width()).powi(2);
         }
@@ -77,18 +82,18 @@ pub fn position_bound_beside(camera: &Camera, positions: &[[f64; 2]], energies: 
 
 /// Derivatives of every pixel over the noise, (pixels, parameters): x and y (in σ) and energy of each emitter, then what
 /// is fitted beside.
-fn jacobian(camera: &Camera, positions: &[[f64; 2]], energies: &[f64], beside: Beside) -> Mat<f64> {
+fn jacobian(camera: &Camera, positions: &[[f64; 2]], energies: &[f64], assumptions: BoundAssumptions) -> Mat<f64> {
     let n = positions.len();
     let sigma = camera.spot_sigma_m;
-    let shape = match beside.shape {
-        Shape::Known => 0,
-        Shape::Width => 1,
-        Shape::Ellipse => 3,
+    let shape = match assumptions.shape {
+        PsfShape::Known => 0,
+        PsfShape::Width => 1,
+        PsfShape::Ellipse => 3,
     };
-    let background = if beside.background { 3 } else { 0 };
+    let background = if assumptions.background { 3 } else { 0 };
     let mut jacobian = Mat::<f64>::zeros(camera.x.n * camera.y.n, 3 * n + shape + background);
     let (mut row, mut column) = (vec![DARK; camera.x.n], vec![DARK; camera.y.n]);
-    let is_usable = |pixel: usize| beside.unusable.is_none_or(|bad| !bad[pixel]);
+    let is_usable = |pixel: usize| assumptions.masked.is_none_or(|bad| !bad[pixel]);
     for (i, &p) in positions.iter().enumerate() {
         let [x, y] = camera.to_sensor(p);
         psf::profile_response(&camera.x, x, sigma, &mut row);
@@ -104,10 +109,10 @@ fn jacobian(camera: &Camera, positions: &[[f64; 2]], energies: &[f64], beside: B
                 jacobian[(pixel, 3 * i + 1)] = signal * sigma * fx.fraction * fy.d_centre;
                 jacobian[(pixel, 3 * i + 2)] = fx.fraction * fy.fraction;
                 let along = [fx.d_sigma * fy.fraction, fx.fraction * fy.d_sigma];
-                match beside.shape {
-                    Shape::Known => {}
-                    Shape::Width => jacobian[(pixel, 3 * n)] += signal * sigma * (along[0] + along[1]),
-                    Shape::Ellipse => {
+                match assumptions.shape {
+                    PsfShape::Known => {}
+                    PsfShape::Width => jacobian[(pixel, 3 * n)] += signal * sigma * (along[0] + along[1]),
+                    PsfShape::Ellipse => {
                         jacobian[(pixel, 3 * n)] += signal * sigma * along[0];
                         jacobian[(pixel, 3 * n + 1)] += signal * sigma * along[1];
                         jacobian[(pixel, 3 * n + 2)] += signal * sigma * sigma * fx.d_centre * fy.d_centre;
@@ -116,7 +121,7 @@ fn jacobian(camera: &Camera, positions: &[[f64; 2]], energies: &[f64], beside: B
             }
         }
     }
-    if beside.background {
+    if assumptions.background {
         for pixel in (0..jacobian.nrows()).filter(|&k| is_usable(k)) {
             let (a, b) = (pixel % camera.x.n, pixel / camera.x.n);
             jacobian[(pixel, 3 * n + shape)] = 1.0;
@@ -149,7 +154,7 @@ mod tests {
     }
 
     #[test]
-    fn knowing_the_energies_tells_a_melted_pair_apart() {
+    fn known_energies_resolve_an_overlapping_pair() {
         let config = crate::optics::Config {
             spot_sigma_m: Some(4e-3),
             pixels: [40, 40],
@@ -159,11 +164,11 @@ mod tests {
         let (pair, energies) = ([[0.0, 0.0], [1.0, 0.0]], [7e-3; 2]);
         let bound = |std: f64| {
             let known = [std; 2];
-            let beside = Beside {
+            let assumptions = BoundAssumptions {
                 known: Some(&known),
                 ..Default::default()
             };
-            position_bound_beside(&camera, &pair, &energies, beside)[0]
+            position_bound_with(&camera, &pair, &energies, assumptions)[0]
         };
         let plain = position_bound(&camera, &pair, &energies)[0];
         let bounds: Vec<f64> = [1e-1, 1e-3, 1e-4].map(bound).into();

@@ -13,7 +13,7 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use crate::estimate::{LADDER, Learned};
+use crate::estimate::{ESTIMATORS, Learned};
 use networks::Candidate;
 
 pub use condition::Condition;
@@ -140,7 +140,7 @@ impl Plan {
 
 fn rungs() -> Vec<&'static str> {
     let learned = Learned::ALL.into_iter().map(Learned::name);
-    LADDER.iter().map(|r| r.name).chain(learned).collect()
+    ESTIMATORS.iter().map(|r| r.name).chain(learned).collect()
 }
 
 /// Runs what `out` does not hold yet and writes tradeoff.json after each row, tradeoff.md and the pictures at the end.
