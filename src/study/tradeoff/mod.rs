@@ -14,7 +14,7 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 
 use crate::estimate::{ESTIMATORS, Learned};
-use networks::Candidate;
+pub(in crate::study) use networks::Candidate;
 
 pub use condition::Condition;
 pub use networks::{Trained, Training};
