@@ -12,7 +12,7 @@ mod score;
 
 use std::path::Path;
 
-use crate::estimate::{LADDER, Learned};
+use crate::estimate::{ESTIMATORS, Learned};
 pub(in crate::study) use networks::Candidate;
 
 pub use condition::Condition;
@@ -107,7 +107,7 @@ impl Plan {
 
 fn rungs() -> Vec<&'static str> {
     let learned = Learned::ALL.into_iter().map(Learned::name);
-    LADDER.iter().map(|r| r.name).chain(learned).collect()
+    ESTIMATORS.iter().map(|r| r.name).chain(learned).collect()
 }
 
 /// Runs what `out` does not hold yet and writes tradeoff.json after each row, tradeoff.md and the pictures at the end.
