@@ -46,6 +46,7 @@ pub fn run(args: Args) -> Outcome {
     let mut estimator = estimate::build(&config.estimator, &camera)
         .with_context(in_config)
         .map_err(Failure::Config)?;
+    let budget = config.estimator.budget();
     let frames = npy::Reader::open(&args.frames, camera.joules_per_count).map_err(Failure::input)?;
     let start = config.source.start.unwrap_or(jiff::Timestamp::UNIX_EPOCH);
     let mut out = std::io::BufWriter::new(std::io::stdout().lock());
@@ -65,7 +66,8 @@ pub fn run(args: Args) -> Outcome {
             masked: None,
         };
         let clock = Instant::now();
-        let estimate = estimator.estimate(&frame);
+        let is_over = || budget.is_some_and(|budget| clock.elapsed() >= budget);
+        let estimate = estimator.estimate_until(&frame, &is_over);
         let latency_us = clock.elapsed().as_micros() as u64;
         let (emitters, error) = match &estimate {
             Ok(estimate) => (Some(estimate.emitters.as_slice()), None),

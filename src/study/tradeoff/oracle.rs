@@ -44,11 +44,7 @@ fn ask(cell: Cell, frames: usize, seed: u64) -> Oracle {
         let (score, _) = from(&places);
         let (true_score, from_truth) = from(&scene.positions);
         missed += usize::from(true_score < score - 2.0);
-        let best = if true_score < score {
-            &from_truth.emitters
-        } else {
-            &found
-        };
+        let best = if true_score < score { &from_truth } else { &found };
         found_m2.extend(squared(&scene.positions, &found));
         best_m2.extend(squared(&scene.positions, best));
     }
