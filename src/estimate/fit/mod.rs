@@ -4,6 +4,8 @@ pub mod amplitudes;
 pub mod context;
 pub mod damped_step;
 pub mod evaluation;
+#[cfg(test)]
+mod fit_test;
 pub mod levenberg_marquardt;
 pub mod normal_equations;
 pub mod problem;

@@ -10,6 +10,8 @@ pub mod nuisance_proposals;
 pub mod nuisance_selection;
 pub mod power_prior;
 pub mod proposals;
+#[cfg(test)]
+mod proposals_test;
 pub mod pruning;
 pub mod refine;
 pub mod reweighting;
