@@ -1,3 +1,5 @@
+//! `/v1/alerts`: the list, one alert, and the operator's acknowledgement.
+
 use axum::extract::State as Shared;
 use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
 use axum::response::Response;

@@ -1,3 +1,5 @@
+//! `POST /v1/claims`: parses a body of claims and hands them to the compute thread.
+
 use axum::body::Bytes;
 use axum::extract::State as Shared;
 use axum::extract::rejection::BytesRejection;

@@ -1,3 +1,5 @@
+//! `[api]`: its keys, their defaults and what is refused before a port is bound.
+
 use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::time::Duration;

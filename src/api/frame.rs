@@ -1,3 +1,5 @@
+//! `/v1/frame.png`: the latest frame, drawn once for all viewers.
+
 use std::sync::Mutex;
 use std::time::{Duration, Instant};
 

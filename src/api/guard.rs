@@ -15,7 +15,7 @@ use governor::{DefaultDirectRateLimiter, Quota, RateLimiter};
 
 use super::config::Config;
 use super::problem::Problem;
-use super::shares::client;
+use super::connection_quota::client_key;
 use crate::metric;
 
 /// Clients share this many buckets by a keyed hash of their address, so that memory is bounded whoever asks.
@@ -113,7 +113,7 @@ impl Rates {
 
     /// Seconds to wait, if the client has asked too often.
     fn excess(&self, address: IpAddr) -> Option<u64> {
-        let bucket = &self.buckets[self.hasher.hash_one(client(address)) as usize % BUCKETS];
+        let bucket = &self.buckets[self.hasher.hash_one(client_key(address)) as usize % BUCKETS];
         let until = bucket.check().err()?;
         Some(until.wait_time_from(self.clock.now()).as_secs() + 1)
     }

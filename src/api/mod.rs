@@ -1,13 +1,14 @@
-//! Floor 4: what people and programs see: REST, WebSocket, server-sent events, metrics and the dashboard.
+//! Layer 4: REST, WebSocket, server-sent events, metrics and the dashboard.
 //!
-//! The daemon builds a [`State`], publishes to its [`Feed`], answers [`Command`]s, and runs a [`Server`]. Nothing in
-//! here can make the compute thread wait.
+//! The daemon builds a [`State`], publishes to its [`Feed`], handles [`Command`]s and runs a [`Server`]. No handler can
+//! make the compute thread wait.
 
 mod alerts;
 mod auth;
 mod claims;
 mod conditional;
 mod config;
+mod connection_quota;
 mod extract;
 mod feed;
 mod frame;
@@ -21,7 +22,6 @@ mod probes;
 mod problem;
 mod respond;
 mod server;
-mod shares;
 mod snapshot;
 mod sse;
 mod state;

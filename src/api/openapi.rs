@@ -1,3 +1,5 @@
+//! All described routes and the OpenAPI document generated from the same code.
+
 use axum::Json;
 use axum::Router;
 use axum::routing::get;

@@ -19,12 +19,12 @@ use tokio_io_timeout::TimeoutStream;
 
 use super::auth::{TokenError, Tokens};
 use super::config::{Config, ConfigError};
-use super::shares::{Share, Shares};
+use super::connection_quota::{ConnectionPermit, ConnectionQuota};
 use super::state::State;
 use crate::metric;
 
 /// Requests under way when the daemon stops have this long.
-const LAST_ORDERS: Duration = Duration::from_secs(1);
+const SHUTDOWN_GRACE: Duration = Duration::from_secs(1);
 /// How often secrets and certificates on disk are looked at.
 const LOOK_AGAIN: Duration = Duration::from_secs(2);
 const MAX_HEADER_BYTES: usize = 32 << 10;
@@ -95,19 +95,19 @@ impl Server {
         listener.set_nonblocking(true)?;
         let handle = Handle::new();
         let stopping = state.stopping.clone();
-        let upkeep = tokio::spawn(keep_up(state.metrics.clone(), self.tokens.clone(), self.tls.clone()));
+        let upkeep = tokio::spawn(keep_up(self.tokens.clone(), self.tls.clone()));
         let stop = tokio::spawn({
             let handle = handle.clone();
             async move {
                 shutdown.await;
                 stopping.send_replace(true);
-                handle.graceful_shutdown(Some(LAST_ORDERS));
+                handle.graceful_shutdown(Some(SHUTDOWN_GRACE));
             }
         });
         let app = super::router(state, &self.config, self.tokens.clone());
         let service = app.into_make_service_with_connect_info::<SocketAddr>();
         let patience = self.config.patience();
-        let connections = Shares::new(self.config.max_connections);
+        let connections = ConnectionQuota::new(self.config.max_connections);
         let mut server = axum_server::from_tcp(listener)?.handle(handle);
         *server.http_builder() = protocol(patience);
         let outcome = match self.tls {
@@ -183,13 +183,12 @@ fn server_config(cert: &PathBuf, key: &PathBuf) -> Result<Arc<rustls::ServerConf
     Ok(Arc::new(config))
 }
 
-/// Follows the files that may change while we run, and lets the metrics' histograms forget.
-async fn keep_up(metrics: metrics_exporter_prometheus::PrometheusHandle, tokens: Arc<Tokens>, tls: Option<Tls>) {
+/// Reloads tokens and certificates when their files change.
+async fn keep_up(tokens: Arc<Tokens>, tls: Option<Tls>) {
     let mut seen = tls.as_ref().and_then(Tls::changed_at);
     let mut complained = false;
     loop {
         tokio::time::sleep(LOOK_AGAIN).await;
-        metrics.run_upkeep();
         let mut failure = None;
         match tokens.reload() {
             Ok(true) => tracing::info!("the API's tokens have changed and are in force"),
@@ -223,7 +222,7 @@ async fn keep_up(metrics: metrics_exporter_prometheus::PrometheusHandle, tokens:
 #[derive(Clone)]
 struct Limited<A> {
     inner: A,
-    connections: Arc<Shares>,
+    connections: Arc<ConnectionQuota>,
     patience: Duration,
 }
 
@@ -241,8 +240,8 @@ where
             Ok(address) => address.ip(),
             Err(e) => return Box::pin(std::future::ready(Err(e))),
         };
-        let share = match self.connections.take(address) {
-            Ok(share) => share,
+        let permit = match self.connections.take(address) {
+            Ok(permit) => permit,
             Err(refused) => {
                 metrics::counter!(metric::HTTP_REFUSED, "reason" => refused.reason()).increment(1);
                 return Box::pin(std::future::ready(Err(io::ErrorKind::ConnectionRefused.into())));
@@ -266,7 +265,7 @@ where
             let connection = Connection {
                 stream: Box::pin(stream),
                 is_silent: true,
-                _share: share,
+                _permit: permit,
                 _counted: counted,
             };
             Ok((connection, service))
@@ -279,7 +278,7 @@ struct Connection<S> {
     stream: Pin<Box<TimeoutStream<S>>>,
     /// Nothing has been read yet. Once something has, hyper's own clock watches the header, and a stream's pings the rest.
     is_silent: bool,
-    _share: Share,
+    _permit: ConnectionPermit,
     _counted: Counted,
 }
 

@@ -1,3 +1,5 @@
+//! `/v1/events`: the stream as server-sent events.
+
 use std::convert::Infallible;
 use std::time::Duration;
 

@@ -1,3 +1,5 @@
+//! What the handlers work with, and the commands they send to the compute thread.
+
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 

@@ -1,3 +1,5 @@
+//! `/v1/webhooks`: delivery status, dead letters, replay and re-enabling.
+
 use axum::extract::State as Shared;
 use axum::http::StatusCode;
 use axum::response::Response;

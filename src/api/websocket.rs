@@ -1,3 +1,5 @@
+//! `/v1/stream`: the stream as a WebSocket, with pings and timeouts.
+
 use std::time::Duration;
 
 use axum::body::Bytes;

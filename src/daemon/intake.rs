@@ -13,7 +13,7 @@ const COMPLAIN_EVERY: Duration = Duration::from_secs(10);
 
 impl Compute {
     /// Claims by POST and acknowledgements.
-    pub(super) fn obey(&mut self) {
+    pub(super) fn handle_commands(&mut self) {
         while let Ok(command) = self.commands.try_recv() {
             match command {
                 Command::Claims { claims, reply } => {

@@ -92,11 +92,8 @@ impl Outlet {
                 continue;
             }
             if !pending.events.is_empty() {
-                let numbered = feed.number(pending.events.clone(), pending.at);
-                if let Some(first) = numbered.first() {
-                    journal.number_above(first.seq - 1);
-                }
-                if let Err(error) = journal.record(&pending.events, pending.at, Timestamp::now()) {
+                let numbered = feed.number(pending.events, pending.at);
+                if let Err(error) = journal.record_numbered(&numbered, Timestamp::now()) {
                     tracing::error!(%error, "alert events are lost to the journal");
                 }
                 if tokio::time::timeout(PATIENCE, journal.settled()).await.is_err() {

@@ -1,4 +1,4 @@
-//! Floor 4: alerts and webhook deliveries on disk, before anyone hears of them.
+//! Layer 4: alerts and webhook deliveries on disk, before anyone hears of them.
 //!
 //! One thread writes ([`Journal::record`] hands over the events and returns at once, so that a slow disk never
 //! delays a frame); any thread reads, over its own read-only connection. SQLite in WAL mode with
@@ -171,11 +171,6 @@ impl Journal {
             at: events[k].at,
             now,
         })
-    }
-
-    /// Numbers the next events above `seq`, for readers who number other things in between.
-    pub fn number_above(&self, seq: u64) {
-        self.shared.number_above(seq);
     }
 
     /// Waits until all that was handed over so far is on disk or, where the disk refuses it, in memory.

@@ -1,3 +1,5 @@
+//! Rows of the webhook outbox and what the journal remembers of each endpoint.
+
 use jiff::Timestamp;
 
 use crate::monitor::{AlertEvent, AlertEventKind, AlertKind};

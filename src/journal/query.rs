@@ -1,3 +1,5 @@
+//! SQL reads of one store: alerts, events, deliveries, endpoints.
+
 use jiff::Timestamp;
 use rusqlite::types::Value;
 use rusqlite::{OptionalExtension, Row, params};

@@ -1,3 +1,5 @@
+//! Removal of old cleared alerts, by age and by size.
+
 use jiff::{SignedDuration, Timestamp};
 use rusqlite::params;
 

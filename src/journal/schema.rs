@@ -1,3 +1,5 @@
+//! Opening a journal file: permissions, ownership check, migrations and pragmas.
+
 use std::path::Path;
 use std::time::Duration;
 

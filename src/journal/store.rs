@@ -1,3 +1,5 @@
+//! SQL writes of one store: a batch of changes in one transaction.
+
 use std::path::Path;
 use std::sync::Arc;
 

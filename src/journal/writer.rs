@@ -1,3 +1,5 @@
+//! The writer thread: decides whether events are on disk or in memory and when readers hear of them.
+
 use std::collections::VecDeque;
 use std::path::PathBuf;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender};
@@ -122,11 +124,6 @@ impl Shared {
         queue.accepted += n as u64;
         self.wake.notify_one();
         Ok(queue.last_seq)
-    }
-
-    pub(super) fn number_above(&self, seq: u64) {
-        let mut queue = lock(&self.queue);
-        queue.last_seq = queue.last_seq.max(seq);
     }
 
     /// Hands over any other write; gives the count of `done` at which it is through.

@@ -44,13 +44,13 @@ pub struct Recorder {
     segment_bytes: u64,
     next_number: u64,
     current: Option<Segment>,
-    /// The clerk could not write the latest frame it was given.
+    /// The recorder thread could not write the latest frame it was given.
     failing: Arc<AtomicBool>,
     queue: Option<SyncSender<Order>>,
     thread: Option<JoinHandle<()>>,
 }
 
-/// The recorder's thread has it.
+/// A frame that the recorder thread has taken.
 #[derive(Clone, Debug)]
 pub struct Taken {
     /// The file that holds it; `None` while the disk fails. Claims stand in the next file's head all the same.
@@ -95,7 +95,7 @@ impl Recorder {
         let next_number = ring::next_number(&folder).map_err(failed(&folder))?;
         let (queue, orders) = sync_channel(QUEUE);
         let failing = Arc::new(AtomicBool::new(false));
-        let clerk = Clerk {
+        let worker = RecorderThread {
             folder: folder.clone(),
             evidence,
             config: config.clone(),
@@ -107,7 +107,7 @@ impl Recorder {
         };
         let thread = std::thread::Builder::new()
             .name("recorder".into())
-            .spawn(move || clerk.run(&orders))
+            .spawn(move || worker.run(&orders))
             .map_err(failed(&folder))?;
         Ok(Some(Self {
             segment: seconds(config.segment_s),
@@ -203,7 +203,7 @@ impl Drop for Recorder {
 }
 
 /// The recorder's thread.
-struct Clerk {
+struct RecorderThread {
     folder: PathBuf,
     evidence: PathBuf,
     config: Config,
@@ -221,7 +221,7 @@ struct Clip {
     until: Timestamp,
 }
 
-impl Clerk {
+impl RecorderThread {
     fn run(mut self, orders: &Receiver<Order>) {
         for order in orders {
             let was_failing = self.failing.load(Ordering::Relaxed);
