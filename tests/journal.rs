@@ -30,6 +30,7 @@ fn alert(id: &str, kind: AlertKind, raised_s: i64) -> Alert {
             frame: raised_s.unsigned_abs(),
             file: None,
         },
+        acknowledgement: None,
     }
 }
 
@@ -268,11 +269,7 @@ async fn an_alarm_does_not_wait_for_a_disk_that_hangs() {
     let locked = Instant::now();
     journal.record(&[raised("b", 1)], start(), start()).unwrap();
     assert_eq!(journal.follow(1).next().await.unwrap().len(), 1);
-    assert!(
-        locked.elapsed() < Duration::from_millis(900),
-        "{:?}",
-        locked.elapsed()
-    );
+    assert!(locked.elapsed() < Duration::from_millis(900), "{:?}", locked.elapsed());
     assert_eq!(journal.health().last_error.as_deref(), Some("the disk takes too long"));
     other.execute_batch("ROLLBACK").unwrap();
     journal.record(&[raised("c", 2)], start(), start()).unwrap();

@@ -1,20 +1,13 @@
 //! Limits the number of open connections, in total and per client address.
 
 use std::collections::HashMap;
-use std::net::IpAddr;
 use std::sync::{Arc, Mutex, PoisonError};
+
+use super::client::Client;
 
 /// A client may hold this many times the number of free connections: three quarters of all when it is alone. Six such
 /// clients in a row are needed to leave none to others (Choudhury & Hahne, 1998, dynamic thresholds of a shared memory).
 const FREE_MULTIPLE: usize = 3;
-
-/// The key of one client: an IPv4 address, or the /64 network that an IPv6 client is assigned.
-pub(super) fn client_key(address: IpAddr) -> u128 {
-    match address.to_canonical() {
-        IpAddr::V4(v4) => u128::from(u32::from(v4)),
-        IpAddr::V6(v6) => u128::from(v6) >> 64 << 64 | 1,
-    }
-}
 
 /// Counts open connections. Memory is bounded by their number.
 pub(super) struct ConnectionQuota {
@@ -56,15 +49,16 @@ impl ConnectionQuota {
         Arc::new(Self { limit, held })
     }
 
-    pub(super) fn take(self: &Arc<Self>, address: IpAddr) -> Result<ConnectionPermit, Refused> {
-        let client = client_key(address);
+    /// `shares_all`: a trusted proxy brings many clients, so that only the total limits it.
+    pub(super) fn take(self: &Arc<Self>, client: Client, shares_all: bool) -> Result<ConnectionPermit, Refused> {
+        let client = client.key();
         let mut held = self.held.lock().unwrap_or_else(PoisonError::into_inner);
         let free = self.limit.saturating_sub(held.total);
         if free == 0 {
             return Err(Refused::Full);
         }
         let own = held.by_client.get(&client).copied().unwrap_or(0);
-        if own >= FREE_MULTIPLE * free {
+        if !shares_all && own >= FREE_MULTIPLE * free {
             return Err(Refused::Greedy);
         }
         held.by_client.insert(client, own + 1);
@@ -91,9 +85,13 @@ impl Drop for ConnectionPermit {
 mod tests {
     use super::*;
 
+    fn ip(address: &str) -> Client {
+        Client::Ip(address.parse().expect("an address"))
+    }
+
     fn as_many_as_it_gets(quota: &Arc<ConnectionQuota>, address: &str) -> Vec<ConnectionPermit> {
-        let address = address.parse().expect("an address");
-        std::iter::from_fn(|| quota.take(address).ok()).collect()
+        let client = ip(address);
+        std::iter::from_fn(|| quota.take(client, false).ok()).collect()
     }
 
     #[test]
@@ -115,12 +113,19 @@ mod tests {
     fn a_network_of_one_client_is_one_client() {
         let quota = ConnectionQuota::new(8);
         let own = as_many_as_it_gets(&quota, "2001:db8::1");
-        let again = quota.take("2001:db8::2".parse().expect("an address"));
+        let again = quota.take(ip("2001:db8::2"), false);
         assert_eq!((own.len(), again.err()), (6, Some(Refused::Greedy)));
         let other = as_many_as_it_gets(&quota, "2001:db8:0:1::1");
         assert_eq!(other.len(), 2);
-        let last = quota.take("192.0.2.1".parse().expect("an address"));
+        let last = quota.take(ip("192.0.2.1"), false);
         assert_eq!(last.err(), Some(Refused::Full));
+    }
+
+    #[test]
+    fn a_trusted_proxy_may_hold_all_there_are() {
+        let quota = ConnectionQuota::new(8);
+        let held: Vec<_> = std::iter::from_fn(|| quota.take(ip("192.0.2.1"), true).ok()).collect();
+        assert_eq!(held.len(), 8);
     }
 
     #[test]

@@ -201,11 +201,14 @@ impl Compute {
     }
 
     fn publish(&mut self, mut report: Report, frame: Option<Arc<Frame>>) {
-        for event in &report.events {
-            self.state.note(event);
-            if let (AlertEventKind::Raised, Some(recorder)) = (event.event, &mut self.recorder) {
-                recorder.evidence(&event.alert.id, report.time);
+        for event in &mut report.events {
+            if let (AlertEventKind::Raised, Some(recorder)) = (event.event, &mut self.recorder)
+                && let Some(file) = recorder.evidence(&event.alert.id, report.time)
+            {
+                self.state.evidence.insert(event.alert.id.clone(), file);
             }
+            self.state.name_evidence(&mut event.alert);
+            self.state.note(event);
         }
         self.state.gauge(&report);
         let at = report.time;
