@@ -20,7 +20,9 @@ mod tracks;
 mod users;
 mod watch;
 
-pub use alert::{Alert, AlertEvent, AlertEventKind, AlertKind, AlertSource, AlertState, Severity};
+pub use alert::{
+    Acknowledgement, Alert, AlertEvent, AlertEventKind, AlertKind, AlertSource, AlertState, Severity, Withdrawal,
+};
 pub use config::{Config, ConfigError};
 pub use report::{Observation, PositionStatus, Report, TrackedPosition, UserPosition};
 pub use sight::BLINDING_SHARE;

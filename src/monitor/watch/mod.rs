@@ -23,7 +23,7 @@ use super::sight::Sight;
 use super::thresholds::{Family, Thresholds};
 use super::tracks::{Track, Tracks};
 use super::users::{Asserted, CLAIM_LIFE_S, User};
-use super::{Alert, AlertEvent, AlertKind, Config, Observation, Report, Source};
+use super::{Acknowledgement, Alert, AlertEvent, AlertKind, Config, Observation, Report, Source, Withdrawal};
 use crate::claims::{Store, seconds};
 use crate::optics::Camera;
 
@@ -182,9 +182,15 @@ impl Monitor {
         self.restore(open);
     }
 
-    /// An operator has taken note. `None` when no open alert has this id, or it is acknowledged already.
-    pub fn acknowledge(&mut self, id: &str, _at: Timestamp) -> Option<AlertEvent> {
-        self.book.acknowledge(id)
+    /// An operator has taken note. `None` when no open alert has this id, or it is acknowledged already and the new
+    /// acknowledgement has no note.
+    pub fn acknowledge(&mut self, id: &str, acknowledgement: Acknowledgement) -> Option<AlertEvent> {
+        self.book.acknowledge(id, acknowledgement)
+    }
+
+    /// An operator has undone an acknowledgement. `None` when no acknowledged alert has this id.
+    pub fn unacknowledge(&mut self, id: &str, withdrawal: Withdrawal) -> Option<AlertEvent> {
+        self.book.unacknowledge(id, withdrawal)
     }
 
     /// Takes over the alerts that were open when the last run ended: they go on, or clear when their cause is gone.
