@@ -16,7 +16,7 @@ use subtle::ConstantTimeEq;
 use tokio::sync::watch;
 
 use super::audit::Audit;
-use super::client::Client;
+use super::client::{Actor, Client};
 use super::config::Config;
 use super::problem::Problem;
 use crate::metric;
@@ -82,10 +82,6 @@ pub struct Tokens {
     /// Counts changes, for streams to ask again whether their token is still in force.
     changes: watch::Sender<u64>,
 }
-
-/// Who sends a request, by their token; inserted into every request that is let through.
-#[derive(Clone, Debug, Default)]
-pub struct Actor(pub Option<Arc<str>>);
 
 /// That a request's token is in force, for as long as it is.
 #[derive(Clone)]
