@@ -28,7 +28,7 @@ pub struct Config {
     pub allowed_hosts: Vec<String>,
     /// Proxies whose `X-Forwarded-For` names the client: networks, addresses, or `unix` for the socket.
     pub trusted_proxies: Vec<String>,
-    /// How long browsers are told to use TLS only (`Strict-Transport-Security`), s; 0 does not tell them. Needs TLS here.
+    /// `max-age` of `Strict-Transport-Security`, s: for this long browsers use TLS only. 0 sends no such header. Needs TLS here.
     pub hsts_max_age_s: u64,
     /// Connections open at a time, streams included; one client holds at most three times as many as are still free.
     pub max_connections: usize,
@@ -86,8 +86,8 @@ impl Default for Config {
 }
 
 impl Config {
-    /// Patience with a client that is slow.
-    pub(super) fn patience(&self) -> Duration {
+    /// Time limit for a slow client.
+    pub(super) fn client_timeout(&self) -> Duration {
         Duration::from_secs_f64(self.client_timeout_s)
     }
 

@@ -10,10 +10,10 @@ use crate::api::{Acknowledged, Feed, Snapshot};
 use crate::journal::Journal;
 use crate::monitor::{Alert, AlertEvent, AlertEventKind};
 
-/// A disk that hangs may hold back what readers hear for this long, no longer.
-const PATIENCE: Duration = Duration::from_secs(2);
+/// Longest time for which a disk that hangs delays what is published.
+const JOURNAL_TIMEOUT: Duration = Duration::from_secs(2);
 
-/// Where the compute thread leaves things. It never waits: a newer snapshot takes an older one's place, events add up
+/// Takes what the compute thread publishes. It never waits: a newer snapshot takes an older one's place, events add up
 /// (they are few, and the journal's backlog bounds what becomes of them).
 #[derive(Clone, Default)]
 pub struct Outlet(Arc<Shared>);
@@ -103,7 +103,7 @@ impl Outlet {
                 if let Err(error) = journal.record_numbered(&numbered, Timestamp::now()) {
                     tracing::error!(%error, "alert events are lost to the journal");
                 }
-                if tokio::time::timeout(PATIENCE, journal.settled()).await.is_err() {
+                if tokio::time::timeout(JOURNAL_TIMEOUT, journal.settled()).await.is_err() {
                     tracing::error!("the journal's disk hangs; alerts are published before they are on it");
                 }
                 feed.publish_events(numbered);
