@@ -21,9 +21,10 @@ pub const USERS_UNSEEN: &str = "oapwatch_users_unseen";
 pub const ALERTS_RAISED: &str = "oapwatch_alerts_raised_total";
 /// Label `kind`.
 pub const ALERTS_OPEN: &str = "oapwatch_alerts_open";
-/// Label `outcome`: accepted, late (kept as history), duplicate, refused (contradicts, too old, no room), malformed.
+/// Label `outcome`: accepted, late (kept as history), duplicate, refused (contradicts, too old, no room), malformed, shed (more than there is time for).
 pub const CLAIMS: &str = "oapwatch_claims_total";
 pub const CLAIMS_LAST: &str = "oapwatch_claims_last_timestamp_seconds";
+pub const CLAIMS_SKIPPED: &str = "oapwatch_claims_log_skipped_bytes_total";
 /// Labels `endpoint` and `outcome`.
 pub const WEBHOOK_ATTEMPTS: &str = "oapwatch_webhook_attempts_total";
 /// Label `endpoint`, as of the three.
@@ -104,6 +105,11 @@ pub fn describe() {
     c!(ALERTS_RAISED, "Alerts raised, by kind.");
     g!(ALERTS_OPEN, "Alerts not yet cleared, by kind.");
     c!(CLAIMS, "Claims received, by outcome.");
+    c!(
+        CLAIMS_SKIPPED,
+        Unit::Bytes,
+        "Bytes of the claims log that were not read: its beginning at the start, or more than could be read."
+    );
     g!(
         CLAIMS_LAST,
         Unit::Seconds,
@@ -151,10 +157,14 @@ pub fn describe() {
         FRAMES_CAPTURED,
         FRAMES_DROPPED,
         FRAMES_UNUSABLE,
+        CLAIMS_SKIPPED,
         STREAM_POSITIONS_MISSED,
         JOURNAL_FAILURES,
     ] {
         counter!(name).increment(0);
+    }
+    for outcome in ["accepted", "late", "duplicate", "refused", "malformed", "shed"] {
+        counter!(CLAIMS, "outcome" => outcome).increment(0);
     }
     gauge!(BUILD_INFO, "version" => env!("CARGO_PKG_VERSION")).set(1.0);
 }

@@ -14,6 +14,8 @@ use crate::{claims, metric};
 
 /// Claims taken from one body.
 const MAX_CLAIMS: usize = 20_000;
+/// A request with so many claims takes up as much of the queue to the monitor as one that has few.
+const CLAIMS_A_PLACE: usize = 500;
 /// Reasons listed in one answer; the count is exact beyond it.
 const MAX_REASONS: usize = 100;
 
@@ -136,6 +138,10 @@ pub async fn post(
     let sent = claims.len();
     metrics::counter!(metric::CLAIMS, "outcome" => "malformed").increment(intake.refused as u64);
     if sent > 0 {
+        // What waits is bounded in claims too: large requests are told to come back while others wait.
+        if state.commands.capacity() <= sent / CLAIMS_A_PLACE {
+            return Err(busy());
+        }
         let (reply, answer) = oneshot::channel();
         send(&state, Command::Claims { claims, reply })?;
         let refused = answer.await.map_err(|_| busy())?;

@@ -37,21 +37,48 @@ pub(super) struct Asserted {
     pub came: Timestamp,
 }
 
-impl Asserted {
+/// What a claim's age and stated error make of the place it names.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Reach {
+    pub made: Timestamp,
+    pub age_s: f64,
+    pub variance: f64,
+    pub slack_m: f64,
+}
+
+impl Reach {
     /// `largest_sigma_m` bounds what a claim may say of its own error: a lie there must not hide a lie about the place.
     /// The log's clock is `ahead_s` ahead of ours.
-    pub fn new(standing: &Standing, now: Timestamp, default_sigma_m: f64, largest_sigma_m: f64, ahead_s: f64) -> Self {
+    pub fn of(standing: &Standing, now: Timestamp, default_sigma_m: f64, largest_sigma_m: f64, ahead_s: f64) -> Self {
         let claim = standing.claim;
         let ahead = jiff::SignedDuration::from_millis((ahead_s * 1e3).round() as i64);
         let made = claim.time.saturating_sub(ahead).map_or(now, |made| made.min(now));
         let age_s = seconds(made, now);
         let sigma = claim.sigma_m.unwrap_or(default_sigma_m).clamp(0.01, largest_sigma_m);
         Self {
-            position: Vector2::new(claim.x_m, claim.y_m),
-            variance: sigma * sigma,
             made,
             age_s,
+            variance: sigma * sigma,
             slack_m: (FREE_SPEED_M_S + standing.pace_m_s.min(FASTEST_M_S)) * age_s,
+        }
+    }
+}
+
+impl Asserted {
+    pub fn new(standing: &Standing, reach: Reach) -> Self {
+        let claim = standing.claim;
+        let Reach {
+            made,
+            age_s,
+            variance,
+            slack_m,
+        } = reach;
+        Self {
+            position: Vector2::new(claim.x_m, claim.y_m),
+            variance,
+            made,
+            age_s,
+            slack_m,
             expected: false,
             hidden: false,
             ended: claim.state == ClaimState::Ended,

@@ -22,9 +22,9 @@ use super::pose::Pose;
 use super::sight::Sight;
 use super::thresholds::{Family, Thresholds};
 use super::tracks::{Track, Tracks};
-use super::users::{Asserted, CLAIM_LIFE_S, User};
+use super::users::{Asserted, CLAIM_LIFE_S, Reach, User};
 use super::{Alert, AlertEvent, AlertKind, Config, Observation, Report, Source};
-use crate::claims::{Store, seconds};
+use crate::claims::{Beam, ClaimState, Standing, Store, seconds};
 use crate::optics::Camera;
 
 /// A clock that shows less than this earlier than before has not been set back: frames and failures are stamped apart.
@@ -130,6 +130,9 @@ impl Monitor {
             self.decide_unclaimed(&asserted, &mut answers, now);
             self.decide_users(&asserted, &answers, now);
             self.decide_spots(&asserted, &answers, now);
+            for (a, _) in asserted.iter().zip(&answers).filter(|(_, answer)| answer.is_some()) {
+                claims.answered(&a.claim.user, now);
+            }
         }
         self.watch_inputs(&asserted, claims, now);
         self.report(&asserted, seen.frame, now)
@@ -216,12 +219,16 @@ impl Monitor {
     }
 
     /// The claims that bear on a frame at `now`.
-    fn assert(&self, claims: &Store, now: Timestamp) -> Vec<Asserted> {
+    fn assert(&self, claims: &mut Store, now: Timestamp) -> Vec<Asserted> {
         let tolerated = self.config.tolerated_distance_m;
+        let reach = |s: &Standing| Reach::of(s, now, self.default_sigma_m, tolerated, self.ahead_s);
+        let beams: Vec<Beam> = self.tracks.all.iter().map(|t| self.beam(t)).collect();
+        claims.choose(&beams, |s| self.is_in_reach(s, &reach(s)));
         claims
-            .standing()
-            .map(|s| Asserted::new(&s, now, self.default_sigma_m, tolerated, self.ahead_s))
-            .filter(|a| self.bears(a))
+            .chosen()
+            .map(|s| (s, reach(&s)))
+            .filter(|(s, reach)| self.is_held(s) || self.is_in_reach(s, reach))
+            .map(|(s, reach)| Asserted::new(&s, reach))
             .map(|mut a| {
                 a.expected = !a.ended && self.must_be_seen(&a);
                 a
@@ -229,14 +236,28 @@ impl Monitor {
             .collect()
     }
 
-    fn bears(&self, a: &Asserted) -> bool {
-        let tracked = self.users.get(&a.claim.user).and_then(|u| u.track);
-        let held = tracked.is_some_and(|id| self.tracks.get(id).is_some());
-        if a.ended {
-            return a.age_s <= self.config.ended_grace_s;
+    fn beam(&self, track: &Track) -> Beam {
+        let p = track.motion.position();
+        Beam {
+            position: [p.x, p.y],
+            is_answered: !self.alone.contains_key(&track.id),
         }
-        let reach = self.config.tolerated_distance_m + a.slack_m + 5.0 * a.variance.sqrt();
-        held || (a.age_s <= CLAIM_LIFE_S && self.is_near_view(a.position, reach + self.spot_m() * 3.0))
+    }
+
+    /// The beam that answered the user's claim is still followed.
+    fn is_held(&self, standing: &Standing) -> bool {
+        let tracked = self.users.get(&standing.claim.user).and_then(|u| u.track);
+        standing.claim.state == ClaimState::Active && tracked.is_some_and(|id| self.tracks.get(id).is_some())
+    }
+
+    fn is_in_reach(&self, standing: &Standing, reach: &Reach) -> bool {
+        let claim = standing.claim;
+        if claim.state == ClaimState::Ended {
+            return reach.age_s <= self.config.ended_grace_s;
+        }
+        let reach_m = self.config.tolerated_distance_m + reach.slack_m + 5.0 * reach.variance.sqrt();
+        let place = Vector2::new(claim.x_m, claim.y_m);
+        reach.age_s <= CLAIM_LIFE_S && self.is_near_view(place, reach_m + self.spot_m() * 3.0)
     }
 
     /// Whether even a user as far off as is tolerated would show at least part of a spot.
