@@ -8,6 +8,7 @@ export const KIND = {
   user_unseen: "A claimed user is not seen",
   sensor_lost: "The sensor is lost",
   claims_stale: "The claims log is quiet",
+  claims_flooded: "More is claimed than there is room for",
   pose_inconsistent: "Our own pose is off",
 };
 

@@ -2,9 +2,9 @@ use jiff::Timestamp;
 use nalgebra::Vector2;
 use serde_json::json;
 
-use super::Monitor;
 use super::users::claimed;
-use crate::claims::{Store, seconds};
+use super::{ESCALATE_S, Monitor};
+use crate::claims::{Store, WINDOW_S, seconds};
 use crate::monitor::book::{Cause, Finding};
 use crate::monitor::residuals::surprise;
 use crate::monitor::thresholds::Family;
@@ -27,6 +27,7 @@ impl Monitor {
             self.book.absent(&lost, now);
         }
         self.watch_pose(now);
+        self.watch_flood(claims, now);
         let stale = Cause::Whole(AlertKind::ClaimsStale);
         let period = self.period_s.unwrap_or(0.0);
         let limit = self.config.claims_stale_s.max(5.0 * period);
@@ -77,6 +78,37 @@ impl Monitor {
             finding.claimed = claimed(a);
             self.book.report(&cause, finding, now, self.frame);
         }
+    }
+
+    /// Claims that are refused or shed for want of room or time, or are more than a frame is held against.
+    fn watch_flood(&mut self, claims: &Store, now: Timestamp) {
+        let cause = Cause::Whole(AlertKind::ClaimsFlooded);
+        let squeezed = claims.squeezed(now);
+        if squeezed.total() == 0 && claims.left_out() == 0 {
+            self.book.absent(&cause, now);
+            return;
+        }
+        let lasted_s = self.book.raised_at(&cause).map_or(0.0, |since| seconds(since, now));
+        let severity = if squeezed.shed_known > 0 || lasted_s >= ESCALATE_S {
+            Severity::Critical
+        } else {
+            Severity::Warning
+        };
+        let claims_lost = squeezed.refused + squeezed.shed_new + squeezed.shed_known;
+        let evidence = json!({
+            "window_s": WINDOW_S,
+            "claims_refused": squeezed.refused,
+            "claims_shed": squeezed.shed_new,
+            "claims_of_known_users_shed": squeezed.shed_known,
+            "claims_lost_per_s": claims_lost as f64 / WINDOW_S as f64,
+            "users_forgotten_early": squeezed.forgotten_early,
+            "log_bytes_skipped": squeezed.skipped_bytes,
+            "users": claims.len(),
+            "max_users": claims.max_users(),
+            "claims_in_view_not_considered": claims.left_out(),
+        });
+        self.book
+            .report(&cause, Finding::new(severity, evidence), now, self.frame);
     }
 
     fn watch_pose(&mut self, now: Timestamp) {
