@@ -109,6 +109,17 @@ impl Asserted {
     }
 }
 
+/// A user whose claim a beam has answered for this long is known by it, s: as many frames in a row as a chance meeting does not last.
+const ESTABLISHED_S: f64 = 3.0;
+
+impl User {
+    /// A beam has answered the claim for long enough that the two are taken to belong together.
+    pub fn is_established(&self) -> bool {
+        let answered = self.first_answered.zip(self.last_answered);
+        answered.is_some_and(|(first, last)| seconds(first, last) >= ESTABLISHED_S)
+    }
+}
+
 /// What the monitor remembers of a user.
 #[derive(Clone, Debug, Default)]
 pub(super) struct User {
@@ -122,6 +133,7 @@ pub(super) struct User {
     pub absence: f64,
     /// Frames in a row with the beam outside what is tolerated.
     pub outside: u32,
+    pub first_answered: Option<Timestamp>,
     pub last_answered: Option<Timestamp>,
     pub mismatched: bool,
     /// A beam elsewhere took the user's place when they vanished.

@@ -1,7 +1,9 @@
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
 use super::Monitor;
+use super::chance::Crowding;
 use crate::assign::assign;
+use crate::claims::Store;
 use crate::monitor::AlertKind;
 use crate::monitor::book::Cause;
 use crate::monitor::motion::mahalanobis2;
@@ -15,7 +17,8 @@ const INCUMBENCY: f64 = 4.0;
 
 impl Monitor {
     /// Which track answers which claim: near pairs by optimal assignment, then the beam that answered before.
-    pub(super) fn answer(&self, asserted: &[Asserted]) -> Vec<Option<u64>> {
+    pub(super) fn answer(&self, asserted: &[Asserted], crowding: &Crowding, claims: &Store) -> Vec<Option<u64>> {
+        let owners = self.owners(asserted);
         let seen: Vec<&Track> = self.tracks.all.iter().filter(|t| t.hit).collect();
         let merged: Vec<&Track> = self.tracks.all.iter().filter(|t| t.merged.is_some()).collect();
         let mut answers = vec![None; asserted.len()];
@@ -39,6 +42,10 @@ impl Monitor {
                 let d2 = mahalanobis2(r, t.motion.position_cov() + a.spread(self.config.tolerated_distance_m));
                 let incumbent = self.users.get(&a.claim.user).and_then(|u| u.track) == Some(t.id);
                 if d2 > ANSWER_GATE || (!incumbent && a.age_s > self.fresh_s(a)) {
+                    return f64::INFINITY;
+                }
+                let owner = owners.get(&t.id).map(|&k| &asserted[k]);
+                if !self.may_answer(a, t, owner, crowding, claims) {
                     f64::INFINITY
                 } else if incumbent {
                     d2
@@ -52,7 +59,7 @@ impl Monitor {
         }
         let mut taken: BTreeSet<u64> = answers.iter().flatten().copied().collect();
         for (a, answer) in asserted.iter().zip(&mut answers) {
-            if answer.is_some() {
+            if answer.is_some() || (crowding.is_crowded() && !self.is_established(a)) {
                 continue;
             }
             let before = self.users.get(&a.claim.user).and_then(|u| u.track);
@@ -65,6 +72,18 @@ impl Monitor {
         }
         answers
     }
+
+    /// Whose claim each track answered in the frame before, by track.
+    fn owners(&self, asserted: &[Asserted]) -> BTreeMap<u64, usize> {
+        let of = |a: &Asserted| {
+            let user = self.users.get(&a.claim.user)?;
+            user.track.filter(|_| user.unanswered_since.is_none())
+        };
+        (0..asserted.len())
+            .filter_map(|i| Some((of(&asserted[i])?, i)))
+            .collect()
+    }
+
     /// Age up to which a claim answers for a beam that was not its user's before, s: the longer a user is silent, the
     /// wider the ground that a stranger could appear on under their name.
     fn fresh_s(&self, a: &Asserted) -> f64 {

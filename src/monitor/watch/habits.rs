@@ -1,6 +1,7 @@
 use jiff::Timestamp;
 
 use super::Monitor;
+use super::chance::Crowding;
 use crate::claims::{Store, seconds};
 use crate::monitor::clock::ahead_s;
 use crate::monitor::users::Asserted;
@@ -18,14 +19,19 @@ const LONGEST_DELAY_S: f64 = 3.0;
 
 impl Monitor {
     /// The log's habits, as medians over users: no single one can slow the monitor down.
-    pub(super) fn learn_habits(&mut self, asserted: &[Asserted], claims: &Store, now: Timestamp) {
+    pub(super) fn learn_habits(&mut self, asserted: &[Asserted], crowding: &Crowding, claims: &Store, now: Timestamp) {
         if self.first_claim.is_none() && claims.quiet_s(now).is_some() {
             self.first_claim = Some(now);
         }
-        if let Some(period) = median(asserted.iter().filter_map(|a| a.period_s)) {
-            self.period_s = Some(period);
-        }
-        let delay = median(asserted.iter().map(|a| seconds(a.claim.time, a.came)));
+        // Names without a beam say nothing of the log while they are a crowd.
+        let telling = || {
+            asserted
+                .iter()
+                .filter(|a| !crowding.is_crowded() || self.is_established(a))
+        };
+        let period = median(telling().filter_map(|a| a.period_s));
+        let delay = median(telling().map(|a| seconds(a.claim.time, a.came)));
+        self.period_s = period.or(self.period_s);
         self.delay_s = delay.unwrap_or(0.0).clamp(0.0, LONGEST_DELAY_S);
     }
 

@@ -1,6 +1,7 @@
 //! The monitor: one frame after another through the steps that lead to verdicts, one file a step.
 
 mod answers;
+mod chance;
 mod crowd;
 pub(super) mod habits;
 mod inputs;
@@ -115,7 +116,8 @@ impl Monitor {
             .filter_map(|a| self.users.get(&a.claim.user)?.last_answered)
             .filter(|t| seconds(*t, now) < 2.0 + self.sight.blind_s(now))
             .count();
-        self.learn_habits(&asserted, claims, now);
+        let crowding = self.crowding(&asserted, claims, now);
+        self.learn_habits(&asserted, &crowding, claims, now);
         self.book.catch_up(self.has_caught_up(now));
         self.learn_clock();
         if let Some(estimate) = self.sight.judge(&seen, lit) {
@@ -123,16 +125,14 @@ impl Monitor {
             let detections = Detection::of(estimate, &self.camera);
             self.tracks.step(now, &detections, dt);
             self.find_pose(&mut asserted, dt);
-            let mut answers = self.answer(&asserted);
+            let mut answers = self.answer(&asserted, &crowding, claims);
             self.note_hidden(&mut asserted, &answers);
             self.weigh(&asserted, &answers, now);
             self.note_alone(&answers, now);
             self.decide_unclaimed(&asserted, &mut answers, now);
             self.decide_users(&asserted, &answers, now);
-            self.decide_spots(&asserted, &answers, now);
-            for (a, _) in asserted.iter().zip(&answers).filter(|(_, answer)| answer.is_some()) {
-                claims.answered(&a.claim.user, now);
-            }
+            self.decide_spots(&asserted, &answers, &crowding, now);
+            self.note_answered(&asserted, &answers, &crowding, claims, now);
         }
         self.watch_inputs(&asserted, claims, now);
         self.report(&asserted, seen.frame, now)

@@ -4,6 +4,7 @@ use jiff::Timestamp;
 use nalgebra::Vector2;
 use serde_json::json;
 
+use super::chance::Crowding;
 use super::habits::median;
 use super::{ESCALATE_S, Monitor};
 use crate::claims::seconds;
@@ -26,11 +27,17 @@ const BESIDE: f64 = 3.0;
 
 impl Monitor {
     /// Looks for a second beam within each user's spot.
-    pub(super) fn decide_spots(&mut self, asserted: &[Asserted], answers: &[Option<u64>], now: Timestamp) {
+    pub(super) fn decide_spots(
+        &mut self,
+        asserted: &[Asserted],
+        answers: &[Option<u64>],
+        crowding: &Crowding,
+        now: Timestamp,
+    ) {
         let level = self.thresholds.level(Family::Blended, asserted.len() as f64);
         let watched: Vec<(usize, Track)> = (0..asserted.len())
             .filter_map(|i| Some((i, self.tracks.get(answers[i]?)?.clone())))
-            .filter(|(i, t)| t.hit && t.confirmed && !self.is_shared(*i, t, asserted, answers))
+            .filter(|(i, t)| t.hit && t.confirmed && !self.is_shared(*i, t, asserted, answers, crowding))
             .map(|(i, t)| (i, self.with_whole_spot(t, answers)))
             .collect();
         self.note_spots(asserted, &watched);
@@ -140,11 +147,19 @@ impl Monitor {
     }
 
     /// Whether another user's beam may be in this spot, by tracks or by claims.
-    fn is_shared(&self, i: usize, track: &Track, asserted: &[Asserted], answers: &[Option<u64>]) -> bool {
+    fn is_shared(
+        &self,
+        i: usize,
+        track: &Track,
+        asserted: &[Asserted],
+        answers: &[Option<u64>],
+        crowding: &Crowding,
+    ) -> bool {
         let (here, reach) = (track.motion.position(), track.detection.resolution_m);
         self.confused_m(track, answers) > 0.0
             || (0..asserted.len())
                 .filter(|&j| j != i && answers[j].is_none())
+                .filter(|&j| !crowding.is_crowded() || self.is_established(&asserted[j]))
                 .any(|j| {
                     let a = &asserted[j];
                     let away = (a.position - here).norm() - a.slack_m - 2.0 * a.variance.sqrt();

@@ -56,6 +56,7 @@ impl Monitor {
             user.track = Some(track.id);
             user.unanswered_since = None;
             user.absence = 0.0;
+            user.first_answered.get_or_insert(now);
             user.last_answered = Some(now);
             if a.ended {
                 continue;
