@@ -5,7 +5,7 @@ use criterion::{BenchmarkGroup, Criterion, criterion_group, criterion_main};
 use ndarray::Array2;
 use oapwatch::assign::assign;
 use oapwatch::estimate::stages::Stages;
-use oapwatch::estimate::{Config, LADDER, build};
+use oapwatch::estimate::{Config, ESTIMATORS, build};
 use oapwatch::frame::Frame;
 use oapwatch::optics::{self, psf};
 use rand::{RngExt, SeedableRng};
@@ -56,7 +56,7 @@ fn frames(criterion: &mut Criterion) {
             let (frame, places) = frame(&camera);
             let mut group = criterion.benchmark_group(format!("{spots}/{pixels}"));
             stages(&mut group, &camera, &frame, &places);
-            for rung in LADDER {
+            for rung in ESTIMATORS {
                 let config = Config {
                     name: Some(rung.name.to_owned()),
                     ..Default::default()
@@ -72,7 +72,7 @@ fn frames(criterion: &mut Criterion) {
 fn stages(group: &mut BenchmarkGroup<WallTime>, camera: &optics::Camera, frame: &Frame, places: &[[f64; 2]]) {
     let mut stages = Stages::new(camera);
     group.bench_function("stage: load", |b| b.iter(|| stages.load(frame)));
-    group.bench_function("stage: heatmap", |b| b.iter(|| stages.heatmap()));
+    group.bench_function("stage: matched filter", |b| b.iter(|| stages.matched_filter()));
     group.bench_function("stage: suppression, sub-pixel peaks", |b| b.iter(|| stages.peaks()));
     // A tenth of a pixel beside the truth, so that each step has something to do.
     let starts: Vec<_> = places.iter().map(|p| p.map(|v| v + 0.1 * camera.x.pitch_m)).collect();

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use crate::{api, calibrate, claims, daemon, estimate, frames, journal, monitor, notify, optics, scene};
+use crate::{api, calibrate, claims, estimate, frames, journal, logging, monitor, notify, optics, scene, toml_file};
 
 /// A config file. Every table may be left out.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
@@ -19,20 +19,14 @@ pub struct Config {
     pub api: api::Config,
     pub journal: journal::Config,
     pub webhook: Vec<notify::Config>,
-    pub log: daemon::logging::Config,
+    pub log: logging::Config,
 }
 
 /// Why a config file cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    #[error("{path}: {source}")]
-    Unreadable { path: PathBuf, source: std::io::Error },
-    #[error("{path}: {message}{nearest}")]
-    Malformed {
-        path: PathBuf,
-        message: String,
-        nearest: Nearest,
-    },
+    #[error(transparent)]
+    File(#[from] toml_file::Error),
     #[error("optics.calibration: {0}")]
     Calibration(#[from] calibrate::file::Error),
 }
@@ -44,48 +38,6 @@ pub enum CameraError {
     Optics(#[from] optics::Error),
     #[error(transparent)]
     Scene(#[from] scene::Error),
-}
-
-/// The known key an unknown one was probably meant to be.
-#[derive(Debug)]
-pub struct Nearest(Option<String>);
-
-impl std::fmt::Display for Nearest {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        match &self.0 {
-            Some(key) => write!(f, "did you mean `{key}`?"),
-            None => Ok(()),
-        }
-    }
-}
-
-/// Reads a TOML file into `T`, naming line, column and, for an unknown key, the nearest known one.
-pub fn read_toml<T: serde::de::DeserializeOwned>(path: &Path) -> Result<T, Error> {
-    let text = std::fs::read_to_string(path).map_err(|source| Error::Unreadable {
-        path: path.to_owned(),
-        source,
-    })?;
-    toml::from_str(&text).map_err(|e| Error::Malformed {
-        path: path.to_owned(),
-        message: e.to_string(),
-        nearest: nearest_key(e.message()),
-    })
-}
-
-/// Finds the nearest known name in serde's "unknown field `a`, expected one of `b`, `c`".
-fn nearest_key(message: &str) -> Nearest {
-    let is_unknown = ["unknown field", "unknown variant"]
-        .iter()
-        .any(|p| message.starts_with(p));
-    if !is_unknown {
-        return Nearest(None);
-    }
-    let mut names = message.split('`').skip(1).step_by(2);
-    let Some(wrong) = names.next() else {
-        return Nearest(None);
-    };
-    let best = names.max_by(|a, b| strsim::jaro_winkler(wrong, a).total_cmp(&strsim::jaro_winkler(wrong, b)));
-    Nearest(best.map(str::to_owned))
 }
 
 impl Config {
@@ -124,7 +76,7 @@ impl Config {
 
     /// The same without reading the calibration that it names.
     pub fn load_uncalibrated(path: &Path) -> Result<Self, Error> {
-        let mut config: Self = read_toml(path)?;
+        let mut config: Self = toml_file::read(path)?;
         let base = path.parent().unwrap_or(Path::new("")).to_owned();
         config.rebase(&base);
         Ok(config)

@@ -8,8 +8,10 @@
 
 pub mod claim;
 pub mod frame;
+pub mod logging;
 pub mod metric;
 pub mod optics;
+pub mod toml_file;
 
 pub mod assign;
 pub mod estimate;

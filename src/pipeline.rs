@@ -108,7 +108,7 @@ impl Pipeline {
         Estimate {
             emitters: Vec::new(),
             is_cut_short: false,
-            rung: self.estimator.name(),
+            estimator: self.estimator.name(),
             reduced_chi2: f64::NAN,
             saturated_share,
             condition: 1.0,

@@ -3,7 +3,7 @@
 
 use ndarray::Array2;
 use oapwatch::assign::ospa;
-use oapwatch::estimate::{Config, Error, Estimate, Estimator, Flags, KnownPower, LADDER, build, position_bound};
+use oapwatch::estimate::{Config, ESTIMATORS, Error, Estimate, Estimator, Flags, KnownPower, build, position_bound};
 use oapwatch::frame::Frame;
 use oapwatch::optics::{self, Camera, psf};
 use rand::{RngExt, SeedableRng};
@@ -229,7 +229,7 @@ fn the_same_frame_gives_the_same_bits() {
     let camera = camera(4e-3, 20, 1e-6);
     let mut rng = ChaCha8Rng::seed_from_u64(9);
     let pixels = render(&camera, &scatter(6, 50.0, &mut rng), &mut rng);
-    for rung in LADDER {
+    for rung in ESTIMATORS {
         let mut used = estimator(Some(rung.name), &camera);
         let bits = |e: Estimate| -> Vec<u64> { places(&e).iter().flatten().map(|v| v.to_bits()).collect() };
         let first = bits(used.estimate(&frame(pixels.clone())).unwrap());

@@ -1,10 +1,10 @@
 use std::path::PathBuf;
 
 use super::{Failure, Outcome};
-use crate::config::{self, Config};
+use crate::config::Config;
 use crate::pipeline::Pipeline;
 use crate::scene::{Plan, Scene};
-use crate::{api, frames, notify};
+use crate::{api, frames, notify, toml_file};
 
 /// Keys that a scene has and a config has not.
 const OF_SCENES: [&str; 7] = [
@@ -25,7 +25,7 @@ pub struct Args {
 
 pub fn run(args: Args) -> Outcome {
     let name = args.file.display();
-    let table: toml::Table = config::read_toml(&args.file).map_err(Failure::config)?;
+    let table: toml::Table = toml_file::read(&args.file).map_err(Failure::config)?;
     if OF_SCENES.iter().any(|key| table.contains_key(*key)) {
         let scene = Scene::load(&args.file).map_err(Failure::config)?;
         Plan::compile(&scene, 0).map_err(Failure::config)?;

@@ -6,6 +6,7 @@ mod completions;
 mod devices;
 mod explain;
 mod failure;
+mod golden;
 mod locate;
 mod man;
 mod picture;
@@ -52,6 +53,8 @@ enum Command {
     Calibrate(calibrate::Args),
     /// Measure what accuracy costs in time
     Tradeoff(tradeoff::Args),
+    /// Write or compare golden answers: what every estimator and the monitor say of the same frames
+    Golden(golden::Args),
     /// Stream simulated frames with their truth to a network's trainer
     TrainingData(training_data::Args),
     /// Try the program on hard cases and print what holds
@@ -84,6 +87,7 @@ pub fn main() -> ExitCode {
         Command::Explain(args) => explain::run(args),
         Command::Calibrate(args) => calibrate::run(args),
         Command::Tradeoff(args) => tradeoff::run(args),
+        Command::Golden(args) => golden::run(args),
         Command::TrainingData(args) => training_data::run(args),
         Command::Stability(args) => stability::run(args),
         Command::Check(args) => check::run(args),

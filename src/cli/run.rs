@@ -3,7 +3,8 @@ use std::path::PathBuf;
 
 use super::{Failure, Outcome};
 use crate::config::Config;
-use crate::daemon::{Daemon, logging};
+use crate::daemon::Daemon;
+use crate::logging;
 
 #[derive(Debug, clap::Args)]
 pub struct Args {

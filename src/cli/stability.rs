@@ -32,7 +32,7 @@ pub fn run(args: Args) -> Outcome {
         },
     };
     if let Some(name) = &options.estimator.name {
-        estimate::rung(name).map_err(Failure::input)?;
+        estimate::find(name).map_err(Failure::input)?;
     }
     let wanted = |text: &str| args.only.as_ref().is_none_or(|only| text.contains(only.as_str()));
     let mut rows = Vec::new();

@@ -3,7 +3,6 @@
 mod claims_log;
 mod compute;
 mod intake;
-pub mod logging;
 mod publish;
 mod reload;
 mod status;
@@ -27,7 +26,7 @@ use crate::frames::{self, Capture, FrameSource, SourceKind};
 use crate::journal::Journal;
 use crate::optics::Camera;
 use crate::pipeline::Pipeline;
-use crate::{api, metric, notify};
+use crate::{api, logging, metric, notify};
 use claims_log::ClaimsLog;
 use compute::Compute;
 use publish::Outlet;

@@ -5,9 +5,9 @@ use std::path::Path;
 use anyhow::Result;
 use tokio::signal::unix::{SignalKind, signal};
 
-use super::logging;
 use super::supervisor::Supervisor;
 use crate::config::Config;
+use crate::logging;
 
 /// Waits for SIGTERM or SIGINT; on SIGHUP what can change live does, and what cannot is named.
 pub async fn until_stopped(config: &Config, path: Option<&Path>, logging: &logging::Handle) -> Result<()> {

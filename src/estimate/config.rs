@@ -1,19 +1,96 @@
+//! `[estimator]` and why it may be refused.
+
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
-use super::KnownPower;
+use crate::estimate::detect::heatmap_network::NetworkError;
 
 /// `[estimator]`.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Config {
-    /// A rung of the ladder; the embedded default when left out.
+    /// The name of an estimator; [`crate::estimate::DEFAULT`] when left out.
     pub name: Option<String>,
-    /// ONNX file of the `network` and `hybrid` rungs, its card beside it; the embedded one when left out.
+    /// ONNX file of the `network` and `hybrid` estimators, its card beside it; the embedded one when left out.
     pub network: Option<PathBuf>,
-    /// Time allowed a frame; the best rung finished within it is returned.
+    /// Time allowed a frame, ms; the best hypothesis reached by then is returned.
     pub budget_ms: Option<f64>,
-    /// What the `map` rung may take for known of users' power; `map` without it is `ml` with another price of emitters.
+    /// What the `map` estimator may assume of users' power; without it `map` is `ml`.
     pub known_power: Option<KnownPower>,
+}
+
+/// `[estimator.known_power]`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct KnownPower {
+    /// Energies that one exposure collects on average from a user straight below, J: one for each power users send with.
+    pub energies_j: Vec<f64>,
+    /// Scatter of a frame's energy around that mean (fading and pointing averaged over the exposure), relative.
+    #[serde(default = "typical_scatter")]
+    pub relative_std: f64,
+    /// Of the beams that arrive, those expected to be such users'.
+    #[serde(default = "typical_share")]
+    pub share: f64,
+    /// Attenuation of the air, 1/m: who stands farther away arrives weaker.
+    #[serde(default)]
+    pub attenuation_per_m: f64,
+}
+
+/// Gamma–Gamma fading with (α, β) = (4, 2), a hundred coherence times an exposure.
+fn typical_scatter() -> f64 {
+    0.094
+}
+
+fn typical_share() -> f64 {
+    0.95
+}
+
+impl KnownPower {
+    /// Checks every field.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        let outside = |field, expected, found| Err(ConfigError::OutOfRange { field, expected, found });
+        let is_positive = |v: f64| v.is_finite() && v > 0.0;
+        if let Some(&energy) = self.energies_j.iter().find(|e| !is_positive(**e)) {
+            return outside("known_power.energies_j", "positive finite numbers", energy);
+        }
+        if !is_positive(self.relative_std) {
+            return outside(
+                "known_power.relative_std",
+                "a positive finite number",
+                self.relative_std,
+            );
+        }
+        if !(self.share > 0.0 && self.share < 1.0) {
+            return outside("known_power.share", "a number between 0 and 1", self.share);
+        }
+        if !(self.attenuation_per_m.is_finite() && self.attenuation_per_m >= 0.0) {
+            return outside(
+                "known_power.attenuation_per_m",
+                "a finite number, 0 or more",
+                self.attenuation_per_m,
+            );
+        }
+        Ok(())
+    }
+}
+
+/// Why an `[estimator]` table describes no estimator.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum ConfigError {
+    #[error("estimator.name: no estimator {found:?}; did you mean {nearest:?}? There are {known}")]
+    UnknownName {
+        found: String,
+        nearest: &'static str,
+        /// All names, as a list.
+        known: String,
+    },
+    #[error("estimator.{field}: expected {expected}, found {found}")]
+    OutOfRange {
+        field: &'static str,
+        expected: &'static str,
+        found: f64,
+    },
+    #[error(transparent)]
+    Network(#[from] NetworkError),
 }

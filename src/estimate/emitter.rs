@@ -1,11 +1,12 @@
+//! What an estimator returns: emitters with their covariance and flags.
+
 use serde::{Deserialize, Serialize};
 
 bitflags::bitflags! {
-    /// What a reader of a position must know before trusting it. Defined here once; JSON carries the names
-    /// in lower case.
+    /// Qualifications of a position. Defined here once; JSON carries the names in lower case.
     #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
     pub struct Flags: u16 {
-        /// Another emitter is so near that the data cannot tell the two apart; or this one, or an overlapping one, may be two.
+        /// Not resolved from another emitter; or this one, or an overlapping one, may be two.
         const UNRESOLVED = 1;
         /// Within 2σ of the sensor's edge, or past it.
         const NEAR_EDGE = 1 << 1;
@@ -19,9 +20,9 @@ bitflags::bitflags! {
         const POOR_FIT = 1 << 5;
         /// The frame-time budget ended the search early.
         const OUT_OF_TIME = 1 << 6;
-        /// Positions and energies trade against each other so nearly that rounding has a say in them.
+        /// The information matrix is so badly conditioned that rounding affects positions and energies.
         const ILL_CONDITIONED = 1 << 7;
-        /// The covariance is only an outline: two standard deviations out the likelihood differs from it by a factor of two.
+        /// The likelihood is not quadratic: two standard deviations out it differs from the covariance's by a factor of two.
         const NON_GAUSSIAN = 1 << 8;
     }
 }
@@ -39,13 +40,13 @@ impl Serialize for Flags {
     }
 }
 
-/// What a frame says of second moments (xx, xy, yy) that an emitter has beyond one spot's, in σ²: two emitters of equal energy,
-/// d apart in units of σ, have d²/4 along the line between them. Zero where nothing is known.
+/// Score of an emitter's second moments (xx, xy, yy) in excess of one spot's, in σ²: two emitters of equal energy, a distance d apart in
+/// σ, have d²/4 along the line between them. Zero where the frame gives no information.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Bend {
-    /// Derivative of the log likelihood in the moments; its covariance, with one spot, is `information`.
+pub struct SecondMomentScore {
+    /// Derivative of the log likelihood in the moments; for a single spot its covariance is `information`.
     pub score: [f64; 3],
-    /// Inverse covariance of the moments, what the rest of the model adjusts taken out.
+    /// Information of the moments after projection off the fitted parameters.
     pub information: [[f64; 3]; 3],
 }
 
@@ -61,21 +62,21 @@ pub struct Emitter {
     /// Standard deviation of `energy_j`.
     #[serde(skip)]
     pub energy_std_j: f64,
-    /// Spot centre on the sensor, m.
+    /// Centre on the sensor, m.
     #[serde(skip)]
     pub sensor_m: [f64; 2],
     #[serde(skip)]
-    pub bend: Bend,
+    pub second_moment: SecondMomentScore,
     pub flags: Flags,
 }
 
-/// What one frame holds.
+/// The emitters of one frame.
 #[derive(Clone, Debug, Default)]
 pub struct Estimate {
     pub emitters: Vec<Emitter>,
-    /// The rung that produced it.
-    pub rung: &'static str,
-    /// Whether a budget of time or work ended the search: its best answer until then.
+    /// The name of the estimator that produced it.
+    pub estimator: &'static str,
+    /// Whether a budget of time or work ended the search early.
     pub is_cut_short: bool,
     /// Weighted squared residual per degree of freedom; near 1 when the model explains the frame.
     pub reduced_chi2: f64,

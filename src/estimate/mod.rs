@@ -1,86 +1,30 @@
-//! Floor 1: one frame → emitters with covariance. Uses `optics`, never `scene` (the simulator stays an
+//! One frame → emitters on the sensor and on the ground, with covariance. Uses `optics`, never `scene` (the simulator stays an
 //! independent judge) and never claims (an attacker writes those).
+//!
+//! The folders are the steps of a frame's way: `preprocess` masks pixels and measures the noise, `model` predicts a frame from a
+//! hypothesis, `detect` finds starting points, `fit` is Levenberg–Marquardt, `uncertainty` is what a fit is worth, `model_order`
+//! chooses the number of emitters, and `estimators` composes them.
 
-mod amplitudes;
-mod analytic;
-mod atoms;
-mod basis;
-mod bend;
-mod bound;
 mod config;
-mod corrected;
-mod covariance;
-#[cfg(test)]
-mod descent;
-mod effort;
+mod dense_linalg;
+mod detect;
 mod emitter;
+mod error;
+mod estimator;
+mod estimators;
 mod fit;
-mod ground;
-mod heatmap;
-mod ladder;
-mod learned;
-mod linear;
-mod linearise;
 mod model;
-mod moves;
-mod network;
-mod noise;
-mod otherwise;
-mod part;
-mod parts;
-mod pencil;
-mod posterior;
-mod power;
-mod reading;
-mod screen;
-mod search;
-mod spot;
-mod spread;
+mod model_order;
+mod preprocess;
 #[doc(hidden)]
 pub mod stages;
-mod step;
-mod straight;
-mod unusable;
-mod valley;
-mod weigh;
+mod uncertainty;
 
-pub use bound::{Beside, Shape, position_bound, position_bound_beside};
-pub use config::Config;
-pub use emitter::{Bend, Emitter, Estimate, Flags};
-pub use ladder::{ConfigError, DEFAULT, LADDER, Rung, build, rung};
-pub use learned::Learned;
-pub use network::NetworkError;
-pub use power::KnownPower;
-
-use crate::frame::Frame;
-
-/// A rung of the ladder: turns a frame into emitters. Holds its scratch memory, so that a frame allocates
-/// nothing on the hot path. Deterministic: the same frame gives the same bits.
-pub trait Estimator: Send {
-    /// The name that `[estimator] name` selects it by.
-    fn name(&self) -> &'static str;
-
-    /// Emitters of one frame; a frame that holds nothing gives an empty list.
-    fn estimate(&mut self, frame: &Frame) -> Result<Estimate, Error>;
-}
-
-/// Why a frame cannot be used at all. Anything milder is a flag on the emitter.
-#[derive(Clone, Debug, PartialEq, thiserror::Error)]
-pub enum Error {
-    #[error("frame is {found_x} × {found_y} pixels, the config says {expected_x} × {expected_y}")]
-    WrongShape {
-        expected_x: usize,
-        expected_y: usize,
-        found_x: usize,
-        found_y: usize,
-    },
-    #[error("no usable pixel: {nan} of {total} are NaN or infinite, {saturated} saturated, {masked} masked")]
-    NoUsablePixel {
-        total: usize,
-        nan: usize,
-        saturated: usize,
-        masked: usize,
-    },
-    #[error(transparent)]
-    Network(#[from] NetworkError),
-}
+pub use config::{Config, ConfigError, KnownPower};
+pub use detect::heatmap_network::NetworkError;
+pub use emitter::{Emitter, Estimate, Flags, SecondMomentScore};
+pub use error::Error;
+pub use estimator::Estimator;
+pub use estimators::build::build;
+pub use estimators::list::{DEFAULT, ESTIMATORS, EstimatorSpec, Learned, find};
+pub use uncertainty::cramer_rao::{BoundAssumptions, PsfShape, position_bound, position_bound_with};

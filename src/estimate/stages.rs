@@ -1,79 +1,87 @@
-//! The stages of a frame one by one, so that a bench can time each and a test begin at the truth; not part of the interface.
+//! The stages of a frame one by one, for benches that time each and studies that begin at the truth; not part of the interface.
 
-use super::ground;
-use super::model::{Model, Nuisances, Spot};
-use super::power::Prior;
-use super::reading::Reading;
-use super::screen::Screened;
-use super::search::Search;
-use super::{Error, Estimate, KnownPower};
+use crate::estimate::config::KnownPower;
+use crate::estimate::emitter::Estimate;
+use crate::estimate::error::Error;
+use crate::estimate::model::compressed_frame::CompressedFrame;
+use crate::estimate::model::hypothesis::{Hypothesis, Nuisances, PointSource};
+use crate::estimate::model_order::power_prior::PowerPrior;
+use crate::estimate::model_order::search::Search;
+use crate::estimate::preprocess::screening::PreprocessedFrame;
+use crate::estimate::uncertainty::localise;
 use crate::frame::Frame;
 use crate::optics::Camera;
 
 /// Steps of the joint fit that is timed.
 const STEPS: usize = 5;
 
-/// A frame's way from pixels to positions, halted between stages.
+/// An estimator that stops between stages.
 pub struct Stages {
     camera: Camera,
     search: Search,
-    frame: Screened,
-    reading: Reading,
-    model: Model,
+    frame: PreprocessedFrame,
+    compressed: CompressedFrame,
+    hypothesis: Hypothesis,
 }
 
 impl Stages {
     pub fn new(camera: &Camera) -> Self {
         Self {
-            search: Search::new(super::analytic::bases(camera).0),
+            search: Search::new(crate::estimate::estimators::analytic::bases(camera).0),
             camera: camera.clone(),
-            frame: Screened::default(),
-            reading: Reading::default(),
-            model: Model::empty(Nuisances::default()),
+            frame: PreprocessedFrame::default(),
+            compressed: CompressedFrame::default(),
+            hypothesis: Hypothesis::empty(Nuisances::default()),
         }
     }
 
-    /// Validates the frame and brings it into the bases.
+    /// Validates the frame and compresses it.
     pub fn load(&mut self, frame: &Frame) -> Result<(), Error> {
         self.frame.load(frame, &self.camera)?;
         let fitter = &self.search.fitter;
-        self.reading.load(&self.frame, &fitter.bx, &fitter.by);
+        self.compressed.load(&self.frame, &fitter.bx, &fitter.by);
         Ok(())
     }
 
     /// The matched filter of the loaded frame.
-    pub fn heatmap(&mut self) {
-        let Reading { z, mx, my, .. } = &self.reading;
-        self.search.heatmap.respond(z, *mx, *my);
+    pub fn matched_filter(&mut self) {
+        let CompressedFrame {
+            coefficients, mx, my, ..
+        } = &self.compressed;
+        self.search.matched_filter.respond(coefficients, *mx, *my);
     }
 
-    /// Maxima of the heatmap, suppressed within a spot's radius and placed between grid points; how many.
+    /// Number of maxima of the matched filter after non-maximum suppression.
     pub fn peaks(&mut self) -> usize {
-        self.search.heatmap.find(self.search.price.sqrt(), 1.0).len()
+        self.search
+            .matched_filter
+            .find(self.search.source_penalty.sqrt(), 1.0)
+            .len()
     }
 
-    /// Five steps of the joint fit of the spots at `places`, m on the sensor.
+    /// Five steps of the joint fit of the sources at `places`, m on the sensor.
     pub fn fit(&mut self, places: &[[f64; 2]]) {
         self.fit_from(places, STEPS);
     }
 
     fn fit_from(&mut self, places: &[[f64; 2]], steps: usize) {
         let sigma = self.camera.spot_sigma_m;
-        self.model = Model::empty(Nuisances::default());
-        let spots = places.iter().map(|p| Spot::new(p.map(|v| v / sigma), 0.0));
-        self.model.spots.extend(spots);
-        self.search.restart(None);
-        self.search.fitter.fit(&self.reading, &mut self.model, steps);
+        self.hypothesis = Hypothesis::empty(Nuisances::default());
+        let sources = places.iter().map(|p| PointSource::new(p.map(|v| v / sigma), 0.0));
+        self.hypothesis.sources.extend(sources);
+        self.search.reset(None);
+        self.search.fitter.fit(&self.compressed, &mut self.hypothesis, steps);
     }
 
-    /// −2 ln of the posterior probability of what `map` makes of spots at `places`, m on the sensor, and that.
+    /// The most probable hypothesis that the `map` search reaches from sources at `places`, m on the sensor: its −2 ln probability, and its
+    /// emitters.
     pub fn most_probable(&mut self, known: &KnownPower, places: &[[f64; 2]]) -> (f64, Estimate) {
         self.fit_from(places, 0);
-        self.search.prior = Some(Prior::new(known, &self.camera));
+        self.search.prior = Some(PowerPrior::new(known, &self.camera));
         self.search
-            .weigh_up(&self.reading, &mut self.model, f64::INFINITY, f64::INFINITY);
-        self.search.maximum_posterior(&self.reading, &mut self.model);
-        let score = self.search.score(&self.model);
+            .fit_with_prior(&self.compressed, &mut self.hypothesis, f64::INFINITY, f64::INFINITY);
+        self.search.maximum_posterior(&self.compressed, &mut self.hypothesis);
+        let score = self.search.score(&self.hypothesis);
         self.search.prior = None;
         (score, self.ground())
     }
@@ -84,9 +92,9 @@ impl Stages {
             camera,
             search,
             frame,
-            reading,
-            model,
+            compressed,
+            hypothesis,
         } = self;
-        ground::locate(search, reading, model, frame, camera, camera.noise_std_j, None)
+        localise::localise(search, compressed, hypothesis, frame, camera, camera.noise_std_j, None)
     }
 }

@@ -4,33 +4,14 @@ use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::thread::JoinHandle;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
-use super::slot::{Slot, Taken};
-use super::{FrameSource, Next};
+use super::slot::{Captured, Slot, Taken};
+use super::source::{FrameSource, Next};
 use crate::metric;
 
 /// How long a closing capture may go unnoticed.
 const PATIENCE: Duration = Duration::from_millis(100);
-
-/// What a source gave, and the recording it stands in.
-#[derive(Clone, Debug)]
-pub struct Captured {
-    pub next: Next,
-    pub file: Option<Arc<Path>>,
-    /// When the source gave it.
-    pub at: Instant,
-}
-
-impl Captured {
-    pub fn new(next: Next, file: Option<Arc<Path>>) -> Self {
-        Self {
-            next,
-            file,
-            at: Instant::now(),
-        }
-    }
-}
 
 /// A running source. Dropping it stops the thread and waits for it.
 #[derive(Debug)]

@@ -9,6 +9,7 @@ use super::npy::Reader;
 use super::record::{self, Player};
 use super::{Config, Error, FrameSource, Next};
 use crate::frame::Frame;
+use crate::toml_file::Key;
 
 /// Opens `source.frames`: a folder of our own recordings, or one of them, whose times and claims are replayed as
 /// they were; or, where `source.start` gives the times, any .npy file.
@@ -108,13 +109,7 @@ struct Replay {
 
 impl Replay {
     fn open(path: &Path, config: &Config, joules_per_count: Option<f64>) -> Result<Self, Error> {
-        if !(config.rate_hz.is_finite() && config.rate_hz > 0.0) {
-            return Err(Error::OutOfRange {
-                field: "rate_hz",
-                expected: "a positive finite number",
-                found: config.rate_hz,
-            });
-        }
+        Key::new("source.rate_hz").positive(config.rate_hz)?;
         let start = config.start.unwrap_or_else(|| {
             tracing::warn!(frames = %path.display(), "source.start is not set: frame 0 is taken to be at 1970-01-01T00:00:00Z");
             Timestamp::UNIX_EPOCH
@@ -197,11 +192,9 @@ impl Pace {
     pub fn new(speed: f64) -> Result<Self, Error> {
         match speed.is_finite() && speed >= 0.0 {
             true => Ok(Self { speed, origin: None }),
-            false => Err(Error::OutOfRange {
-                field: "speed",
-                expected: "0 (as fast as possible) or a positive finite number",
-                found: speed,
-            }),
+            false => Err(Key::new("source.speed")
+                .refuse("0 (as fast as possible) or a positive finite number", speed)
+                .into()),
         }
     }
 

@@ -1,13 +1,33 @@
 //! Where the capture thread leaves what it has and the compute thread finds the latest.
 
 use std::collections::VecDeque;
-use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+use std::path::Path;
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use super::{Captured, Next};
+use super::source::Next;
 
 /// Events other than frames that wait at most; more than this and the oldest goes.
 const MOST_UNUSABLE: usize = 64;
+
+/// What a source gave, and the recording it stands in.
+#[derive(Clone, Debug)]
+pub struct Captured {
+    pub next: Next,
+    pub file: Option<Arc<Path>>,
+    /// When the source gave it.
+    pub at: Instant,
+}
+
+impl Captured {
+    pub fn new(next: Next, file: Option<Arc<Path>>) -> Self {
+        Self {
+            next,
+            file,
+            at: Instant::now(),
+        }
+    }
+}
 
 /// Holds at most one frame. A newer frame takes its place and inherits its claims; the drop is counted.
 #[derive(Debug, Default)]

@@ -3,7 +3,7 @@ use std::collections::VecDeque;
 use nalgebra::{Matrix2, Matrix3, Vector3};
 
 use super::watch::habits::median;
-use crate::estimate::Bend;
+use crate::estimate::SecondMomentScore;
 
 /// Newest frames that a test looks at.
 const WINDOWS: [usize; 5] = [3, 10, 20, 40, 80];
@@ -79,7 +79,7 @@ impl Default for Moments {
 
 impl Moments {
     /// What a frame says, its covariance times `inflation`.
-    pub fn of(bend: &Bend, inflation: f64) -> Self {
+    pub fn of(bend: &SecondMomentScore, inflation: f64) -> Self {
         let s = bend.information;
         Self {
             score: Vector3::from(bend.score) / inflation,

@@ -51,7 +51,7 @@ impl Detection {
                     cov,
                     energy_j: e.energy_j,
                     flags: e.flags,
-                    moments: Moments::of(&e.bend, inflation),
+                    moments: Moments::of(&e.second_moment, inflation),
                     snr: snr(camera, e.energy_j) / inflation.sqrt(),
                     resolution_m: resolution_m(camera, snr(camera, e.energy_j)),
                     ghost: 0.0,

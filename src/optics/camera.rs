@@ -1,6 +1,7 @@
 use std::sync::Arc;
 
-use super::{Distortion, PixelMaps};
+use super::distortion::Distortion;
+use super::pixel_maps::PixelMaps;
 
 /// One axis of the photodetector array: `n` pixels of equal pitch from `min_m` upwards.
 #[derive(Clone, Copy, Debug, PartialEq)]

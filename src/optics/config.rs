@@ -2,8 +2,11 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
+use super::calibration::Calibration;
 use super::camera::{Axis, Camera};
-use super::{Calibration, CalibrationError, Distortion};
+use super::distortion::Distortion;
+use super::error::Error;
+use crate::toml_file::Key;
 
 /// `[optics]` of a config or scene. What is left out takes the value of the paper's scene.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -40,23 +43,6 @@ pub struct BlurConfig {
     pub sensor_sigma_m: f64,
 }
 
-/// Why an `[optics]` table describes no camera.
-#[derive(Debug, thiserror::Error)]
-pub enum Error {
-    #[error("optics.{field}: expected {expected}, found {found}")]
-    OutOfRange {
-        field: &'static str,
-        expected: &'static str,
-        found: f64,
-    },
-    #[error("optics: give either spot_sigma_m or [optics.blur], not both")]
-    TwoBlurs,
-    #[error("optics.calibration: {0} was named but not read: only a config can name a calibration, a scene cannot")]
-    CalibrationNotRead(PathBuf),
-    #[error("optics.calibration: {0}")]
-    Calibration(#[from] CalibrationError),
-}
-
 impl Default for Config {
     fn default() -> Self {
         Self {
@@ -82,24 +68,11 @@ impl Config {
 
     /// Checks every field and resolves the blur budget.
     pub fn camera(&self) -> Result<Camera, Error> {
-        let positive = |field, value: f64| {
-            if value.is_finite() && value > 0.0 {
-                Ok(value)
-            } else {
-                Err(Error::OutOfRange {
-                    field,
-                    expected: "a positive finite number",
-                    found: value,
-                })
-            }
-        };
+        let key = Key::new("optics");
+        let positive = |name, value| key.at(name).positive(value);
         for n in self.pixels {
             if n == 0 || n > 4096 {
-                return Err(Error::OutOfRange {
-                    field: "pixels",
-                    expected: "1 to 4096 a side",
-                    found: n as f64,
-                });
+                return Err(key.at("pixels").refuse("1 to 4096 a side", self.pixels).into());
             }
         }
         let axis = |k: usize| -> Result<Axis, Error> {
@@ -115,19 +88,10 @@ impl Config {
                 let f = positive("blur.focal_length_m", blur.focal_length_m)?;
                 let wavelength = positive("blur.wavelength_m", blur.wavelength_m)?;
                 let sensor = blur.sensor_sigma_m;
-                if !(sensor.is_finite() && sensor >= 0.0) {
-                    return Err(Error::OutOfRange {
-                        field: "blur.sensor_sigma_m",
-                        expected: "zero or more",
-                        found: sensor,
-                    });
-                }
+                key.at("blur.sensor_sigma_m").non_negative(sensor)?;
                 if plane_distance_m > f {
-                    return Err(Error::OutOfRange {
-                        field: "plane_distance_m",
-                        expected: "at most blur.focal_length_m",
-                        found: plane_distance_m,
-                    });
+                    let expected = "at most blur.focal_length_m";
+                    return Err(key.at("plane_distance_m").refuse(expected, plane_distance_m).into());
                 }
                 super::blur::spot_sigma(lens_radius_m, plane_distance_m, f, wavelength, sensor)
             }

@@ -1,16 +1,20 @@
-//! Floor 0: the optics as pure functions. No IO, no clock, no randomness.
+//! The optics as pure functions. No IO, no clock, no randomness.
 
 pub mod blur;
 mod calibration;
 mod camera;
 mod config;
 mod distortion;
+mod error;
 pub mod fading;
 pub mod geometry;
+mod pixel_maps;
 pub mod psf;
 pub mod radiometry;
 
-pub use calibration::{Calibration, CalibrationError, PixelMaps};
+pub use calibration::Calibration;
 pub use camera::{Axis, Camera};
-pub use config::{BlurConfig, Config, Error};
+pub use config::{BlurConfig, Config};
 pub use distortion::Distortion;
+pub use error::{CalibrationError, Error};
+pub use pixel_maps::PixelMaps;

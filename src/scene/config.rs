@@ -3,10 +3,12 @@ use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 
-use super::effects::{Effect, Effects};
-use super::error::{Error, Field};
+use super::effect::Effect;
+use super::effects::Effects;
+use super::error::Error;
 use super::motion::{Motion, Schedule};
-use crate::{config, optics};
+use crate::toml_file::{Key, OutOfRange};
+use crate::{optics, toml_file};
 
 /// A scene file. Only `optics` and `link` have defaults that do something (the paper's); everything else is there
 /// because the file names it.
@@ -153,7 +155,7 @@ impl Scene {
     /// The file cannot be read, is not TOML, has an unknown key (the nearest known one is named), or a field is out of
     /// range (the field is named).
     pub fn load(path: &Path) -> Result<Self, Error> {
-        let scene: Self = config::read_toml(path)?;
+        let scene: Self = toml_file::read(path)?;
         match scene.validate() {
             Ok(()) => Ok(scene),
             Err(e) => Err(Error::Scene {
@@ -180,7 +182,7 @@ impl Scene {
 
     /// Checks every field that the optics do not check themselves.
     pub fn validate(&self) -> Result<(), Error> {
-        let root = Field::new("");
+        let root = Key::new("");
         root.at("rate_hz").positive(self.rate_hz)?;
         root.at("tolerance").non_negative(self.tolerance)?;
         self.optics.camera()?;
@@ -196,10 +198,10 @@ impl Scene {
         for (k, intruder) in self.intruder.iter().enumerate() {
             self.validate_intruder(intruder, &root.item("intruder", k))?;
         }
-        self.effects.validate(&root.at("effects"))
+        Ok(self.effects.validate(&root.at("effects"))?)
     }
 
-    fn validate_names(&self, root: &Field) -> Result<(), Error> {
+    fn validate_names(&self, root: &Key) -> Result<(), OutOfRange> {
         let mut seen = HashSet::new();
         let users = self.user.iter().enumerate().map(|(k, u)| ("user", k, &u.name));
         let intruders = self.intruder.iter().enumerate().map(|(k, i)| ("intruder", k, &i.name));
@@ -214,7 +216,7 @@ impl Scene {
         Ok(())
     }
 
-    fn validate_intruder(&self, intruder: &IntruderConfig, field: &Field) -> Result<(), Error> {
+    fn validate_intruder(&self, intruder: &IntruderConfig, field: &Key) -> Result<(), OutOfRange> {
         let motion = field.at("motion");
         intruder.motion.validate(&motion)?;
         if let Motion::Beside(beside) | Motion::AtClaimOf(beside) = &intruder.motion
@@ -228,7 +230,7 @@ impl Scene {
 }
 
 impl UserConfig {
-    fn validate(&self, field: &Field) -> Result<(), Error> {
+    fn validate(&self, field: &Key) -> Result<(), OutOfRange> {
         for (name, motion) in [("motion", Some(&self.motion)), ("claimed", self.claimed.as_ref())] {
             let Some(motion) = motion else { continue };
             let field = field.at(name);
@@ -242,7 +244,7 @@ impl UserConfig {
     }
 }
 
-fn validate_power(power_w: Option<f64>, field: &Field) -> Result<(), Error> {
+fn validate_power(power_w: Option<f64>, field: &Key) -> Result<(), OutOfRange> {
     power_w.map_or(Ok(()), |p| field.at("power_w").positive(p).map(drop))
 }
 
@@ -252,7 +254,7 @@ impl LinkConfig {
         (self.integration_time_s / self.coherence_time_s).round().max(1.0) as u32
     }
 
-    fn validate(&self, field: &Field, rate_hz: f64) -> Result<(), Error> {
+    fn validate(&self, field: &Key, rate_hz: f64) -> Result<(), OutOfRange> {
         field.at("power_w").positive(self.power_w)?;
         field.at("beam_radius_m").positive(self.beam_radius_m)?;
         field.at("transmittance").fraction(self.transmittance)?;
@@ -274,7 +276,7 @@ impl LinkConfig {
 }
 
 impl ClaimsConfig {
-    fn validate(&self, field: &Field) -> Result<(), Error> {
+    fn validate(&self, field: &Key) -> Result<(), OutOfRange> {
         field.at("period_s").positive(self.period_s)?;
         if let Some(sigma) = self.sigma_m {
             field.at("sigma_m").positive(sigma)?;
@@ -290,7 +292,7 @@ impl ClaimsConfig {
 }
 
 impl RandomEmittersConfig {
-    fn validate(&self, field: &Field) -> Result<(), Error> {
+    fn validate(&self, field: &Key) -> Result<(), OutOfRange> {
         if self.count[0] > self.count[1] {
             return Err(field.at("count").refuse("[smallest, largest]", self.count));
         }

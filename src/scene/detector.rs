@@ -3,14 +3,16 @@
 use ndarray::Array2;
 
 use super::config::Scene;
+use super::effect::Effect;
 use super::effects::{Converter, DefectMap, Glint};
-use super::error::{Error, Field};
-use super::light::{Light, Moment, brightest_pixel};
+use super::effects::{Saturation, ShotNoise, ThermalNoise};
+use super::light::{Light, brightest_pixel};
+use super::moment::Moment;
 use super::render::{Renderer, Spot};
 use super::report::{Decisions, Status};
 use super::stream::{Ledger, Streams};
-use super::{Effect, Saturation, ShotNoise, ThermalNoise};
 use crate::optics::{Camera, PixelMaps};
+use crate::toml_file::{Key, OutOfRange};
 
 /// The array and its read-out.
 #[derive(Debug)]
@@ -30,10 +32,10 @@ pub(super) struct Detector {
 }
 
 impl Detector {
-    pub fn new(scene: &Scene, light: &Light, streams: Streams, decisions: &mut Decisions) -> Result<Self, Error> {
+    pub fn new(scene: &Scene, light: &Light, streams: Streams, decisions: &mut Decisions) -> Result<Self, OutOfRange> {
         let ledger = Ledger::default();
         let once = |effect| streams.open(effect, 0, 0, &ledger);
-        let field = Field::new("effects");
+        let field = Key::new("effects");
         let effects = &scene.effects;
         let camera = &light.lens;
         let (ny, nx) = camera.shape();
@@ -152,8 +154,8 @@ impl Detector {
     fn saturation(
         scene: &Scene,
         decisions: &mut Decisions,
-        field: &Field,
-    ) -> Result<Option<(f64, Option<Saturation>)>, Error> {
+        field: &Key,
+    ) -> Result<Option<(f64, Option<Saturation>)>, OutOfRange> {
         let table = scene.effects.saturation.as_ref();
         let level = table.and_then(|s| s.level_j).or(scene.optics.saturation_j);
         match (table, level) {

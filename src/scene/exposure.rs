@@ -1,12 +1,13 @@
 //! How a spot moves while the shutter is open.
 
-use super::Effect;
 use super::config::Scene;
+use super::effect::Effect;
 use super::effects::{Shaker, Wander};
-use super::error::{Error, Field};
+use super::error::Error;
 use super::population::Population;
 use super::report::{Decisions, Status};
 use super::stream::{Ledger, Streams};
+use crate::toml_file::Key;
 
 #[derive(Debug)]
 pub(super) struct Exposure {
@@ -32,9 +33,9 @@ impl Exposure {
     ) -> Result<Self, Error> {
         let effects = &scene.effects;
         let time_s = scene.link.integration_time_s;
-        let field = Field::new("effects");
+        let field = Key::new("effects");
         // Eight sub-frames a period, or a correlation time, follow the motion; 1,024 are the most.
-        let needed = |times: f64, field: Field, found: f64| {
+        let needed = |times: f64, field: Key, found: f64| {
             let steps = (8.0 * times).ceil();
             if steps <= MOST_STEPS {
                 Ok((steps as usize).max(16))

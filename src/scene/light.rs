@@ -2,14 +2,16 @@
 
 use super::average::Average;
 use super::config::Scene;
+use super::effect::Effect;
+use super::effects::{Attenuation, Vignetting};
 use super::effects::{Pose, Rays, attitude};
 use super::error::Error;
 use super::exposure::Exposure;
+use super::moment::Moment;
 use super::population::{Beam, Population};
 use super::render::Spot;
 use super::report::{Decisions, Status};
 use super::stream::{Ledger, Streams};
-use super::{Attenuation, Effect, Vignetting};
 use crate::optics::{Camera, geometry, psf};
 
 /// Everything between a beam and its spots.
@@ -35,15 +37,6 @@ pub(super) struct Shot {
     shaken: Vec<[f64; 2]>,
     wandered: Vec<[f64; 2]>,
     factors: Vec<f64>,
-}
-
-/// Frame number, time and where its randomness comes from.
-#[derive(Clone, Copy, Debug)]
-pub(super) struct Moment<'a> {
-    pub k: u64,
-    pub t: f64,
-    pub streams: Streams,
-    pub ledger: &'a Ledger,
 }
 
 /// The steepest slope of a unit Gaussian, exp(−1/2).

@@ -4,10 +4,12 @@
 mod average;
 mod config;
 mod detector;
+mod effect;
 mod effects;
 mod error;
 mod exposure;
 mod light;
+mod moment;
 mod motion;
 mod network;
 mod plan;
@@ -19,6 +21,7 @@ mod stream;
 mod truth;
 
 pub use config::{ClaimsConfig, IntruderConfig, LinkConfig, RandomEmittersConfig, Scene, UserConfig};
+pub use effect::Effect;
 pub use effects::*;
 pub use error::Error;
 pub use motion::{Beside, Drift, Motion, Roam, Schedule, Walk};

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::error::{Error, Field};
+use crate::toml_file::{Key, OutOfRange};
 
 /// How an emitter moves on the ground. Metres, seconds; axes as on the ground, origin below the lens.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -57,7 +57,7 @@ pub struct Beside {
 }
 
 impl Motion {
-    pub(super) fn validate(&self, field: &Field) -> Result<(), Error> {
+    pub(super) fn validate(&self, field: &Key) -> Result<(), OutOfRange> {
         match self {
             Self::Still(at) => field.at("still").finite_pair(*at).map(drop),
             Self::Walk(walk) => {
@@ -136,7 +136,7 @@ pub struct Schedule {
 }
 
 impl Schedule {
-    pub(super) fn validate(&self, field: &Field) -> Result<(), Error> {
+    pub(super) fn validate(&self, field: &Key) -> Result<(), OutOfRange> {
         field.at("from_s").finite(self.from_s)?;
         if let Some(until) = self.until_s {
             field.at("until_s").finite(until)?;

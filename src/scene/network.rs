@@ -3,8 +3,8 @@
 use rand::RngExt;
 use rand_distr::{Distribution, StandardNormal};
 
-use super::Effect;
 use super::config::ClaimsConfig;
+use super::effect::Effect;
 use super::population::{Actor, Population};
 use super::report::{Decisions, Status};
 use super::stream::{Ledger, Streams};

@@ -2,8 +2,8 @@
 
 use rand::RngExt;
 
-use super::Effect;
 use super::config::{RandomEmittersConfig, Scene};
+use super::effect::Effect;
 use super::motion::{Beside, Motion, Schedule};
 use super::process::GaussianProcess;
 use super::report::{Decisions, Status};

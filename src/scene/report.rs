@@ -1,4 +1,4 @@
-use super::Effect;
+use super::effect::Effect;
 
 /// What a plan does about one effect.
 #[derive(Clone, Debug)]

@@ -9,7 +9,7 @@ use std::ops::{Deref, DerefMut};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-use super::Effect;
+use super::effect::Effect;
 
 /// How many 32-bit words each effect has drawn.
 #[derive(Debug, Default)]

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use oapwatch::claim::{Claim, ClaimState};
 use oapwatch::claims::{self, Store};
-use oapwatch::estimate::{Bend, Emitter, Error, Estimate, Flags};
+use oapwatch::estimate::{Emitter, Error, Estimate, Flags, SecondMomentScore};
 use oapwatch::monitor::{AlertEvent, AlertEventKind, AlertKind, AlertState, Monitor, Observation, Report, Source};
 use oapwatch::optics::Camera;
 use rand::{RngExt, SeedableRng};
@@ -73,17 +73,17 @@ struct Blob {
 /// What a fit of one spot would say of the second moments. For a Gaussian spot their information is ¼, ½ and ¼ of that of a
 /// coordinate, in units of σ: ⟨f_xx, f_xx⟩ less what the amplitude takes is half of ⟨f, f⟩, as is ⟨f_x, f_x⟩. The story's error of
 /// positions is one beam's; information grows with the square of the energy.
-fn bend(blob: &Blob, story: &Story, camera: &Camera, rng: &mut ChaCha8Rng) -> Bend {
+fn score(blob: &Blob, story: &Story, camera: &Camera, rng: &mut ChaCha8Rng) -> SecondMomentScore {
     let sigma_m = camera.spot_sigma_m * camera.ground_scale();
     let coordinate = (sigma_m / story.position_std_m * blob.energy_j / blob.brightest_j).powi(2);
-    let mut bend = Bend::default();
+    let mut score = SecondMomentScore::default();
     for (k, share) in [0.25, 0.5, 0.25].into_iter().enumerate() {
         let information = share * coordinate;
         let z: f64 = StandardNormal.sample(rng);
-        bend.score[k] = information * blob.moments_m2[k] / sigma_m.powi(2) + information.sqrt() * z;
-        bend.information[k][k] = information;
+        score.score[k] = information * blob.moments_m2[k] / sigma_m.powi(2) + information.sqrt() * z;
+        score.information[k][k] = information;
     }
-    bend
+    score
 }
 
 /// Detections of one frame: beams that are too near each other melt into one.
@@ -143,7 +143,7 @@ fn detect(story: &Story, t: f64, rng: &mut ChaCha8Rng) -> Vec<Emitter> {
                 energy_j,
                 energy_std_j: 1e-5,
                 sensor_m: camera.to_sensor([x_m, y_m]),
-                bend: bend(&blob, story, &camera, &mut shapes),
+                second_moment: score(&blob, story, &camera, &mut shapes),
                 flags: Flags::empty(),
             }
         })
@@ -235,7 +235,7 @@ pub fn tell_with(story: &Story, keep: bool) -> Told {
         let mut estimate = Estimate {
             is_cut_short: false,
             emitters: detect(story, t, &mut rng),
-            rung: "story",
+            estimator: "story",
             reduced_chi2: 1.0,
             saturated_share: 0.0,
             condition: 1.0,

@@ -3,6 +3,7 @@ use std::path::PathBuf;
 use serde::{Deserialize, Serialize};
 
 use crate::frames::Error;
+use crate::toml_file::Key;
 
 /// `[record]`: what the monitor sees, kept on disk.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -37,20 +38,12 @@ impl Default for Config {
 impl Config {
     /// Refuses what no recorder can do.
     pub fn check(&self) -> Result<(), Error> {
-        let numbers = [
-            ("record.limit_mb", self.limit_mb),
-            ("record.segment_s", self.segment_s),
-            ("record.before_s", self.before_s),
-            ("record.after_s", self.after_s),
-            ("record.evidence_limit_mb", self.evidence_limit_mb),
-        ];
-        match numbers.into_iter().find(|(_, n)| !(n.is_finite() && *n > 0.0)) {
-            None => Ok(()),
-            Some((field, found)) => Err(Error::OutOfRange {
-                field,
-                expected: "a positive finite number",
-                found,
-            }),
-        }
+        let key = Key::new("record");
+        key.at("limit_mb").positive(self.limit_mb)?;
+        key.at("segment_s").positive(self.segment_s)?;
+        key.at("before_s").positive(self.before_s)?;
+        key.at("after_s").positive(self.after_s)?;
+        key.at("evidence_limit_mb").positive(self.evidence_limit_mb)?;
+        Ok(())
     }
 }

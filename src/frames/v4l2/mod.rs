@@ -24,6 +24,7 @@ use super::{Error, FrameSource, Next};
 use crate::frame::Frame;
 use crate::metric;
 use crate::optics::Camera;
+use crate::toml_file::Key;
 use clock::{Moment, Numbering, Stamped, exposed, is_monotonic};
 use faults::{Fault, Faults};
 use session::Session;
@@ -68,14 +69,7 @@ impl V4l2 {
     /// Checks the config. The device itself is opened by the first wait, and waited for while it is not there.
     pub fn new(source: &super::Config, camera: &Camera) -> Result<Self, Error> {
         let missing = |field| Error::Missing { field, kind: "v4l2" };
-        let positive = |field, found: f64| match found.is_finite() && found > 0.0 {
-            true => Ok(found),
-            false => Err(Error::OutOfRange {
-                field,
-                expected: "a positive finite number",
-                found,
-            }),
-        };
+        let positive = |name, found| Key::new("source").at(name).positive(found);
         let device = source.device.clone().ok_or(missing("device"))?;
         let config = source.v4l2.clone();
         let rate_hz = positive("rate_hz", source.rate_hz)?;

@@ -6,13 +6,14 @@ use law::{MeanLaw, WORTH_FROM};
 use rand::RngExt;
 use rand_distr::Distribution;
 
-use super::Effect;
 use super::config::Scene;
+use super::effect::Effect;
 use super::effects::{Capture, Fades, Pointing, Turbulence};
-use super::error::{Error, Field};
-use super::light::Moment;
+use super::error::Error;
+use super::moment::Moment;
 use super::report::{Decisions, Status};
 use crate::optics::Camera;
+use crate::toml_file::Key;
 
 #[derive(Debug)]
 pub(super) enum Average {
@@ -40,7 +41,7 @@ impl Average {
         let w = scene.link.beam_radius_m;
         let fading = decisions.weigh(Effect::Fading, &effects.fading, |_| f64::INFINITY);
         let turbulence = match fading {
-            Some(fading) => Some(fading.turbulence(&Field::new("effects.fading"))?),
+            Some(fading) => Some(fading.turbulence(&Key::new("effects.fading"))?),
             None => None,
         };
         let pointing = decisions.weigh(Effect::Pointing, &effects.pointing, |p| {

@@ -1,8 +1,8 @@
 use serde::{Deserialize, Serialize};
 
-use super::Table;
-use crate::scene::error::{Error, Field};
+use super::table::Table;
 use crate::scene::render::Spot;
+use crate::toml_file::{Key, OutOfRange};
 
 /// A spot that is no Gaussian: the rays of a spot diagram, each blurred by what σ_eff leaves for diffraction and the
 /// sensor. Geometric optics, so valid where the aberration is wider than the diffraction.
@@ -107,7 +107,7 @@ impl Rays {
 }
 
 impl Table for Aberrations {
-    fn validate(&self, field: &Field) -> Result<(), Error> {
+    fn validate(&self, field: &Key) -> Result<(), OutOfRange> {
         field.at("coma_m").non_negative(self.coma_m)?;
         let share = field.at("defocus_share").non_negative(self.defocus_share)?;
         if share > 0.95 {

@@ -1,8 +1,8 @@
 use serde::{Deserialize, Serialize};
 
-use super::Table;
+use super::table::Table;
 use crate::optics::radiometry;
-use crate::scene::error::{Error, Field};
+use crate::toml_file::{Key, OutOfRange};
 
 /// The power through the lens as the Gaussian beam's integral over the disc, 1 − Q₁(2r/w_z, 2r_a/w_z), in place of the flat
 /// form, whose relative error is about (r_a/w_z)². Valid for any w_z.
@@ -11,7 +11,7 @@ use crate::scene::error::{Error, Field};
 pub struct ExactAperture {}
 
 impl Table for ExactAperture {
-    fn validate(&self, _field: &Field) -> Result<(), Error> {
+    fn validate(&self, _field: &Key) -> Result<(), OutOfRange> {
         Ok(())
     }
 }

@@ -1,8 +1,8 @@
 use serde::{Deserialize, Serialize};
 
-use super::Table;
+use super::table::Table;
 use crate::optics::radiometry;
-use crate::scene::error::{Error, Field};
+use crate::toml_file::{Key, OutOfRange};
 
 /// Absorption and scattering along the path: g = exp(−κL) (Beer and Lambert). Valid for a path of uniform extinction.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -20,7 +20,7 @@ impl Attenuation {
 }
 
 impl Table for Attenuation {
-    fn validate(&self, field: &Field) -> Result<(), Error> {
+    fn validate(&self, field: &Key) -> Result<(), OutOfRange> {
         field.at("kappa_per_m").non_negative(self.kappa_per_m).map(drop)
     }
 }

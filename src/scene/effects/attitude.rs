@@ -1,10 +1,11 @@
 use rand_distr::{Distribution, StandardNormal};
 use serde::{Deserialize, Serialize};
 
-use super::{Effect, Table};
-use crate::scene::error::{Error, Field};
+use super::table::Table;
+use crate::scene::effect::Effect;
 use crate::scene::process::GaussianProcess;
 use crate::scene::stream::{Ledger, Streams};
+use crate::toml_file::{Key, OutOfRange};
 
 /// The platform's attitude differs from what is believed: every spot of a frame moves alike. Tilts about y and x shift the
 /// angles θx and θy, yaw turns them about the lens's axis; each is N(bias, std²), anew for every frame, or with
@@ -21,7 +22,7 @@ pub struct Attitude {
 }
 
 impl Table for Attitude {
-    fn validate(&self, field: &Field) -> Result<(), Error> {
+    fn validate(&self, field: &Key) -> Result<(), OutOfRange> {
         for std in self.tilt_std_rad {
             field.at("tilt_std_rad").non_negative(std)?;
         }

@@ -1,8 +1,8 @@
 use serde::{Deserialize, Serialize};
 
-use super::Table;
+use super::table::Table;
 use crate::optics::Camera;
-use crate::scene::error::{Error, Field};
+use crate::toml_file::{Key, OutOfRange};
 
 /// Light of sky and ground, an energy per pixel that is the same in every frame: uniform + gradient·(x/X, y/Y), X and Y the
 /// half-widths of the sensor, and never below zero.
@@ -29,7 +29,7 @@ impl Background {
 }
 
 impl Table for Background {
-    fn validate(&self, field: &Field) -> Result<(), Error> {
+    fn validate(&self, field: &Key) -> Result<(), OutOfRange> {
         field.at("uniform_j").non_negative(self.uniform_j)?;
         field.at("gradient_j").finite_pair(self.gradient_j).map(drop)
     }

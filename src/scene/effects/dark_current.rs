@@ -2,8 +2,8 @@ use rand::Rng;
 use rand_distr::{Distribution, LogNormal};
 use serde::{Deserialize, Serialize};
 
-use super::Table;
-use crate::scene::error::{Error, Field};
+use super::table::Table;
+use crate::toml_file::{Key, OutOfRange};
 
 /// Charge that gathers without light, in joules of light that would give as much: a mean per exposure and, with `spread`, a
 /// log-normal pattern of that relative standard deviation, the same in every frame. Its own shot noise comes with
@@ -27,7 +27,7 @@ impl DarkCurrent {
 }
 
 impl Table for DarkCurrent {
-    fn validate(&self, field: &Field) -> Result<(), Error> {
+    fn validate(&self, field: &Key) -> Result<(), OutOfRange> {
         field.at("energy_j").positive(self.energy_j)?;
         field.at("spread").non_negative(self.spread).map(drop)
     }

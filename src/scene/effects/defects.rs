@@ -2,8 +2,8 @@ use ndarray::Array2;
 use rand::{Rng, RngExt};
 use serde::{Deserialize, Serialize};
 
-use super::Table;
-use crate::scene::error::{Error, Field};
+use super::table::Table;
+use crate::toml_file::{Key, OutOfRange};
 
 /// Pixels that are dead (read nothing) or hot (read a fixed energy too much), each pixel with the given probability, the same
 /// in every frame.
@@ -68,7 +68,7 @@ impl DefectMap {
 }
 
 impl Table for Defects {
-    fn validate(&self, field: &Field) -> Result<(), Error> {
+    fn validate(&self, field: &Key) -> Result<(), OutOfRange> {
         field.at("dead").fraction(self.dead)?;
         field.at("hot").fraction(self.hot)?;
         if self.dead + self.hot > 1.0 {

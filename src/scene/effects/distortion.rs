@@ -1,8 +1,8 @@
 use serde::{Deserialize, Serialize};
 
-use super::Table;
+use super::table::Table;
 use crate::optics::Distortion;
-use crate::scene::error::{Error, Field};
+use crate::toml_file::{Key, OutOfRange};
 
 /// The lens's departure from a pinhole (Brown, 1966), in the form that a calibration has it; the data sheet in `[optics]`
 /// does not know of it.
@@ -31,7 +31,7 @@ impl DistortionTable {
 }
 
 impl Table for DistortionTable {
-    fn validate(&self, field: &Field) -> Result<(), Error> {
+    fn validate(&self, field: &Key) -> Result<(), OutOfRange> {
         field.at("principal_point_m").finite_pair(self.principal_point_m)?;
         for k in self.radial {
             field.at("radial").finite(k)?;

@@ -2,9 +2,9 @@ use rand::Rng;
 use rand_distr::{Distribution, Gamma};
 use serde::{Deserialize, Serialize};
 
-use super::Table;
+use super::table::Table;
 use crate::optics::fading::{GammaGamma, Wave, rytov_variance};
-use crate::scene::error::{Error, Field};
+use crate::toml_file::{Key, OutOfRange};
 
 /// Gamma–Gamma turbulence (Al-Habash, Andrews and Phillips, 2001, eq. 9): ρ is the product of independent Gamma(α, 1/α)
 /// and Gamma(β, 1/β), of unit mean and scintillation index 1/α + 1/β + 1/(αβ). Give α and β, or C_n² and the wavelength,
@@ -28,7 +28,7 @@ pub(in crate::scene) enum Turbulence {
 }
 
 impl Fading {
-    pub(in crate::scene) fn turbulence(&self, field: &Field) -> Result<Turbulence, Error> {
+    pub(in crate::scene) fn turbulence(&self, field: &Key) -> Result<Turbulence, OutOfRange> {
         match (self.alpha, self.beta, self.cn2, self.wavelength_m) {
             (Some(alpha), Some(beta), None, None) => Ok(Turbulence::Given(GammaGamma {
                 alpha: field.at("alpha").positive(alpha)?,
@@ -100,7 +100,7 @@ impl Distribution<f64> for Fades {
 }
 
 impl Table for Fading {
-    fn validate(&self, field: &Field) -> Result<(), Error> {
+    fn validate(&self, field: &Key) -> Result<(), OutOfRange> {
         self.turbulence(field).map(drop)
     }
 }

@@ -1,9 +1,10 @@
 use rand::RngExt;
 use serde::{Deserialize, Serialize};
 
-use super::{Effect, Table};
-use crate::scene::error::{Error, Field};
+use super::table::Table;
+use crate::scene::effect::Effect;
 use crate::scene::stream::{Ledger, Streams};
+use crate::toml_file::{Key, OutOfRange};
 
 /// The link to the camera loses frames, or hands the last one out again, each frame with the given probability.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
@@ -39,7 +40,7 @@ impl FrameLoss {
 }
 
 impl Table for FrameLoss {
-    fn validate(&self, field: &Field) -> Result<(), Error> {
+    fn validate(&self, field: &Key) -> Result<(), OutOfRange> {
         field.at("dropped").fraction(self.dropped)?;
         field.at("repeated").fraction(self.repeated)?;
         if self.dropped + self.repeated >= 1.0 {

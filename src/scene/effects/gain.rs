@@ -2,8 +2,8 @@ use rand::Rng;
 use rand_distr::{Distribution, StandardNormal};
 use serde::{Deserialize, Serialize};
 
-use super::Table;
-use crate::scene::error::{Error, Field};
+use super::table::Table;
+use crate::toml_file::{Key, OutOfRange};
 
 /// Photo-response non-uniformity: each pixel's sensitivity is 1 + std·z, z standard normal and the same in every frame
 /// (EMVA 1288, release 4.0, section 8). Never below zero.
@@ -21,7 +21,7 @@ impl Gain {
 }
 
 impl Table for Gain {
-    fn validate(&self, field: &Field) -> Result<(), Error> {
+    fn validate(&self, field: &Key) -> Result<(), OutOfRange> {
         field.at("std").non_negative(self.std).map(drop)
     }
 }

@@ -2,11 +2,11 @@ use std::f64::consts::TAU;
 
 use serde::{Deserialize, Serialize};
 
-use super::Table;
+use super::table::Table;
 use crate::optics::Camera;
-use crate::scene::error::{Error, Field};
 use crate::scene::motion::Schedule;
 use crate::scene::render::Spot;
+use crate::toml_file::{Key, OutOfRange};
 
 /// A blot of light that is no beam: the sun's glint on water, or a lamp that blinds. A Gaussian of the given width and peak,
 /// where an emitter at `at_m` would be seen.
@@ -35,7 +35,7 @@ impl Glint {
 }
 
 impl Table for Glint {
-    fn validate(&self, field: &Field) -> Result<(), Error> {
+    fn validate(&self, field: &Key) -> Result<(), OutOfRange> {
         field.at("at_m").finite_pair(self.at_m)?;
         field.at("spread_m").positive(self.spread_m)?;
         field.at("peak_j").positive(self.peak_j)?;

@@ -17,6 +17,7 @@ mod pointing;
 mod quantisation;
 mod saturation;
 mod shot_noise;
+mod table;
 mod thermal_noise;
 mod vibration;
 mod vignetting;
@@ -54,23 +55,11 @@ pub(super) use vibration::Shaker;
 
 use serde::{Deserialize, Serialize};
 
-use super::error::{Error, Field};
+use super::effect::{Effect, effect_list};
+use crate::toml_file::{Key, OutOfRange};
+use table::Table;
 
-/// A table of `[effects]`.
-pub(super) trait Table {
-    /// Checks every field; `field` is the table's own name.
-    fn validate(&self, field: &Field) -> Result<(), Error>;
-}
-
-impl<T: Table> Table for Vec<T> {
-    fn validate(&self, field: &Field) -> Result<(), Error> {
-        let mut items = self.iter().enumerate();
-        items.try_for_each(|(k, item)| item.validate(&field.index(k)))
-    }
-}
-
-/// Declares `[effects]` and, for each table, the [`Effect`] that its random streams are keyed by.
-macro_rules! effects {
+macro_rules! declare_effects {
     ($($number:literal $effect:ident $field:ident: $table:ty,)*) => {
         /// `[effects]`: what is not named does not happen and costs nothing.
         #[derive(Clone, Debug, Default, Serialize, Deserialize)]
@@ -79,24 +68,8 @@ macro_rules! effects {
             $(pub $field: Option<$table>,)*
         }
 
-        /// Everything that a scene can switch on. The numbers key the random streams: they never change.
-        #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
-        #[repr(usize)]
-        pub enum Effect {
-            /// Emitters drawn anew for every frame.
-            Population = 0,
-            /// Roaming emitters.
-            Motion = 1,
-            /// Defocus and diffraction.
-            Blur = 2,
-            ClaimDelay = 3,
-            ClaimLoss = 4,
-            ClaimNoise = 5,
-            $($effect = $number,)*
-        }
-
         impl Effects {
-            pub(super) fn validate(&self, field: &Field) -> Result<(), Error> {
+            pub(in crate::scene) fn validate(&self, field: &Key) -> Result<(), OutOfRange> {
                 $(if let Some(table) = &self.$field {
                     table.validate(&field.at(stringify!($field)))?;
                 })*
@@ -119,52 +92,7 @@ macro_rules! effects {
                 }
             }
         }
-
-        impl Effect {
-            /// Every effect that has a table under `[effects]`, in the order of the light's way.
-            pub const TABLES: &[Self] = &[$(Self::$effect,)*];
-
-            /// The key of its table under `[effects]`, or what else the scene calls it.
-            pub fn name(self) -> &'static str {
-                match self {
-                    $(Self::$effect => stringify!($field),)*
-                    Self::Population => "random_emitters",
-                    Self::Motion => "motion",
-                    Self::Blur => "blur",
-                    Self::ClaimDelay => "claims.delay",
-                    Self::ClaimLoss => "claims.lost",
-                    Self::ClaimNoise => "claims.noise",
-                }
-            }
-        }
     };
 }
 
-effects! {
-    10 Attenuation attenuation: Attenuation,
-    11 Fading fading: Fading,
-    12 Pointing pointing: Pointing,
-    13 ExactAperture exact_aperture: ExactAperture,
-    14 Attitude attitude: Attitude,
-    15 Vibration vibration: Vec<Vibration>,
-    16 Wander wander: Wander,
-    17 MotionBlur motion_blur: MotionBlur,
-    18 Distortion distortion: DistortionTable,
-    19 Vignetting vignetting: Vignetting,
-    20 Background background: Background,
-    21 Glint glint: Vec<Glint>,
-    22 Gain gain: Gain,
-    23 DarkCurrent dark_current: DarkCurrent,
-    24 ShotNoise shot_noise: ShotNoise,
-    25 Saturation saturation: Saturation,
-    26 ThermalNoise thermal_noise: ThermalNoise,
-    27 Defects defects: Defects,
-    28 Quantisation quantisation: Quantisation,
-    29 FrameLoss frame_loss: FrameLoss,
-    30 Aberrations aberrations: Aberrations,
-}
-
-impl Effect {
-    /// Room for every number.
-    pub(super) const ROOM: usize = 31;
-}
+effect_list!(declare_effects);

@@ -1,7 +1,7 @@
 use serde::{Deserialize, Serialize};
 
-use super::Table;
-use crate::scene::error::{Error, Field};
+use super::table::Table;
+use crate::toml_file::{Key, OutOfRange};
 
 /// Emitters move during the exposure; without it each stays where it is in the middle. A speed v smears the spot evenly over
 /// vT_int (on the ground), a variance of (vT_int)²/12.
@@ -10,7 +10,7 @@ use crate::scene::error::{Error, Field};
 pub struct MotionBlur {}
 
 impl Table for MotionBlur {
-    fn validate(&self, _field: &Field) -> Result<(), Error> {
+    fn validate(&self, _field: &Key) -> Result<(), OutOfRange> {
         Ok(())
     }
 }

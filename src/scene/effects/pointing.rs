@@ -2,8 +2,8 @@ use rand::Rng;
 use rand_distr::{Distribution, StandardNormal};
 use serde::{Deserialize, Serialize};
 
-use super::Table;
-use crate::scene::error::{Error, Field};
+use super::table::Table;
+use crate::toml_file::{Key, OutOfRange};
 
 /// The beam misses the lens by r_p, two independent N(μ_p, σ_p²); the lens then collects exp(−2‖r_p‖²/w_z²) of what it would
 /// (Farid and Hranilovic, 2007, eq. 9, for w_z ≫ r_a). With zero μ_p the mean is w_z²/(w_z² + 4σ_p²).
@@ -29,7 +29,7 @@ impl Pointing {
 }
 
 impl Table for Pointing {
-    fn validate(&self, field: &Field) -> Result<(), Error> {
+    fn validate(&self, field: &Key) -> Result<(), OutOfRange> {
         field.at("jitter_m").non_negative(self.jitter_m)?;
         field.at("boresight_m").finite_pair(self.boresight_m).map(drop)
     }

@@ -1,7 +1,7 @@
 use serde::{Deserialize, Serialize};
 
-use super::Table;
-use crate::scene::error::{Error, Field};
+use super::table::Table;
+use crate::toml_file::{Key, OutOfRange};
 
 /// The converter rounds to whole counts from 0 to 2^bits − 1. The black level is added before and taken off after, so that
 /// noise below zero is not cut off. Rounding errs by joules_per_count/√12 (Widrow and Kollár, 2008, chapter 1).
@@ -24,7 +24,7 @@ pub(in crate::scene) struct Converter {
 }
 
 impl Quantisation {
-    pub(in crate::scene) fn converter(&self, data_sheet: Option<f64>, field: &Field) -> Result<Converter, Error> {
+    pub(in crate::scene) fn converter(&self, data_sheet: Option<f64>, field: &Key) -> Result<Converter, OutOfRange> {
         let field = field.at("joules_per_count");
         let Some(step) = self.joules_per_count.or(data_sheet) else {
             return Err(field.refuse("a value here or in optics.joules_per_count", "neither"));
@@ -47,7 +47,7 @@ impl Converter {
 }
 
 impl Table for Quantisation {
-    fn validate(&self, field: &Field) -> Result<(), Error> {
+    fn validate(&self, field: &Key) -> Result<(), OutOfRange> {
         if !(1..=32).contains(&self.bits) {
             return Err(field.at("bits").refuse("1 to 32", self.bits));
         }

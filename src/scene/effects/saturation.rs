@@ -1,7 +1,7 @@
 use serde::{Deserialize, Serialize};
 
-use super::Table;
-use crate::scene::error::{Error, Field};
+use super::table::Table;
+use crate::toml_file::{Key, OutOfRange};
 
 /// A pixel carries no more than the level; with blooming, what is above it spills in equal halves up and down the column,
 /// each full pixel passing on what it cannot hold, until it is taken up or leaves the array.
@@ -48,7 +48,7 @@ impl Saturation {
 }
 
 impl Table for Saturation {
-    fn validate(&self, field: &Field) -> Result<(), Error> {
+    fn validate(&self, field: &Key) -> Result<(), OutOfRange> {
         if let Some(level) = self.level_j {
             field.at("level_j").positive(level)?;
         }

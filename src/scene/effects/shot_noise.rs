@@ -2,8 +2,8 @@ use rand::Rng;
 use rand_distr::{Distribution, Poisson, StandardNormal};
 use serde::{Deserialize, Serialize};
 
-use super::Table;
-use crate::scene::error::{Error, Field};
+use super::table::Table;
+use crate::toml_file::{Key, OutOfRange};
 
 /// Light comes in quanta of q joules of collected energy: a pixel that expects y reads q·Poisson(y/q), of variance q·y. q is
 /// hc/λ over the detector's excess noise factor's reciprocal, i.e. F·hc/λ.
@@ -30,7 +30,7 @@ fn unity() -> f64 {
 }
 
 impl ShotNoise {
-    pub(in crate::scene) fn quantum(&self, field: &Field) -> Result<f64, Error> {
+    pub(in crate::scene) fn quantum(&self, field: &Key) -> Result<f64, OutOfRange> {
         let factor = field.at("excess_factor").positive(self.excess_factor)?;
         match (self.quantum_j, self.wavelength_m) {
             (Some(q), None) => Ok(factor * field.at("quantum_j").positive(q)?),
@@ -57,7 +57,7 @@ impl ShotNoise {
 }
 
 impl Table for ShotNoise {
-    fn validate(&self, field: &Field) -> Result<(), Error> {
+    fn validate(&self, field: &Key) -> Result<(), OutOfRange> {
         self.quantum(field).map(drop)
     }
 }

@@ -2,8 +2,8 @@ use rand::Rng;
 use rand_distr::{Distribution, StandardNormal};
 use serde::{Deserialize, Serialize};
 
-use super::Table;
-use crate::scene::error::{Error, Field};
+use super::table::Table;
+use crate::toml_file::{Key, OutOfRange};
 
 /// Additive white Gaussian noise of the read-out, σ_n joules per pixel (`meas_total`).
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
@@ -24,7 +24,7 @@ impl ThermalNoise {
 }
 
 impl Table for ThermalNoise {
-    fn validate(&self, field: &Field) -> Result<(), Error> {
+    fn validate(&self, field: &Key) -> Result<(), OutOfRange> {
         self.std_j.map_or(Ok(()), |s| field.at("std_j").positive(s).map(drop))
     }
 }

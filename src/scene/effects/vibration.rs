@@ -3,9 +3,10 @@ use std::f64::consts::TAU;
 use rand::RngExt;
 use serde::{Deserialize, Serialize};
 
-use super::{Effect, Table};
-use crate::scene::error::{Error, Field};
+use super::table::Table;
+use crate::scene::effect::Effect;
 use crate::scene::stream::{Ledger, Streams};
+use crate::toml_file::{Key, OutOfRange};
 
 /// The platform shakes within an exposure: every angle moves by a·sin(2πft + φ), φ drawn once. Over many periods the spot
 /// widens by z·a/√2 along the direction of a. Valid for a lens that turns as a whole.
@@ -19,7 +20,7 @@ pub struct Vibration {
 }
 
 impl Table for Vibration {
-    fn validate(&self, field: &Field) -> Result<(), Error> {
+    fn validate(&self, field: &Key) -> Result<(), OutOfRange> {
         field.at("amplitude_rad").finite_pair(self.amplitude_rad)?;
         field.at("frequency_hz").positive(self.frequency_hz).map(drop)
     }

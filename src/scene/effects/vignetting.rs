@@ -1,7 +1,7 @@
 use serde::{Deserialize, Serialize};
 
-use super::Table;
-use crate::scene::error::{Error, Field};
+use super::table::Table;
+use crate::toml_file::{Key, OutOfRange};
 
 /// The lens passes less light away from its axis: 1 − loss·(r/R)², R the half-diagonal of the sensor. A far emitter's
 /// whole beam loses alike; background light loses pixel by pixel.
@@ -20,7 +20,7 @@ impl Vignetting {
 }
 
 impl Table for Vignetting {
-    fn validate(&self, field: &Field) -> Result<(), Error> {
+    fn validate(&self, field: &Key) -> Result<(), OutOfRange> {
         field.at("corner_loss").fraction(self.corner_loss).map(drop)
     }
 }

@@ -2,8 +2,8 @@ use rand::Rng;
 use rand_distr::{Distribution, StandardNormal};
 use serde::{Deserialize, Serialize};
 
-use super::Table;
-use crate::scene::error::{Error, Field};
+use super::table::Table;
+use crate::toml_file::{Key, OutOfRange};
 
 /// Turbulence tilts each arriving wavefront: both angles of arrival follow, for each emitter by itself, an Ornstein–Uhlenbeck
 /// process of standard deviation σ_a and correlation time T_a within the exposure (angle-of-arrival variance: Andrews and Phillips,
@@ -34,7 +34,7 @@ impl Wander {
 }
 
 impl Table for Wander {
-    fn validate(&self, field: &Field) -> Result<(), Error> {
+    fn validate(&self, field: &Key) -> Result<(), OutOfRange> {
         field.at("std_rad").non_negative(self.std_rad)?;
         field.at("time_s").positive(self.time_s).map(drop)
     }

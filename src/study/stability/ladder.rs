@@ -5,7 +5,7 @@ use rand_distr::{Distribution, Uniform};
 
 use super::trial::{Source, anywhere, camera, energy, expose, frame, observe};
 use super::{Case, Options};
-use crate::estimate::{Config, LADDER};
+use crate::estimate::{Config, ESTIMATORS};
 
 const GROUP: &str = "Ladder";
 
@@ -33,7 +33,7 @@ pub(super) fn cases() -> Vec<Case> {
             |k| [(k % 3) as f64, (k / 3) as f64],
         ),
     ];
-    cases.extend(LADDER.iter().map(|rung| rung.name).map(bears_anything));
+    cases.extend(ESTIMATORS.iter().map(|rung| rung.name).map(bears_anything));
     cases
 }
 

@@ -5,7 +5,7 @@ use jiff::{SignedDuration, Timestamp};
 use super::trial::camera;
 use super::{Case, Observed};
 use crate::claims::{self, Claim, ClaimState, Store};
-use crate::estimate::{Bend, Emitter, Estimate, Flags};
+use crate::estimate::{Emitter, Estimate, Flags, SecondMomentScore};
 use crate::monitor::{self, Monitor, Observation, Source};
 use crate::optics::Camera;
 
@@ -138,7 +138,7 @@ fn emitter(camera: &Camera, frame: u64, [x_m, y_m]: [f64; 2], cov_m2: [[f64; 2];
         energy_j: 7e-3,
         energy_std_j: 1e-5,
         sensor_m: camera.to_sensor([x_m, y_m]),
-        bend: Bend::default(),
+        second_moment: SecondMomentScore::default(),
         flags: Flags::empty(),
     }
 }
@@ -146,7 +146,7 @@ fn emitter(camera: &Camera, frame: u64, [x_m, y_m]: [f64; 2], cov_m2: [[f64; 2];
 fn estimate(emitters: Vec<Emitter>) -> Estimate {
     Estimate {
         emitters,
-        rung: "study",
+        estimator: "study",
         reduced_chi2: 1.0,
         condition: 1.0,
         ..Estimate::default()

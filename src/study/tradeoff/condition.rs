@@ -6,7 +6,7 @@ use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 use serde::{Deserialize, Serialize};
 
-use crate::estimate::{Beside, Shape, position_bound_beside};
+use crate::estimate::{BoundAssumptions, PsfShape, position_bound_with};
 use crate::optics::{Axis, Camera, psf};
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -108,13 +108,13 @@ impl Condition {
         let mean = energies.iter().sum::<f64>() / energies.len().max(1) as f64;
         let peak = typical_peak(truth, mean);
         let mut camera = truth.clone();
-        let mut beside = Beside::default();
+        let mut beside = BoundAssumptions::default();
         let mut unusable = vec![false; pixels.len()];
         match condition {
             None => {}
-            Some(Self::Width) => beside.shape = Shape::Width,
+            Some(Self::Width) => beside.shape = PsfShape::Width,
             Some(Self::Ellipse) => {
-                beside.shape = Shape::Ellipse;
+                beside.shape = PsfShape::Ellipse;
                 camera.spot_sigma_m /= ELLIPSE[1];
             }
             Some(Self::Background) => {
@@ -150,10 +150,10 @@ impl Condition {
                 }
             }
         }
-        beside.unusable = Some(&unusable);
+        beside.masked = Some(&unusable);
         let known: Vec<f64> = energies.iter().map(|e| e * relative_std).collect();
         [None, Some(known.as_slice())]
-            .map(|known| position_bound_beside(&camera, positions, energies, Beside { known, ..beside }))
+            .map(|known| position_bound_with(&camera, positions, energies, BoundAssumptions { known, ..beside }))
     }
 }
 

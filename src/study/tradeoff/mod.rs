@@ -1,6 +1,7 @@
 //! What accuracy costs in time: every rung of the ladder on the same frames, against the Cramér–Rao bound.
 
 mod condition;
+mod error;
 mod networks;
 #[cfg(test)]
 mod oracle;
@@ -9,17 +10,16 @@ mod report;
 mod scene;
 mod score;
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
-use serde::{Deserialize, Serialize};
-
-use crate::estimate::{LADDER, Learned};
-use networks::Candidate;
+use crate::estimate::{ESTIMATORS, Learned};
+pub(in crate::study) use networks::Candidate;
 
 pub use condition::Condition;
+pub use error::{Error, PictureError};
 pub use networks::{Trained, Training};
 pub use scene::{Cell, Noise};
-pub use score::Row;
+pub use score::{Row, Study};
 
 /// What to measure.
 #[derive(Clone, Debug)]
@@ -32,39 +32,6 @@ pub struct Plan {
     /// Frames a cell.
     pub frames: usize,
     pub seed: u64,
-}
-
-/// Why a study could not be finished.
-#[derive(Debug, thiserror::Error)]
-pub enum Error {
-    #[error("{path}: {source}")]
-    Io { path: PathBuf, source: std::io::Error },
-    #[error("{path}: not a trade-off study: {source}")]
-    Malformed { path: PathBuf, source: serde_json::Error },
-    #[error("{path}: not a network's card: {source}")]
-    Card { path: PathBuf, source: toml::de::Error },
-    #[error("cell {cell}: {source}")]
-    Optics { cell: String, source: crate::optics::Error },
-    #[error(transparent)]
-    Estimator(#[from] crate::estimate::ConfigError),
-    #[error("{path}: {message}")]
-    Picture { path: PathBuf, message: PictureError },
-}
-
-/// What the plotting library said.
-#[derive(Debug)]
-pub struct PictureError(Box<dyn std::error::Error + Send + Sync>);
-
-impl std::fmt::Display for PictureError {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        self.0.fmt(f)
-    }
-}
-
-/// The study's file: rows are found again by cell, rung, frames and seed.
-#[derive(Debug, Default, Serialize, Deserialize)]
-pub struct Study {
-    pub rows: Vec<Row>,
 }
 
 impl Plan {
@@ -140,7 +107,7 @@ impl Plan {
 
 fn rungs() -> Vec<&'static str> {
     let learned = Learned::ALL.into_iter().map(Learned::name);
-    LADDER.iter().map(|r| r.name).chain(learned).collect()
+    ESTIMATORS.iter().map(|r| r.name).chain(learned).collect()
 }
 
 /// Runs what `out` does not hold yet and writes tradeoff.json after each row, tradeoff.md and the pictures at the end.

@@ -35,7 +35,7 @@ pub struct Training {
 
 /// One rung as it is run in one cell.
 #[derive(Clone, Debug)]
-pub(super) struct Candidate {
+pub(in crate::study) struct Candidate {
     /// What `[estimator] name` selects it by.
     pub rung: &'static str,
     /// The network in front of it; the embedded one where a learned rung has none.

@@ -5,7 +5,7 @@ use plotters::style::text_anchor::{HPos, Pos, VPos};
 
 use super::report::{PAPER, cells, front, is_paper_cell};
 use super::{Error, PictureError, Row, Study};
-use crate::estimate::LADDER;
+use crate::estimate::ESTIMATORS;
 
 const SIZE: (u32, u32) = (900, 600);
 /// Pixels a side that the axis goes to: beyond 100 there is room for the legend.
@@ -149,7 +149,7 @@ fn accuracy_against_array(study: &Study, path: &Path) -> Drawn {
         .y_label_formatter(&|v| format!("{v:.0e}"))
         .label_style(FONT)
         .draw()?;
-    let mut lines: Vec<(String, Vec<(f64, f64)>)> = LADDER
+    let mut lines: Vec<(String, Vec<(f64, f64)>)> = ESTIMATORS
         .iter()
         .map(|rung| {
             let own = rows.iter().filter(|r| r.rung == rung.name);
@@ -163,7 +163,7 @@ fn accuracy_against_array(study: &Study, path: &Path) -> Drawn {
     let unet = PAPER.iter().map(|p| (p.0 as f64, p.2)).collect();
     lines.push(("the paper's hybrid".into(), hybrid));
     lines.push(("the paper's U-Net".into(), unet));
-    let bound = rows.iter().filter(|r| r.rung == LADDER[0].name);
+    let bound = rows.iter().filter(|r| r.rung == ESTIMATORS[0].name);
     let bound = bound
         .filter_map(|r| Some((r.cell.pixels as f64, r.bound_median_m2?)))
         .collect();

@@ -1,7 +1,7 @@
 use std::fmt::Write;
 
 use super::{Noise, Row, Study};
-use crate::estimate::{DEFAULT, LADDER, Learned};
+use crate::estimate::{DEFAULT, ESTIMATORS, Learned};
 
 /// Array sizes, and the mean squared errors that the paper reports there for its hybrid and its U-Net, m².
 pub(super) const PAPER: [(usize, f64, f64); 6] = [
@@ -66,7 +66,7 @@ pub(super) fn markdown(study: &Study) -> String {
         let of = |rows: &[Row]| rows.iter().filter(|r| is_rung(&r.rung, name)).count();
         format!("on the front in {} of {} cells", of(&fronts), of(&study.rows))
     };
-    for rung in LADDER {
+    for rung in ESTIMATORS {
         let default = if rung.name == DEFAULT { " (default)" } else { "" };
         let _ = writeln!(
             text,
@@ -136,7 +136,7 @@ pub(super) fn markdown(study: &Study) -> String {
 /// The paper's errors by array size, and those of every rung that has a row among the cells that `is_wanted` names.
 fn beside(text: &mut String, study: &Study, is_wanted: impl Fn(&Row) -> bool) {
     let rows: Vec<&Row> = study.rows.iter().filter(|r| is_wanted(r)).collect();
-    let mut rungs: Vec<&str> = LADDER.iter().map(|r| r.name).collect();
+    let mut rungs: Vec<&str> = ESTIMATORS.iter().map(|r| r.name).collect();
     for row in &rows {
         if !rungs.contains(&row.rung.as_str()) {
             rungs.push(&row.rung);

@@ -33,7 +33,7 @@ pub struct Cell {
 }
 
 /// A frame with its truth.
-pub(super) struct Scene {
+pub(in crate::study) struct Scene {
     pub frame: Frame,
     pub positions: Vec<[f64; 2]>,
     pub bound_m2: Vec<f64>,
@@ -119,7 +119,7 @@ impl Cell {
     }
 
     /// What the network knows of its users here: the mean and scatter of `energy` straight below.
-    pub(super) fn known_power(&self, camera: &Camera) -> KnownPower {
+    pub(in crate::study) fn known_power(&self, camera: &Camera) -> KnownPower {
         // exp(−2r²/w²) over a pointing offset of σ_s an axis has mean 1/(1 + q) and mean square 1/(1 + 2q).
         let q = 4.0 * (POINTING_STD_M / BEAM_RADIUS_M).powi(2);
         let axial = radiometry::flat_aperture_fraction(camera.lens_radius_m, BEAM_RADIUS_M, 0.0);
@@ -134,7 +134,7 @@ impl Cell {
     }
 
     /// Draws frames from the paper's scene.
-    pub(super) fn scenes(&self, frames: usize, seed: u64) -> Result<Vec<Scene>, Error> {
+    pub(in crate::study) fn scenes(&self, frames: usize, seed: u64) -> Result<Vec<Scene>, Error> {
         let camera = self.camera()?;
         Ok((0..frames)
             .map(|k| {

@@ -6,7 +6,7 @@ use std::path::Path;
 use v4l::v4l_sys as c;
 use v4l::v4l2::vidioc;
 
-use super::{Zeroed, ioctl, text};
+use super::call::{Zeroed, ioctl, text};
 
 /// What a node says it is.
 #[derive(Clone, Debug)]

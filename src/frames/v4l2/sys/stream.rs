@@ -7,7 +7,8 @@ use std::time::Duration;
 use v4l::v4l_sys as c;
 use v4l::v4l2::{self, vidioc};
 
-use super::{Node, Zeroed, ioctl};
+use super::call::{Zeroed, ioctl};
+use super::node::Node;
 
 /// What the driver says about one filled buffer.
 #[derive(Clone, Copy, Debug)]

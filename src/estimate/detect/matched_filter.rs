@@ -1,0 +1,187 @@
+//! The matched filter on a fine grid and its maxima: non-maximum suppression, sub-grid peaks.
+
+use crate::estimate::dense_linalg::{axpy, dot};
+use crate::estimate::model::svd_basis::Basis;
+
+/// Grid spacing, σ: a spot half-way between grid points loses 3 % of its response.
+const SPACING: f64 = 0.5;
+
+/// Half-width of a template, σ: the rest holds 1e-5 of a spot's square.
+const REACH: f64 = 3.0;
+
+/// A maximum of the response.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Peak {
+    /// Sub-pixel position, σ.
+    pub u: [f64; 2],
+    /// The grid point it stands on.
+    pub grid: [f64; 2],
+    /// Matched-filter response over its standard deviation.
+    pub significance: f64,
+    /// Energy a lone spot would have there, in units of the noise.
+    pub a: f64,
+}
+
+/// The matched filter: unit-norm spots on a grid, in the bases.
+pub(crate) struct MatchedFilter {
+    grid: [Vec<f64>; 2],
+    /// (grid, stride), each row of unit norm over the full basis.
+    templates: [Vec<f64>; 2],
+    norms: [Vec<f64>; 2],
+    /// Columns outside which a template is zero.
+    spans: [Vec<[usize; 2]>; 2],
+    strides: [usize; 2],
+    /// Response over its standard deviation, (grid y, grid x).
+    map: Vec<f64>,
+    strip: Vec<f64>,
+    peaks: Vec<Peak>,
+}
+
+impl MatchedFilter {
+    pub fn new(bx: &Basis, by: &Basis) -> Self {
+        let axis = |b: &Basis| {
+            // Centres up to half a σ outside; farther out only a fit can place them.
+            // Within a pixel much wider than the spot the response is constant: a grid of σ would only cost memory.
+            let spacing = SPACING.max(0.25 * b.pitch());
+            let (lo, hi) = (b.edges[0] - spacing, b.edges[b.n] + spacing);
+            let count = ((hi - lo) / spacing).ceil() as usize + 1;
+            let grid: Vec<f64> = (0..count)
+                .map(|k| lo + (hi - lo) * k as f64 / (count - 1) as f64)
+                .collect();
+            let mut templates = vec![0.0; count * b.stride];
+            let mut norms = Vec::with_capacity(count);
+            let mut spans = Vec::with_capacity(count);
+            let (mut scratch, mut profile) = (vec![0.0; 3 * b.n], vec![0.0; 3 * b.stride]);
+            for (k, row) in templates.chunks_exact_mut(b.stride).enumerate() {
+                let span = b.profile(grid[k], 1.0, REACH, b.stride, &mut scratch, &mut profile);
+                spans.push([span.start, span.end]);
+                let norm = dot(&profile[..b.stride], &profile[..b.stride]).sqrt().max(1e-12);
+                for (t, a) in row.iter_mut().zip(&profile) {
+                    *t = a / norm;
+                }
+                norms.push(norm);
+            }
+            (grid, templates, norms, spans)
+        };
+        let ((gx, tx, wx, sx), (gy, ty, wy, sy)) = (axis(bx), axis(by));
+        Self {
+            grid: [gx, gy],
+            templates: [tx, ty],
+            norms: [wx, wy],
+            spans: [sx, sy],
+            strides: [bx.stride, by.stride],
+            map: Vec::new(),
+            strip: Vec::new(),
+            peaks: Vec::new(),
+        }
+    }
+
+    /// Peaks of `residual` (my, mx) of at least `threshold` standard deviations, no two nearer than `radius` σ,
+    /// strongest first.
+    pub fn peaks(&mut self, residual: &[f64], mx: usize, my: usize, threshold: f64, radius: f64) -> &[Peak] {
+        self.respond(residual, mx, my);
+        self.find(threshold, radius)
+    }
+
+    /// Fills the map with the response to `residual`.
+    pub fn respond(&mut self, residual: &[f64], mx: usize, my: usize) {
+        pulp::Arch::new().dispatch(Filter {
+            matched_filter: self,
+            residual,
+            mx,
+            my,
+        });
+    }
+
+    #[inline(always)]
+    fn filter(&mut self, residual: &[f64], mx: usize, my: usize) {
+        let (nx, ny) = (self.grid[0].len(), self.grid[1].len());
+        self.map.resize(nx * ny, 0.0);
+        self.strip.resize(mx, 0.0);
+        for (j, out) in self.map.chunks_exact_mut(nx).enumerate() {
+            let row = &self.templates[1][j * self.strides[1]..(j + 1) * self.strides[1]];
+            let [lo, hi] = self.spans[1][j];
+            self.strip.fill(0.0);
+            for c in lo..hi.min(my) {
+                axpy(row[c], &residual[c * mx..(c + 1) * mx], &mut self.strip);
+            }
+            for (i, o) in out.iter_mut().enumerate() {
+                let column = &self.templates[0][i * self.strides[0]..(i + 1) * self.strides[0]];
+                let [lo, hi] = self.spans[0][i];
+                let hi = hi.min(mx);
+                *o = dot(&self.strip[lo..hi], &column[lo..hi]);
+            }
+        }
+    }
+
+    /// Peaks of the map as it is; see `peaks`.
+    pub fn find(&mut self, threshold: f64, radius: f64) -> &[Peak] {
+        let (nx, ny) = (self.grid[0].len(), self.grid[1].len());
+        self.peaks.clear();
+        let at = |i: usize, j: usize| self.map[j * nx + i];
+        for (j, row) in self.map.chunks_exact(nx).enumerate() {
+            for (i, &value) in row.iter().enumerate() {
+                if !(value >= threshold) {
+                    continue;
+                }
+                // Of equal neighbours the first is the peak.
+                let (lo, hi) = (i.saturating_sub(1), (i + 1).min(nx - 1));
+                let is_peak = (i == 0 || row[lo] < value)
+                    && (i == hi || row[hi] <= value)
+                    && (j == 0 || (lo..=hi).all(|a| at(a, j - 1) < value))
+                    && (j + 1 == ny || (lo..=hi).all(|a| at(a, j + 1) <= value));
+                if !is_peak {
+                    continue;
+                }
+                let vertex = |lo: Option<f64>, hi: Option<f64>| match (lo, hi) {
+                    (Some(lo), Some(hi)) if lo + hi - 2.0 * value < 0.0 => {
+                        (0.5 * (lo - hi) / (lo + hi - 2.0 * value)).clamp(-0.5, 0.5)
+                    }
+                    _ => 0.0,
+                };
+                let dx = vertex(i.checked_sub(1).map(|a| at(a, j)), (i + 1 < nx).then(|| at(i + 1, j)));
+                let dy = vertex(j.checked_sub(1).map(|b| at(i, b)), (j + 1 < ny).then(|| at(i, j + 1)));
+                let step = |g: &[f64]| g[1] - g[0];
+                self.peaks.push(Peak {
+                    u: [
+                        self.grid[0][i] + dx * step(&self.grid[0]),
+                        self.grid[1][j] + dy * step(&self.grid[1]),
+                    ],
+                    grid: [self.grid[0][i], self.grid[1][j]],
+                    significance: value,
+                    a: value / (self.norms[0][i] * self.norms[1][j]),
+                });
+            }
+        }
+        self.peaks.sort_by(|a, b| b.significance.total_cmp(&a.significance));
+        let mut kept = 0;
+        for k in 0..self.peaks.len() {
+            let peak = self.peaks[k];
+            let is_alone = self.peaks[..kept]
+                .iter()
+                .all(|p| (p.u[0] - peak.u[0]).powi(2) + (p.u[1] - peak.u[1]).powi(2) >= radius * radius);
+            if is_alone {
+                self.peaks[kept] = peak;
+                kept += 1;
+            }
+        }
+        self.peaks.truncate(kept);
+        &self.peaks
+    }
+}
+
+struct Filter<'a> {
+    matched_filter: &'a mut MatchedFilter,
+    residual: &'a [f64],
+    mx: usize,
+    my: usize,
+}
+
+impl pulp::NullaryFnOnce for Filter<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn call(self) {
+        self.matched_filter.filter(self.residual, self.mx, self.my);
+    }
+}

@@ -1,0 +1,44 @@
+//! Builds an estimator from a config.
+
+use std::time::Duration;
+
+use crate::estimate::config::{Config, ConfigError};
+use crate::estimate::estimator::Estimator;
+use crate::estimate::estimators::analytic::AnalyticEstimator;
+use crate::estimate::estimators::list::{DEFAULT, Learned, find};
+use crate::estimate::estimators::network::NetworkEstimator;
+use crate::estimate::estimators::pixel_correction::PixelCorrected;
+use crate::optics::Camera;
+
+/// Builds the configured estimator for a camera.
+pub fn build(config: &Config, camera: &Camera) -> Result<Box<dyn Estimator>, ConfigError> {
+    // Frames are small: threads cost more than they gain, and make the last bits depend on timing.
+    faer::set_global_parallelism(faer::Par::Seq);
+    let name = config.name.as_deref().unwrap_or(DEFAULT);
+    if let Some(budget) = config.budget_ms
+        && !(budget.is_finite() && budget > 0.0)
+    {
+        return Err(ConfigError::OutOfRange {
+            field: "budget_ms",
+            expected: "a positive finite number",
+            found: budget,
+        });
+    }
+    if let Some(known) = &config.known_power {
+        known.validate()?;
+    }
+    let budget = config.budget_ms.map(|ms| Duration::from_secs_f64(ms * 1e-3));
+    let estimator: Box<dyn Estimator> = match Learned::ALL.into_iter().find(|l| l.name() == name) {
+        Some(learned) => Box::new(NetworkEstimator::new(learned, config.network.as_deref(), camera)?),
+        None => Box::new(AnalyticEstimator::new(
+            find(name)?,
+            camera,
+            budget,
+            config.known_power.as_ref(),
+        )),
+    };
+    Ok(match &camera.pixels {
+        Some(maps) => Box::new(PixelCorrected::new(estimator, maps.clone(), camera.saturation_j)),
+        None => estimator,
+    })
+}

@@ -1,0 +1,49 @@
+//! Corrects a frame's gains and dark levels by the calibration before an estimator sees it.
+
+use std::sync::Arc;
+
+use crate::estimate::emitter::Estimate;
+use crate::estimate::error::Error;
+use crate::estimate::estimator::Estimator;
+use crate::frame::Frame;
+use crate::optics::PixelMaps;
+
+/// An estimator that is given corrected frames.
+pub(crate) struct PixelCorrected {
+    inner: Box<dyn Estimator>,
+    maps: Arc<PixelMaps>,
+    saturation_j: Option<f64>,
+    frame: Option<Frame>,
+}
+
+impl PixelCorrected {
+    pub fn new(inner: Box<dyn Estimator>, maps: Arc<PixelMaps>, saturation_j: Option<f64>) -> Self {
+        Self {
+            inner,
+            maps,
+            saturation_j,
+            frame: None,
+        }
+    }
+}
+
+impl Estimator for PixelCorrected {
+    fn name(&self) -> &'static str {
+        self.inner.name()
+    }
+
+    fn estimate(&mut self, frame: &Frame) -> Result<Estimate, Error> {
+        let own = match &mut self.frame {
+            Some(own) if own.pixels.dim() == frame.pixels.dim() => {
+                own.index = frame.index;
+                own.time = frame.time;
+                own.pixels.assign(&frame.pixels);
+                own.masked.clone_from(&frame.masked);
+                own
+            }
+            own => own.insert(frame.clone()),
+        };
+        self.maps.correct(own, self.saturation_j);
+        self.inner.estimate(own)
+    }
+}

@@ -1,0 +1,282 @@
+//! A frame's coefficients in the two bases, with weights and masked pixels: the data of a fit.
+
+use crate::estimate::dense_linalg::{combine, dot, largest};
+use crate::estimate::model::hypothesis::Hypothesis;
+use crate::estimate::model::psf_table;
+use crate::estimate::model::svd_basis::Basis;
+use crate::estimate::preprocess::masked_pixels::{MaskedPixel, MaskedPixels};
+use crate::estimate::preprocess::noise_variance::VarianceFunction;
+use crate::estimate::preprocess::screening::PreprocessedFrame;
+
+/// Largest part of the brightest spot that may be left outside the basis, in units of the noise.
+const LOSS: f64 = 0.02;
+/// Most emitters of a frame.
+const MAX_SOURCES: usize = 80;
+
+/// Coefficients of a preprocessed frame and the statistics of the rest of it.
+#[derive(Clone, Default)]
+pub(crate) struct CompressedFrame {
+    /// Columns in use along each axis, and their next multiples of 4.
+    pub rank: [usize; 2],
+    pub mx: usize,
+    pub my: usize,
+    /// (my, mx) row-major.
+    pub coefficients: Vec<f64>,
+    pub masked: MaskedPixels,
+    /// Inverse variances (my, mx) where pixels differ in them, and Σ ln of the variances. Only in the pixel bases.
+    pub weights: Vec<f64>,
+    pub log_det: f64,
+    weighted: Vec<f64>,
+    /// Beyond this many of its widths a spot is below the noise.
+    pub reach: f64,
+    /// Number of data of the fit: coefficients, or usable pixels where those are fewer.
+    pub data_count: f64,
+    /// Mean square outside the basis, and the number of data there.
+    pub outside: (f64, f64),
+    /// The variance as a function of the light, its mean over the frame, and its mean weighted by the light.
+    pub variance: VarianceFunction,
+    pub mean_variance: f64,
+    pub light_weighted_variance: f64,
+    rows: Vec<f64>,
+}
+
+impl CompressedFrame {
+    /// Compresses `frame`, Z = Uᵧᵀ Y Uₓ.
+    pub fn load(&mut self, frame: &PreprocessedFrame, bx: &Basis, by: &Basis) {
+        pulp::Arch::new().dispatch(Load {
+            compressed: self,
+            frame,
+            bx,
+            by,
+        });
+    }
+
+    #[inline(always)]
+    fn read(&mut self, frame: &PreprocessedFrame, bx: &Basis, by: &Basis) {
+        let (nx, ny) = (bx.n, by.n);
+        let brightest = largest(1.0, &frame.pixels);
+        // The brightest pixel bounds every amplitude: A ≤ peak / (largest pixel fraction)².
+        let fraction = |b: &Basis| (b.pitch() / (2.0 * std::f64::consts::PI).sqrt()).min(1.0);
+        let amplitude = brightest / (fraction(bx) * fraction(by));
+        self.reach = (2.0 * (amplitude / LOSS).max(1.0).ln())
+            .sqrt()
+            .clamp(3.0, psf_table::REACH);
+        let norm = |b: &Basis| (b.pitch() / (2.0 * std::f64::consts::PI.sqrt())).sqrt().min(1.0);
+        self.rank = [
+            bx.rank(LOSS / (amplitude * norm(by))),
+            by.rank(LOSS / (amplitude * norm(bx))),
+        ];
+        self.mx = self.rank[0].next_multiple_of(4).min(bx.stride);
+        self.my = self.rank[1].next_multiple_of(4).min(by.stride);
+        // Columns up to the multiple of 4 are stored anyway: use them.
+        self.rank = [self.mx.min(bx.columns()), self.my.min(by.columns())];
+        let (mx, my) = (self.mx, self.my);
+        self.weights.clear();
+        self.log_det = 0.0;
+        if bx.is_pixels && by.is_pixels {
+            self.coefficients.clear();
+            self.coefficients.resize(my * mx, 0.0);
+            for (out, row) in self
+                .coefficients
+                .chunks_exact_mut(mx)
+                .zip(frame.pixels.chunks_exact(nx))
+            {
+                out[..nx].copy_from_slice(row);
+            }
+        } else {
+            self.compress(frame, bx, by);
+        }
+        let bad = frame.flagged.iter().map(|b| MaskedPixel {
+            x: b.x,
+            y: b.y,
+            value: frame.pixels[b.y * nx + b.x],
+        });
+        self.masked.load(bad, &mut self.coefficients, mx, bx, by);
+        self.update_weighted([bx, by]);
+        let usable = (nx * ny - self.masked.len()) as f64;
+        self.data_count = ((self.rank[0] * self.rank[1]) as f64).min(usable);
+        let left = usable - self.data_count;
+        let filled = |b: &MaskedPixel| b.value.powi(2) - frame.pixels[b.y * nx + b.x].powi(2);
+        let energy =
+            square(&frame.pixels) + self.masked.pixels.iter().map(filled).sum::<f64>() - square(&self.coefficients);
+        self.outside = (energy.max(0.0) / left.max(1.0), left);
+        (self.variance, self.mean_variance, self.light_weighted_variance) = (VarianceFunction::default(), 1.0, 1.0);
+    }
+
+    #[inline(always)]
+    fn compress(&mut self, frame: &PreprocessedFrame, bx: &Basis, by: &Basis) {
+        let (mx, my) = (self.mx, self.my);
+        self.rows.resize(by.n * mx, 0.0);
+        for (out, row) in self.rows.chunks_exact_mut(mx).zip(frame.pixels.chunks_exact(bx.n)) {
+            combine([row], 1, bx.rows(), bx.stride, mx, out);
+        }
+        self.coefficients.resize(my * mx, 0.0);
+        for (c, out) in self.coefficients.chunks_exact_mut(4 * mx).enumerate() {
+            let columns = [0, 1, 2, 3].map(|k| &by.rows()[4 * c + k..]);
+            combine(columns, by.stride, &self.rows, mx, mx, out);
+        }
+    }
+
+    /// Gives every pixel the weight 1/`variance`, (Ny, Nx), and masked ones 0. Only in the pixel bases.
+    pub fn set_weights(&mut self, frame: &PreprocessedFrame, axes: [&Basis; 2], variance: impl Fn(usize) -> f64) {
+        let nx = axes[0].n;
+        self.weights.clear();
+        self.weights.resize(self.coefficients.len(), 0.0);
+        self.log_det = 0.0;
+        for (k, _) in frame.is_masked.iter().enumerate().filter(|(_, bad)| !**bad) {
+            let v = variance(k);
+            self.log_det += v.ln();
+            self.weights[k / nx * self.mx + k % nx] = 1.0 / v;
+        }
+        self.masked.clear();
+        self.update_weighted(axes);
+    }
+
+    /// Updates the weighted coefficients after a change of coefficients, weights or masked pixels.
+    #[inline(always)]
+    pub fn update_weighted(&mut self, axes: [&Basis; 2]) {
+        if self.is_unweighted() {
+            return;
+        }
+        let mut weighted = std::mem::take(&mut self.weighted);
+        weighted.clone_from(&self.coefficients);
+        self.apply_weights(&mut weighted, axes, true, &mut Vec::new());
+        self.weighted = weighted;
+    }
+
+    /// Whether all data have the same weight.
+    pub fn is_unweighted(&self) -> bool {
+        self.weights.is_empty() && self.masked.is_empty()
+    }
+
+    /// Applies the weights to a matrix (my, mx): the pixels' inverse variances, or the removal of masked pixels. `is_residual`: the matrix
+    /// is the frame less a prediction. Returns the weighted square.
+    #[inline(always)]
+    pub fn apply_weights(
+        &self,
+        matrix: &mut [f64],
+        axes: [&Basis; 2],
+        is_residual: bool,
+        scratch: &mut Vec<f64>,
+    ) -> f64 {
+        if self.weights.is_empty() {
+            let whole = dot(matrix, matrix);
+            if self.masked.is_empty() {
+                return whole;
+            }
+            return whole - self.masked.project_out(matrix, self.mx, axes, is_residual, scratch);
+        }
+        let mut square = 0.0;
+        for (m, w) in matrix.iter_mut().zip(&self.weights) {
+            let weighted = w * *m;
+            square += weighted * *m;
+            *m = weighted;
+        }
+        square
+    }
+
+    /// The coefficients times their weights.
+    #[inline(always)]
+    pub fn weighted_coefficients(&self) -> &[f64] {
+        if self.is_unweighted() {
+            &self.coefficients
+        } else {
+            &self.weighted
+        }
+    }
+
+    /// Most sources of a hypothesis: each takes three of the data.
+    pub fn max_sources(&self) -> usize {
+        MAX_SOURCES.min((self.data_count / 3.0) as usize).max(1)
+    }
+
+    /// Whether the deviance of a hypothesis is that of noise alone.
+    pub fn is_explained_by(&self, hypothesis: &Hypothesis) -> bool {
+        let freedom = (self.data_count - hypothesis.parameters() as f64).max(1.0);
+        let spread = 2.5 * (2.0 * freedom).sqrt() + 2.5;
+        hypothesis.deviance < self.mean_variance * freedom + self.light_weighted_variance * spread
+    }
+
+    /// Deviance over its expectation; 1 where the hypothesis explains the frame.
+    pub fn misfit(&self, hypothesis: &Hypothesis) -> f64 {
+        if self.is_explained_by(hypothesis) {
+            return 1.0;
+        }
+        let freedom = (self.data_count - hypothesis.parameters() as f64).max(1.0);
+        (hypothesis.deviance / (self.mean_variance * freedom)).max(1.0)
+    }
+
+    /// Fills `out` (Ny, Nx) with the part of the frame within the bases, Uᵧ Z Uₓᵀ.
+    pub fn expand(&self, bx: &Basis, by: &Basis, out: &mut Vec<f64>) {
+        self.expand_matrix(&self.coefficients, bx, by, out);
+    }
+
+    /// The same for any matrix (my, mx) of coefficients.
+    pub fn expand_matrix(&self, matrix: &[f64], bx: &Basis, by: &Basis, out: &mut Vec<f64>) {
+        pulp::Arch::new().dispatch(Expand {
+            compressed: self,
+            matrix,
+            bx,
+            by,
+            out,
+        });
+    }
+
+    #[inline(always)]
+    fn expand_rows(&self, matrix: &[f64], bx: &Basis, by: &Basis, out: &mut Vec<f64>) {
+        let (mx, my) = (self.mx, self.my);
+        out.clear();
+        out.resize(bx.n * by.n, 0.0);
+        if bx.is_pixels && by.is_pixels {
+            for (out, row) in out.chunks_exact_mut(bx.n).zip(matrix.chunks_exact(mx)) {
+                out.copy_from_slice(&row[..bx.n]);
+            }
+            return;
+        }
+        let mut row = vec![0.0; mx];
+        for (y, out) in out.chunks_exact_mut(bx.n).enumerate() {
+            combine([&by.row(y)[..my]], 1, matrix, mx, mx, &mut row);
+            for (x, o) in out.iter_mut().enumerate() {
+                *o = dot(&row, &bx.row(x)[..mx]);
+            }
+        }
+    }
+}
+
+struct Load<'a> {
+    compressed: &'a mut CompressedFrame,
+    frame: &'a PreprocessedFrame,
+    bx: &'a Basis,
+    by: &'a Basis,
+}
+
+impl pulp::NullaryFnOnce for Load<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn call(self) {
+        self.compressed.read(self.frame, self.bx, self.by);
+    }
+}
+
+struct Expand<'a> {
+    compressed: &'a CompressedFrame,
+    matrix: &'a [f64],
+    bx: &'a Basis,
+    by: &'a Basis,
+    out: &'a mut Vec<f64>,
+}
+
+impl pulp::NullaryFnOnce for Expand<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn call(self) {
+        self.compressed.expand_rows(self.matrix, self.bx, self.by, self.out);
+    }
+}
+
+#[inline(always)]
+fn square(v: &[f64]) -> f64 {
+    dot(v, v)
+}

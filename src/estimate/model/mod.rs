@@ -1,0 +1,8 @@
+//! What a hypothesis predicts: the PSF on one axis, its compressed basis, and sums of separable terms.
+
+pub mod compressed_frame;
+pub mod hypothesis;
+pub mod psf_table;
+pub mod separable_model;
+pub mod separable_terms;
+pub mod svd_basis;

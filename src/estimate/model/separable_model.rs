@@ -1,0 +1,297 @@
+//! The predicted frame of a hypothesis: components (sources, then background terms), each a sum of separable terms.
+//!
+//! A source whose PSF is aligned with the axes is one term. A rotated ellipse is no product of profiles: it is an aligned PSF smeared
+//! along a diagonal, which Gauss–Hermite quadrature (Abramowitz and Stegun, 1964, 25.4.46) turns into a sum of five.
+
+use crate::estimate::model::compressed_frame::CompressedFrame;
+use crate::estimate::model::hypothesis::{Nuisances, PointSource};
+use crate::estimate::model::separable_terms::SeparableTerms;
+use crate::estimate::model::svd_basis::Basis;
+use crate::estimate::preprocess::masked_pixels::Run;
+
+/// Nodes in σ of the smear, and weights; exact for the first nine moments.
+const QUADRATURE: [(f64, f64); 5] = [
+    (0.0, 0.533_333_333_333_333_3),
+    (1.355_626_179_974_266, 0.222_075_922_005_612_66),
+    (-1.355_626_179_974_266, 0.222_075_922_005_612_66),
+    (2.856_970_013_872_805_7, 0.011_257_411_327_720_691),
+    (-2.856_970_013_872_805_7, 0.011_257_411_327_720_691),
+];
+const WHOLE: [(f64, f64); 1] = [(0.0, 1.0)];
+
+/// Orders of the derivatives along x and y that go with a source's energy, x and y.
+pub(crate) const SLOPES: [[usize; 2]; 3] = [[0, 0], [1, 0], [0, 1]];
+
+/// Components in the bases: sources first, then background terms.
+#[derive(Default)]
+pub(crate) struct SeparableModel {
+    pub sources: Vec<PointSource>,
+    pub background: [f64; 3],
+    /// Relative to the configured σ.
+    pub width: [f64; 2],
+    /// The sources' covariance between the axes, σ².
+    pub covariance_xy: f64,
+    components: usize,
+    terms: SeparableTerms,
+}
+
+/// Constant and sloped profiles along one axis, of about a source's norm, so that the normal equations are well scaled.
+pub(crate) fn background(b: &Basis) -> [Vec<f64>; 2] {
+    let (half, norm) = (0.5 * b.n as f64, (b.n as f64).sqrt());
+    let mut pair = [vec![0.0; b.stride], vec![0.0; b.stride]];
+    b.compress((0..b.n).map(|_| 1.0 / norm), &mut pair[0]);
+    b.compress((0..b.n).map(|k| (k as f64 + 0.5 - half) / half / norm), &mut pair[1]);
+    pair
+}
+
+impl SeparableModel {
+    pub fn components(&self) -> usize {
+        self.components
+    }
+
+    /// Numbers within all components' spans together: the cost of one pass over them.
+    pub fn footprint(&self) -> f64 {
+        self.terms.footprint()
+    }
+
+    /// Separable terms of a source.
+    pub fn terms_per_source(&self) -> f64 {
+        self.quadrature(0).len() as f64
+    }
+
+    /// Amplitude of a component.
+    #[inline(always)]
+    pub fn amplitude(&self, i: usize) -> f64 {
+        let n = self.sources.len();
+        if i < n {
+            self.sources[i].a
+        } else {
+            self.background[i - n]
+        }
+    }
+
+    /// Evaluates all terms for the present sources, widths and background.
+    #[inline(always)]
+    pub fn place(
+        &mut self,
+        axes: [&Basis; 2],
+        backgrounds: [&[Vec<f64>; 2]; 2],
+        compressed: &CompressedFrame,
+        nuisances: Nuisances,
+        scratch: &mut [f64],
+    ) {
+        let n = self.sources.len();
+        let quadrature = self.quadrature(0);
+        self.components = n + nuisances.background_terms();
+        let count = n * quadrature.len() + nuisances.background_terms();
+        self.terms.clear(count, compressed.mx, compressed.my);
+        let along = self.covariance_xy.abs().sqrt();
+        let width = self.width.map(|w| (w * w - self.covariance_xy.abs()).max(0.0).sqrt());
+        for s in &self.sources {
+            for (t, _) in quadrature {
+                let u = [s.u[0] + t * along, s.u[1] + t * along * self.covariance_xy.signum()];
+                self.terms.push(axes, u, width, compressed.reach, scratch);
+            }
+        }
+        for b in 0..nuisances.background_terms() {
+            let kinds = [usize::from(b == 1), usize::from(b == 2)];
+            self.terms
+                .push_profiles([0, 1].map(|k| backgrounds[k][kinds[k]].as_slice()));
+        }
+        self.terms.evaluate_lines(axes, &compressed.masked.lines);
+    }
+
+    /// Nodes and weights of a component's terms.
+    #[inline(always)]
+    fn quadrature(&self, i: usize) -> &'static [(f64, f64)] {
+        if self.covariance_xy != 0.0 && i < self.sources.len() {
+            &QUADRATURE
+        } else {
+            &WHOLE
+        }
+    }
+
+    /// A component's first term, and the nodes and weights of all of its terms.
+    #[inline(always)]
+    fn terms(&self, i: usize) -> (usize, &'static [(f64, f64)]) {
+        let n = self.sources.len();
+        let each = self.quadrature(0).len();
+        (if i < n { i * each } else { n * each + i - n }, self.quadrature(i))
+    }
+
+    /// Derivatives of component `i` at a masked pixel, of the given orders along x and y.
+    #[inline(always)]
+    pub fn derivatives_at(&self, i: usize, [x, y]: [usize; 2], derivatives: [[usize; 2]; 3]) -> [f64; 3] {
+        let (first, shares) = self.terms(i);
+        let mut sum = [0.0; 3];
+        for (k, (_, share)) in shares.iter().enumerate() {
+            let [fx, fy] = self.terms.at(first + k, x, y);
+            for (s, [a, b]) in sum.iter_mut().zip(derivatives) {
+                *s += share * fx[a] * fy[b];
+            }
+        }
+        sum
+    }
+
+    /// [`SeparableModel::gram_block`] over masked pixels alone.
+    #[inline(always)]
+    pub fn gram_block_over_runs(&self, i: usize, j: usize, runs: &[Run], scratch: &mut Vec<f64>) -> [f64; 9] {
+        let ((first, shares), (other, others)) = (self.terms(i), self.terms(j));
+        let mut sum = [0.0; 9];
+        for (k, (_, share)) in shares.iter().enumerate() {
+            for (l, (_, of)) in others.iter().enumerate() {
+                add(
+                    &mut sum,
+                    share * of,
+                    self.terms.gram_block_over_runs(first + k, other + l, runs, scratch),
+                );
+            }
+        }
+        sum
+    }
+
+    /// Adds `scale`·f_y⁽ᵇ⁾⊗f_x⁽ᵃ⁾ of component `i` to a matrix (my, mx).
+    #[inline(always)]
+    pub fn accumulate(&self, i: usize, a: usize, b: usize, scale: f64, matrix: &mut [f64]) {
+        let (first, shares) = self.terms(i);
+        for (k, (_, share)) in shares.iter().enumerate() {
+            self.terms.accumulate(first + k, a, b, share * scale, matrix);
+        }
+    }
+
+    /// Adds `f_y⊗(q0[0] f″_x + q0[1] f′_x) + f′_y⊗(q1[0] f′_x + q1[1] f_x) + q2 f″_y⊗f_x` of component `i` to a matrix (my, mx).
+    #[inline(always)]
+    pub fn accumulate_second_derivative(
+        &self,
+        i: usize,
+        q0: [f64; 2],
+        q1: [f64; 2],
+        q2: f64,
+        scratch: &mut Vec<f64>,
+        matrix: &mut [f64],
+    ) {
+        let (first, shares) = self.terms(i);
+        for (k, (_, share)) in shares.iter().enumerate() {
+            let (q0, q1) = ([share * q0[0], share * q0[1]], [share * q1[0], share * q1[1]]);
+            self.terms
+                .accumulate_second_derivative(first + k, q0, q1, share * q2, scratch, matrix);
+        }
+    }
+
+    /// Inner products of a matrix (my, mx) with f_y⊗f_x, f_y⊗f′_x and f′_y⊗f_x of component `i`.
+    #[inline(always)]
+    pub fn project(&self, i: usize, matrix: &[f64], scratch: &mut Vec<f64>) -> [f64; 3] {
+        let (first, shares) = self.terms(i);
+        let mut sum = [0.0; 3];
+        for (k, (_, share)) in shares.iter().enumerate() {
+            add(&mut sum, *share, self.terms.project(first + k, matrix, scratch));
+        }
+        sum
+    }
+
+    /// Jᵀ times a matrix (my, mx): J's columns are every source's x, y and energy, then the background's amplitudes.
+    #[inline(always)]
+    pub fn transposed_jacobian_times(&self, matrix: &[f64], scratch: &mut Vec<f64>, out: &mut [f64]) {
+        for i in 0..self.components {
+            self.set_jacobian(i, self.project(i, matrix, scratch), out);
+        }
+    }
+
+    /// The row of J at a masked pixel.
+    #[inline(always)]
+    pub fn jacobian_row_at(&self, pixel: [usize; 2], out: &mut [f64]) {
+        for i in 0..self.components {
+            self.set_jacobian(i, self.derivatives_at(i, pixel, SLOPES), out);
+        }
+    }
+
+    #[inline(always)]
+    fn set_jacobian(&self, i: usize, [value, along_x, along_y]: [f64; 3], out: &mut [f64]) {
+        let n = self.sources.len();
+        if i < n {
+            let a = self.sources[i].a;
+            (out[3 * i], out[3 * i + 1], out[3 * i + 2]) = (a * along_x, a * along_y, value);
+        } else {
+            out[2 * n + i] = value;
+        }
+    }
+
+    /// The first value of [`Self::project`] alone.
+    #[inline(always)]
+    pub fn project_value(&self, i: usize, matrix: &[f64], scratch: &mut Vec<f64>) -> f64 {
+        let (first, shares) = self.terms(i);
+        let mut sum = 0.0;
+        for (k, (_, share)) in shares.iter().enumerate() {
+            sum += share * self.terms.project_value(first + k, matrix, scratch);
+        }
+        sum
+    }
+
+    /// Inner products with the second derivatives: xx, xy, yy.
+    #[inline(always)]
+    pub fn project_second_derivatives(&self, i: usize, matrix: &[f64], scratch: &mut Vec<f64>) -> [f64; 3] {
+        let (first, shares) = self.terms(i);
+        let mut sum = [0.0; 3];
+        for (k, (_, share)) in shares.iter().enumerate() {
+            add(
+                &mut sum,
+                *share,
+                self.terms.project_second_derivatives(first + k, matrix, scratch),
+            );
+        }
+        sum
+    }
+
+    /// Inner product of component `i`'s derivative, `a[0]` times along x and `a[1]` times along y, with component `j`'s under `weights`
+    /// (my, mx), even where that is empty.
+    #[inline(always)]
+    pub fn inner_product(
+        &self,
+        i: usize,
+        a: [usize; 2],
+        j: usize,
+        b: [usize; 2],
+        weights: &[f64],
+        scratch: &mut Vec<f64>,
+    ) -> f64 {
+        let ((first, shares), (other, others)) = (self.terms(i), self.terms(j));
+        let mut sum = 0.0;
+        for (k, (_, share)) in shares.iter().enumerate() {
+            for (l, (_, of)) in others.iter().enumerate() {
+                sum += share * of * self.terms.inner_product(first + k, a, other + l, b, weights, scratch);
+            }
+        }
+        sum
+    }
+
+    /// Inner products along x and along y of component `i`'s f, f′ and f″ with component `j`'s f and f′; `None` where they share nothing.
+    /// Only of sources that are upright.
+    #[inline(always)]
+    pub fn axis_inner_products(&self, i: usize, j: usize) -> Option<[[[f64; 2]; 3]; 2]> {
+        self.terms.axis_inner_products(i, j)
+    }
+
+    /// Inner products of (f′_x f_y, f_x f′_y, f_x f_y) of component `i` with those of component `j`, 3 × 3 row-major.
+    #[inline(always)]
+    pub fn gram_block(&self, i: usize, j: usize, weights: &[f64], scratch: &mut Vec<f64>) -> [f64; 9] {
+        let ((first, shares), (other, others)) = (self.terms(i), self.terms(j));
+        let mut sum = [0.0; 9];
+        for (k, (_, share)) in shares.iter().enumerate() {
+            for (l, (_, of)) in others.iter().enumerate() {
+                add(
+                    &mut sum,
+                    share * of,
+                    self.terms.gram_block(first + k, other + l, weights, scratch),
+                );
+            }
+        }
+        sum
+    }
+}
+
+#[inline(always)]
+fn add<const N: usize>(sum: &mut [f64; N], share: f64, values: [f64; N]) {
+    for k in 0..N {
+        sum[k] += share * values[k];
+    }
+}

@@ -1,0 +1,116 @@
+//! Validates a frame: divides it by the noise, lists the pixels that cannot be used and interpolates over them.
+
+use crate::estimate::error::Error;
+use crate::frame::Frame;
+use crate::optics::Camera;
+
+/// Values of this many standard deviations or more count as non-finite: their squares approach the range of f64.
+const OVERFLOWS: f64 = 1e100;
+
+/// A frame in units of the noise's standard deviation, with its masked pixels listed and filled in.
+#[derive(Clone, Default)]
+pub(crate) struct PreprocessedFrame {
+    /// (Ny, Nx) row-major. Masked pixels hold the mean of their usable neighbours, or `ceiling`; a fit must not
+    /// use them.
+    pub pixels: Vec<f64>,
+    pub flagged: Vec<FlaggedPixel>,
+    pub is_masked: Vec<bool>,
+    pub saturated: usize,
+}
+
+/// A pixel that must not be used, and why.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct FlaggedPixel {
+    pub x: usize,
+    pub y: usize,
+    pub is_saturated: bool,
+}
+
+impl PreprocessedFrame {
+    /// Checks and normalises a frame.
+    pub fn load(&mut self, frame: &Frame, camera: &Camera) -> Result<(), Error> {
+        let (ny, nx) = frame.pixels.dim();
+        if (ny, nx) != camera.shape() {
+            return Err(Error::WrongShape {
+                expected_x: camera.x.n,
+                expected_y: camera.y.n,
+                found_x: nx,
+                found_y: ny,
+            });
+        }
+        self.pixels.clear();
+        self.flagged.clear();
+        self.is_masked.clear();
+        self.saturated = 0;
+        let (mut nan, mut masked) = (0, 0);
+        let scale = 1.0 / camera.noise_std_j;
+        let ceiling = camera.saturation_j.unwrap_or(f64::INFINITY);
+        self.pixels.extend(frame.pixels.iter().map(|value| value * scale));
+        self.is_masked.resize(self.pixels.len(), false);
+        let is_sound = |value: f64| (value * scale).abs() < OVERFLOWS && value < ceiling;
+        // The common case: without branches, so that the loop is vectorised.
+        if frame.masked.is_none() && frame.pixels.iter().fold(true, |all, &value| all & is_sound(value)) {
+            return Ok(());
+        }
+        for (k, ((y, x), &value)) in frame.pixels.indexed_iter().enumerate() {
+            let is_masked = frame.masked.as_ref().is_some_and(|m| m.get((y, x)) == Some(&true));
+            if is_sound(value) && !is_masked {
+                continue;
+            }
+            let is_saturated = value >= ceiling;
+            // Values whose square overflows count as non-finite.
+            nan += usize::from(!((value * scale).abs() < OVERFLOWS));
+            masked += usize::from(is_masked);
+            self.saturated += usize::from(is_saturated);
+            self.flagged.push(FlaggedPixel { x, y, is_saturated });
+            self.is_masked[k] = true;
+            self.pixels[k] = ceiling * scale;
+        }
+        if self.flagged.len() == self.pixels.len() {
+            return Err(Error::NoUsablePixel {
+                total: self.pixels.len(),
+                nan,
+                saturated: self.saturated,
+                masked,
+            });
+        }
+        self.interpolate_masked(nx, ny);
+        Ok(())
+    }
+
+    /// Masks one more pixel; the caller fills it.
+    pub fn mask(&mut self, x: usize, y: usize, nx: usize) {
+        if !std::mem::replace(&mut self.is_masked[y * nx + x], true) {
+            self.flagged.push(FlaggedPixel {
+                x,
+                y,
+                is_saturated: false,
+            });
+        }
+    }
+
+    /// Gives every masked pixel that is not saturated the mean of the nearest usable ones.
+    fn interpolate_masked(&mut self, nx: usize, ny: usize) {
+        for bad in &self.flagged {
+            if bad.is_saturated && self.pixels[bad.y * nx + bad.x].is_finite() {
+                continue;
+            }
+            let mut radius = 1;
+            self.pixels[bad.y * nx + bad.x] = loop {
+                let (mut sum, mut count) = (0.0, 0);
+                for y in bad.y.saturating_sub(radius)..=(bad.y + radius).min(ny - 1) {
+                    for x in bad.x.saturating_sub(radius)..=(bad.x + radius).min(nx - 1) {
+                        if !self.is_masked[y * nx + x] {
+                            sum += self.pixels[y * nx + x];
+                            count += 1;
+                        }
+                    }
+                }
+                if count > 0 {
+                    break sum / count as f64;
+                }
+                radius *= 2;
+            };
+        }
+    }
+}

@@ -1,0 +1,169 @@
+//! From a fitted hypothesis to positions on the ground, each with its covariance and flags.
+
+use crate::estimate::emitter::{Emitter, Estimate, Flags, SecondMomentScore};
+use crate::estimate::model::compressed_frame::CompressedFrame;
+use crate::estimate::model::hypothesis::Hypothesis;
+use crate::estimate::model_order::search::Search;
+use crate::estimate::preprocess::screening::PreprocessedFrame;
+use crate::estimate::uncertainty::covariance::RIDGE;
+use crate::estimate::uncertainty::pixel_posterior;
+use crate::estimate::uncertainty::posterior_mean::PosteriorMoments;
+use crate::optics::Camera;
+
+/// A masked pixel within this distance, σ, sets a flag.
+const MASKED_DISTANCE: f64 = 3.0;
+/// A source within this distance of the edge, σ, is flagged.
+const EDGE_DISTANCE: f64 = 2.0;
+/// Condition number beyond which the ridge under the information matrix is no longer small against its least eigenvalue.
+const MAX_CONDITION: f64 = 0.01 / RIDGE;
+/// Sources this many standard deviations of their difference apart are resolved.
+const RESOLVED: f64 = 3.0;
+/// A source may be two where a split is predicted to decrease the deviance by this much, which is less than a source's penalty.
+const DOUBTFUL: f64 = 10.0;
+/// Sources within this distance, σ, of an unresolved one may be displaced by it.
+const INFLUENCE_DISTANCE: f64 = 2.5;
+
+/// Turns `hypothesis` into emitters with covariance and flags.
+pub(crate) fn localise(
+    search: &mut Search,
+    compressed: &CompressedFrame,
+    hypothesis: &mut Hypothesis,
+    frame: &PreprocessedFrame,
+    camera: &Camera,
+    noise_j: f64,
+    posterior_moments: Option<&[PosteriorMoments]>,
+) -> Estimate {
+    let n = hypothesis.sources.len();
+    let p = hypothesis.parameters();
+    search.fitter.compute_information(compressed, hypothesis);
+    let freedom = (compressed.data_count - p as f64).max(1.0);
+    // The masked pixels' downdate may leave a small negative number.
+    let reduced_chi2 = hypothesis.deviance.max(0.0) / freedom;
+    let expected = compressed.mean_variance * freedom;
+    let is_poor =
+        hypothesis.deviance > expected + compressed.light_weighted_variance * (5.0 * (2.0 * freedom).sqrt() + 5.0);
+    // A misfit inflates the covariance.
+    let inflation = if is_poor { hypothesis.deviance / expected } else { 1.0 };
+    let (bx, by) = (&search.fitter.bx, &search.fitter.by);
+    let (low, high) = ([bx.edges[0], by.edges[0]], [bx.edges[bx.n], by.edges[by.n]]);
+    let pitch = [bx.pitch(), by.pitch()];
+    // The fit may place a source past the sensor's edges.
+    let extent = (bx.max_position() - bx.min_position()).max(by.max_position() - by.min_position());
+    let prior = 12.0 / (extent * extent);
+    let mut cov = Vec::new();
+    let is_regular = search.fitter.covariance(p, n, prior, &mut cov);
+    let condition = if is_regular {
+        search.fitter.condition_number(p, &cov)
+    } else {
+        f64::INFINITY
+    };
+    let scores = match is_regular {
+        true => search.fitter.second_moment_scores(compressed, hypothesis, &cov),
+        false => vec![SecondMomentScore::default(); n],
+    };
+    let block = |i: usize, j: usize| {
+        if is_regular {
+            [0, 1].map(|r| [0, 1].map(|c| cov[(3 * i + r) * p + 3 * j + c]))
+        } else {
+            let v = if i == j { extent * extent / 12.0 } else { 0.0 };
+            [[v, 0.0], [0.0, v]]
+        }
+    };
+    let is_merged = |i: usize| {
+        let own = block(i, i);
+        (0..n).filter(|&j| j != i).any(|j| {
+            let d = [0, 1].map(|k| hypothesis.sources[i].u[k] - hypothesis.sources[j].u[k]);
+            let (other, cross) = (block(j, j), block(i, j));
+            let s = [0, 1].map(|r| [0, 1].map(|c| own[r][c] + other[r][c] - cross[r][c] - cross[c][r]));
+            let along: f64 = (0..2).map(|r| (0..2).map(|c| d[r] * s[r][c] * d[c]).sum::<f64>()).sum();
+            let d2 = d[0] * d[0] + d[1] * d[1];
+            d2 * d2 < RESOLVED * RESOLVED * inflation * along
+        })
+    };
+    let may_be_two = |i: usize| scores[i].split(i).is_some_and(|s| s.gain > DOUBTFUL * inflation);
+    let is_doubtful: Vec<bool> = (0..n).map(|i| !is_regular || is_merged(i) || may_be_two(i)).collect();
+    let is_near = |i: usize, j: usize| {
+        let d = [0, 1].map(|k| hypothesis.sources[i].u[k] - hypothesis.sources[j].u[k]);
+        d[0].hypot(d[1]) < INFLUENCE_DISTANCE
+    };
+    let is_crowded = |i: usize| (0..n).any(|j| j != i && is_near(i, j));
+    let is_likelihood_quadratic: Vec<bool> = (0..n)
+        .map(|i| !is_regular || !is_crowded(i) || search.is_likelihood_quadratic(compressed, hypothesis, &cov, i))
+        .collect();
+    let (bx, by) = (&search.fitter.bx, &search.fitter.by);
+    let sigma = camera.spot_sigma_m;
+    let emitters = (0..n)
+        .map(|i| {
+            let source = hypothesis.sources[i];
+            let mut flags = Flags::empty();
+            flags.set(Flags::NO_CONVERGENCE, !hypothesis.converged);
+            flags.set(Flags::POOR_FIT, is_poor);
+            flags.set(Flags::ILL_CONDITIONED, !(condition <= MAX_CONDITION));
+            let near_edge =
+                (0..2).any(|k| source.u[k] < low[k] + EDGE_DISTANCE || source.u[k] > high[k] - EDGE_DISTANCE);
+            flags.set(Flags::NEAR_EDGE, near_edge);
+            for bad in &frame.flagged {
+                let centre = [bad.x, bad.y].map(|k| k as f64 + 0.5);
+                let d2: f64 = (0..2)
+                    .map(|k| (low[k] + centre[k] * pitch[k] - source.u[k]).powi(2))
+                    .sum();
+                if d2 < MASKED_DISTANCE * MASKED_DISTANCE {
+                    flags |= if bad.is_saturated {
+                        Flags::SATURATED
+                    } else {
+                        Flags::MASKED
+                    };
+                }
+            }
+            let own = block(i, i);
+            flags.set(Flags::UNRESOLVED, (0..n).any(|j| is_doubtful[j] && is_near(i, j)));
+            flags.set(Flags::NON_GAUSSIAN, !is_likelihood_quadratic[i]);
+            let (mut u, mut own) = (source.u, own);
+            for k in 0..if is_regular { 2 } else { 0 } {
+                if let Some(s) = pixel_posterior::pixel_posterior([bx, by], k, &source) {
+                    u[k] += s.shift;
+                    // Neighbours and nuisances widen this variance as they widen the information matrix's.
+                    let wider = (s.variance * (s.information + prior)).sqrt();
+                    for other in 0..2 {
+                        own[k][other] *= wider;
+                        own[other][k] *= wider;
+                    }
+                }
+            }
+            if let Some(moments) = posterior_moments.map(|c| c[i]) {
+                for k in 0..2 {
+                    u[k] += moments.shift[k];
+                }
+                own = moments.covariance;
+            }
+            let sensor_m = u.map(|u| u * sigma);
+            let scale = sigma * sigma * inflation;
+            let [x_m, y_m] = camera.to_ground(sensor_m);
+            let energy_variance = if is_regular {
+                cov[(3 * i + 2) * p + 3 * i + 2]
+            } else {
+                source.a * source.a
+            };
+            Emitter {
+                x_m,
+                y_m,
+                cov_m2: camera.cov_to_ground(sensor_m, own.map(|r| r.map(|c| c * scale))),
+                energy_j: source.a * noise_j,
+                // Two square roots: the product of the variances may overflow.
+                energy_std_j: energy_variance.max(0.0).sqrt() * inflation.sqrt() * noise_j,
+                sensor_m,
+                second_moment: scores[i],
+                flags,
+            }
+        })
+        .collect();
+    Estimate {
+        emitters,
+        estimator: "",
+        is_cut_short: false,
+        reduced_chi2,
+        saturated_share: frame.saturated as f64 / frame.pixels.len() as f64,
+        condition,
+        steps: search.fitter.steps,
+    }
+}
