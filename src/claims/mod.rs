@@ -20,7 +20,7 @@ pub use inbox::{Batch, Inbox};
 pub use line::{LineError, parse_line};
 pub use pressure::{Squeeze, WINDOW_S};
 pub use roster::Roster;
-pub use store::{Beam, Counts, Outcome, Store};
+pub use store::{Beam, Counts, NO_ROOM, Outcome, Store};
 
 pub(crate) use store::seconds;
 

@@ -78,6 +78,21 @@ pub enum Outcome {
     Full,
 }
 
+/// Why a claim was refused for want of room.
+pub const NO_ROOM: &str = "the store of claims is full";
+
+impl Outcome {
+    /// Why the claim was refused, where it was.
+    pub fn refusal(self) -> Option<&'static str> {
+        match self {
+            Self::Full => Some(NO_ROOM),
+            Self::Conflicting => Some("another position was claimed for this user and time"),
+            Self::TooLate => Some("older than all that is kept of this user"),
+            Self::Accepted | Self::Ahead | Self::Late | Self::Duplicate => None,
+        }
+    }
+}
+
 /// How many claims had each outcome.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct Counts {

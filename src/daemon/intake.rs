@@ -7,7 +7,7 @@ use tokio::sync::oneshot;
 
 use super::compute::Compute;
 use crate::api::{Acknowledged, Command};
-use crate::claims::{Claim, Outcome, Refused};
+use crate::claims::{Claim, Refused};
 use crate::metric;
 use crate::monitor::AlertState;
 
@@ -83,13 +83,9 @@ impl Compute {
             if self.recorder.is_some() {
                 self.unrecorded.push(claim.clone());
             }
-            let reason = match self.pipeline.claims.insert(claim, now) {
-                Outcome::Full => "the store of claims is full",
-                Outcome::Conflicting => "another position was claimed for this user and time",
-                Outcome::TooLate => "older than all that is kept of this user",
-                Outcome::Accepted | Outcome::Ahead | Outcome::Late | Outcome::Duplicate => continue,
-            };
-            post.refused.push((index, reason.to_owned()));
+            if let Some(reason) = self.pipeline.claims.insert(claim, now).refusal() {
+                post.refused.push((index, reason.to_owned()));
+            }
         }
         self.posts.waiting.push_back(post);
         placed
