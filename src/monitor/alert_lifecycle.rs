@@ -3,9 +3,9 @@ use std::collections::BTreeMap;
 use jiff::Timestamp;
 use serde_json::Value;
 
-use super::alert::SAME_PLACE_M;
-use super::{Alert, AlertEvent, AlertEventKind, AlertKind, AlertSource, AlertState, Severity};
 use crate::claims::seconds;
+use crate::monitor::alert::SAME_PLACE_M;
+use crate::monitor::alert::{Alert, AlertEvent, AlertEventKind, AlertKind, AlertSource, AlertState, Severity};
 
 /// What an alert is about: while one is open for a cause, the cause raises no other.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -57,7 +57,7 @@ struct Cleared {
 
 /// The alerts of a run: raised once per cause, updated, acknowledged, cleared.
 #[derive(Debug)]
-pub(super) struct Book {
+pub(super) struct AlertLifecycle {
     open: BTreeMap<Cause, Open>,
     cleared: BTreeMap<Cause, Cleared>,
     /// Alerts of each kind raised at the newest instant: a flood of them must not cost more than their number.
@@ -82,6 +82,14 @@ impl Cause {
         }
     }
 
+    /// The user that the cause is about, if it is about one.
+    pub fn names(&self) -> Option<&str> {
+        match self {
+            Self::User(_, user) | Self::Spot(user) => Some(user),
+            Self::Track(..) | Self::Whole(_) => None,
+        }
+    }
+
     fn user(&self) -> Option<&str> {
         match self {
             Self::User(_, user) => Some(user),
@@ -103,7 +111,7 @@ impl Finding {
     }
 }
 
-impl Book {
+impl AlertLifecycle {
     pub fn new(source_kind: String, source_file: Option<String>, cool_down_s: f64) -> Self {
         Self {
             open: BTreeMap::new(),
