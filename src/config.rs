@@ -100,6 +100,9 @@ impl Config {
         for path in optional.into_iter().flatten() {
             *path = located(base, path, credentials.as_deref());
         }
+        if let api::Listen::Unix(path) = &mut self.api.listen {
+            *path = located(base, path, credentials.as_deref());
+        }
         for webhook in &mut self.webhook {
             let files = [Some(&mut webhook.secret_file), webhook.ca_file.as_mut()];
             for path in files.into_iter().flatten() {

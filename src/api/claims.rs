@@ -1,3 +1,5 @@
+//! `POST /v1/claims`: parses a body of claims and hands them to the compute thread.
+
 use axum::body::Bytes;
 use axum::extract::State as Shared;
 use axum::extract::rejection::BytesRejection;
@@ -6,6 +8,7 @@ use axum::response::Response;
 use serde::Serialize;
 use tokio::sync::{mpsc, oneshot};
 
+use super::audit::Caller;
 use super::problem::Problem;
 use super::respond;
 use super::state::{Command, State};
@@ -128,6 +131,7 @@ fn check_media_type(headers: &HeaderMap) -> Result<(), Problem> {
     ))]
 pub async fn post(
     Shared(state): Shared<State>,
+    caller: Caller,
     headers: HeaderMap,
     body: Result<Bytes, BytesRejection>,
 ) -> Result<Response, Problem> {
@@ -151,6 +155,7 @@ pub async fn post(
         }
         intake.reasons.sort_by_key(|r| r.line);
     }
+    state.audit.claims(&caller, intake.accepted, intake.refused);
     if intake.accepted > 0 {
         return Ok(respond::json(&intake));
     }

@@ -1,3 +1,5 @@
+//! `/v1/frame.png`: the latest frame, drawn once for all viewers.
+
 use std::sync::Mutex;
 use std::time::{Duration, Instant};
 
@@ -17,7 +19,7 @@ use super::{conditional, picture, positions};
 const REDRAW: Duration = Duration::from_millis(100);
 /// Side of the picture when no scale is asked for, at least.
 const DEFAULT_SIDE: usize = 512;
-const MAX_SIDE: usize = 2048;
+pub(super) const MAX_SIDE: usize = 2048;
 
 #[derive(Debug, Deserialize, utoipa::IntoParams)]
 #[into_params(parameter_in = Query)]
@@ -93,14 +95,22 @@ pub async fn frame_png(
     let side = nx.max(ny).max(1);
     let scale = match query.scale {
         Some(scale) => within("scale", scale, 1, 64)?.min((MAX_SIDE / side).max(1)),
-        None => DEFAULT_SIDE.div_ceil(side).clamp(1, 64),
+        None => picture::scale_for(&frame, DEFAULT_SIDE),
     };
     let look = (scale, query.detections.unwrap_or(true));
     let (seq, png) = match state.pictures.get(&latest, look) {
         Some(drawn) => drawn,
         None => {
             let published = latest.clone();
-            let draw = move || picture::png(&frame, &published.snapshot, look.0, look.1);
+            let draw = move || {
+                let snapshot = &published.snapshot;
+                let marks = if look.1 {
+                    picture::marks_of(snapshot)
+                } else {
+                    Vec::new()
+                };
+                picture::png(&frame, &snapshot.camera, &marks, look.0)
+            };
             let drawn = tokio::task::spawn_blocking(draw).await.expect("drawing does not panic");
             let png = drawn.map_err(|e| Problem::new(StatusCode::INTERNAL_SERVER_ERROR, e.to_string()))?;
             let png = Bytes::from(png);

@@ -1,3 +1,5 @@
+//! RFC 9457 problem details: the form of every error that the API answers with.
+
 use axum::Json;
 use axum::body::Body;
 use axum::extract::Request;

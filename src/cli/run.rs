@@ -1,7 +1,7 @@
-use std::net::SocketAddr;
 use std::path::PathBuf;
 
 use super::{Failure, Outcome};
+use crate::api::Listen;
 use crate::config::Config;
 use crate::daemon::Daemon;
 use crate::logging;
@@ -11,9 +11,9 @@ pub struct Args {
     /// Without one it runs on the built-in simulator
     #[arg(long)]
     config: Option<PathBuf>,
-    /// Address for the API instead of the one configured
+    /// Address for the API instead of the one configured: 127.0.0.1:8787, localhost:8787 or unix:PATH
     #[arg(long)]
-    listen: Option<SocketAddr>,
+    listen: Option<Listen>,
 }
 
 /// Threads that serve the API, and those that wait for the journal on its behalf. A machine of many cores has no more of

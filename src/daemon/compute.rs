@@ -66,7 +66,7 @@ impl Compute {
         let mut heard = Instant::now();
         while !self.stop.load(Ordering::Relaxed) {
             self.follow_log();
-            self.obey();
+            self.handle_commands();
             let patience = if self.posts.is_empty() { PATIENCE } else { POSTING };
             let captured = self.capture.next(patience);
             let arrived = Instant::now();
@@ -76,7 +76,7 @@ impl Compute {
                     // A live frame is as old as its capture; a recording's has waited for us to ask.
                     let since = if self.is_replay { arrived } else { captured.at };
                     self.take_claims(claims, frame.time);
-                    self.obey();
+                    self.handle_commands();
                     let recorded = self.recorder.as_mut().map(|r| r.frame(&frame, &self.unrecorded));
                     self.recorded(recorded.flatten(), captured.file);
                     self.frame(frame, since);
@@ -209,11 +209,14 @@ impl Compute {
     }
 
     fn publish(&mut self, mut report: Report, frame: Option<Arc<Frame>>) {
-        for event in &report.events {
-            self.state.note(event);
-            if let (AlertEventKind::Raised, Some(recorder)) = (event.event, &mut self.recorder) {
-                recorder.evidence(&event.alert.id, report.time);
+        for event in &mut report.events {
+            if let (AlertEventKind::Raised, Some(recorder)) = (event.event, &mut self.recorder)
+                && let Some(file) = recorder.evidence(&event.alert.id, report.time)
+            {
+                self.state.evidence.insert(event.alert.id.clone(), file);
             }
+            self.state.name_evidence(&mut event.alert);
+            self.state.note(event);
         }
         self.state.gauge(&report);
         let at = report.time;

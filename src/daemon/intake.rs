@@ -7,9 +7,10 @@ use tokio::sync::oneshot;
 
 use super::compute::Compute;
 use crate::api::{Acknowledged, Command};
+use crate::claim::escape_undisplayable;
 use crate::claims::{Claim, Refused};
 use crate::metric;
-use crate::monitor::AlertState;
+use crate::monitor::{Acknowledgement, AlertEvent, AlertState, Withdrawal};
 
 /// How often lines of the claims log that are no claims are logged.
 const COMPLAIN_EVERY: Duration = Duration::from_secs(10);
@@ -51,13 +52,29 @@ impl Posts {
 
 impl Compute {
     /// Acknowledgements, and some of the claims by POST.
-    pub(super) fn obey(&mut self) {
+    pub(super) fn handle_commands(&mut self) {
         while self.posts.claims < MOST_POSTED
             && let Ok(command) = self.commands.try_recv()
         {
             match command {
                 Command::Claims { claims, reply } => self.posts.add(claims, reply),
-                Command::Acknowledge { id, reply } => self.acknowledge(&id, reply),
+                Command::Acknowledge { id, by, note, reply } => {
+                    let acknowledgement = Acknowledgement {
+                        at: self.now(),
+                        by,
+                        note,
+                        withdrawn: None,
+                    };
+                    let event = self.pipeline.monitor.acknowledge(&id, acknowledgement);
+                    let outcome = self.acknowledged(&id, event);
+                    self.outlet.acknowledged(reply, outcome);
+                }
+                Command::Unacknowledge { id, by, reply } => {
+                    let withdrawal = Withdrawal { at: self.now(), by };
+                    let event = self.pipeline.monitor.unacknowledge(&id, withdrawal);
+                    let outcome = self.acknowledged(&id, event);
+                    self.outlet.acknowledged(reply, outcome);
+                }
             }
         }
         let mut left = POSTED_A_TURN;
@@ -91,20 +108,19 @@ impl Compute {
         placed
     }
 
-    fn acknowledge(&mut self, id: &str, reply: oneshot::Sender<Acknowledged>) {
-        let outcome = match self.pipeline.monitor.acknowledge(id, self.now()) {
-            Some(event) => {
-                let alert = event.alert.clone();
-                self.outlet.events(vec![event], self.now());
-                Acknowledged::Done(Box::new(alert))
-            }
-            None => match self.journal.alert(id) {
-                Ok(Some(alert)) if alert.state == AlertState::Cleared => Acknowledged::AlreadyCleared,
-                Ok(Some(alert)) => Acknowledged::Done(Box::new(alert)),
-                Ok(None) | Err(_) => Acknowledged::Unknown,
-            },
-        };
-        self.outlet.acknowledged(reply, outcome);
+    /// Publishes what an operator changed; without a change the answer is what the journal has.
+    fn acknowledged(&mut self, id: &str, event: Option<AlertEvent>) -> Acknowledged {
+        if let Some(mut event) = event {
+            self.state.name_evidence(&mut event.alert);
+            let alert = event.alert.clone();
+            self.outlet.events(vec![event], self.now());
+            return Acknowledged::Done(Box::new(alert));
+        }
+        match self.journal.alert(id) {
+            Ok(Some(alert)) if alert.state == AlertState::Cleared => Acknowledged::AlreadyCleared,
+            Ok(Some(alert)) => Acknowledged::Done(Box::new(alert)),
+            Ok(None) | Err(_) => Acknowledged::Unknown,
+        }
     }
 
     /// Takes in what the claims log has gained.
@@ -157,6 +173,8 @@ impl Compute {
         }
         let count = std::mem::take(&mut self.state.unnamed);
         self.state.complained = Some(Instant::now());
-        tracing::warn!(line = first.line, error = %first.error, count, "lines of the claims log are no claims");
+        let error = first.error.to_string();
+        let error = escape_undisplayable(&error);
+        tracing::warn!(line = first.line, %error, count, "lines of the claims log are no claims");
     }
 }

@@ -8,7 +8,6 @@ mod reload;
 mod status;
 mod supervisor;
 
-use std::net::TcpListener;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -81,8 +80,8 @@ impl Daemon {
 
     /// Runs until SIGTERM or SIGINT.
     pub async fn run(mut self, logging: logging::Handle) -> Result<()> {
-        let listen = self.config.api.listen;
-        let listener = TcpListener::bind(listen).with_context(|| format!("api.listen: cannot listen on {listen}"))?;
+        let listen = &self.config.api.listen;
+        let listener = api::Listener::bind(listen).with_context(|| format!("api.listen: cannot listen on {listen}"))?;
         let recorder = metric::recorder()?;
         let metrics = recorder.handle();
         // A second daemon in one process (a test) counts into the first one's recorder.
@@ -116,7 +115,10 @@ impl Daemon {
         let (commands, orders) = mpsc::channel(COMMANDS);
         let ready = Arc::new(AtomicBool::new(false));
         let state = api::State::new(feed, commands, self.journal.clone(), metrics.clone(), ready.clone());
-        let state = state.with_webhooks(notifier.clone());
+        let mut state = state.with_webhooks(notifier.clone());
+        if let Some(folder) = &self.config.record.folder {
+            state = state.with_evidence(folder);
+        }
 
         let source = &self.config.source;
         let log = self.config.claims.log.as_deref();
@@ -131,9 +133,8 @@ impl Daemon {
                 .path
                 .as_ref()
                 .map_or("memory".to_owned(), |p| p.display().to_string()),
-            "watching; API and page on {}://{}",
-            self.server.scheme(),
-            listener.local_addr()?,
+            "watching; API and page on {}",
+            listener.url(self.server.scheme())?,
         );
         let is_replay = source.kind == SourceKind::Replay;
         let halt = Arc::new(AtomicBool::new(false));

@@ -8,7 +8,7 @@ use tokio::sync::{Notify, oneshot};
 
 use crate::api::{Acknowledged, Feed, Snapshot};
 use crate::journal::Journal;
-use crate::monitor::AlertEvent;
+use crate::monitor::{Alert, AlertEvent, AlertEventKind};
 
 /// A disk that hangs may hold back what readers hear for this long, no longer.
 const PATIENCE: Duration = Duration::from_secs(2);
@@ -91,12 +91,16 @@ impl Outlet {
                 self.0.changed.notified().await;
                 continue;
             }
+            let is_raised = |event: &&AlertEvent| event.event == AlertEventKind::Raised;
+            let raised: Vec<Alert> = pending
+                .events
+                .iter()
+                .filter(is_raised)
+                .map(|e| e.alert.clone())
+                .collect();
             if !pending.events.is_empty() {
-                let numbered = feed.number(pending.events.clone(), pending.at);
-                if let Some(first) = numbered.first() {
-                    journal.number_above(first.seq - 1);
-                }
-                if let Err(error) = journal.record(&pending.events, pending.at, Timestamp::now()) {
+                let numbered = feed.number(pending.events, pending.at);
+                if let Err(error) = journal.record_numbered(&numbered, Timestamp::now()) {
                     tracing::error!(%error, "alert events are lost to the journal");
                 }
                 if tokio::time::timeout(PATIENCE, journal.settled()).await.is_err() {
@@ -109,6 +113,10 @@ impl Outlet {
                 let _ = reply.send(outcome);
             }
             if let Some(snapshot) = pending.snapshot {
+                if !raised.is_empty() {
+                    let (feed, snapshot) = (feed.clone(), snapshot.clone());
+                    tokio::task::spawn_blocking(move || feed.illustrate(&raised, &snapshot));
+                }
                 feed.publish(snapshot);
             }
         }

@@ -1,14 +1,17 @@
 //! What the compute thread remembers from frame to frame, and what it tells of it.
 
 use std::collections::{BTreeMap, VecDeque};
+use std::path::Path;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use jiff::Timestamp;
 use metrics::{counter, gauge};
 
 use crate::api::{FrameCounts, Latency, Snapshot, SourceState};
+use crate::claim::escape_undisplayable;
 use crate::metric;
-use crate::monitor::{AlertEvent, AlertEventKind, AlertKind, AlertState, PositionStatus, Report};
+use crate::monitor::{Alert, AlertEvent, AlertEventKind, AlertKind, AlertState, PositionStatus, Report};
 
 /// Frames over which rate and latency are told.
 const WINDOW: usize = 128;
@@ -32,6 +35,8 @@ pub(super) struct State {
     pub complained: Option<Instant>,
     pub unnamed: u64,
     pub last: Option<Snapshot>,
+    /// Files that hold the evidence of the alerts that are not cleared, by id.
+    pub evidence: BTreeMap<String, Arc<Path>>,
 }
 
 impl State {
@@ -51,6 +56,7 @@ impl State {
             complained: None,
             unnamed: 0,
             last: None,
+            evidence: BTreeMap::new(),
         }
     }
 
@@ -62,11 +68,19 @@ impl State {
         push(&mut self.latencies, time);
     }
 
+    /// Makes an alert name the file of its evidence, in place of the ring's segment, which is deleted in time.
+    pub fn name_evidence(&self, alert: &mut Alert) {
+        if let Some(file) = self.evidence.get(&alert.id) {
+            alert.source.file = Some(file.display().to_string());
+        }
+    }
+
     /// Keeps count of what is open, and logs it.
     pub fn note(&mut self, event: &AlertEvent) {
         let alert = &event.alert;
         if alert.state == AlertState::Cleared {
             self.open.remove(&alert.id);
+            self.evidence.remove(&alert.id);
         } else {
             self.open.insert(alert.id.clone(), alert.kind);
         }
@@ -78,7 +92,7 @@ impl State {
             kind = word(alert.kind),
             severity = word(alert.severity),
             id = alert.id,
-            user = alert.user,
+            user = alert.user.as_deref().map(escape_undisplayable).as_deref(),
             x_m = alert.x_m,
             y_m = alert.y_m,
             "alert"

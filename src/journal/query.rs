@@ -1,3 +1,5 @@
+//! SQL reads of one store: alerts, events, deliveries, endpoints.
+
 use jiff::Timestamp;
 use rusqlite::types::Value;
 use rusqlite::{OptionalExtension, Row, params};
@@ -223,6 +225,6 @@ fn recorded(row: &Row) -> Result<Option<Recorded>, rusqlite::Error> {
 }
 
 /// Microseconds since 1970, held to what a calendar can show: a damaged file must not be a panic.
-fn time(us: i64) -> Timestamp {
+pub(super) fn time(us: i64) -> Timestamp {
     Timestamp::from_microsecond(us).unwrap_or(if us < 0 { Timestamp::MIN } else { Timestamp::MAX })
 }

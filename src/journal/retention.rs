@@ -1,3 +1,5 @@
+//! Removal of old cleared alerts, by age and by size.
+
 use jiff::{SignedDuration, Timestamp};
 use rusqlite::params;
 
@@ -50,6 +52,7 @@ impl Store {
             .saturating_sub(retention.keep)
             .unwrap_or(Timestamp::MIN)
             .as_microsecond();
+        self.trim_audit(cutoff, self.db.path().is_none_or(str::is_empty))?;
         let mut removed = Removed {
             deliveries: self.give_up_unwanted(cutoff, now)?,
             ..Removed::default()

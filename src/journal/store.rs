@@ -1,10 +1,12 @@
+//! SQL writes of one store: a batch of changes in one transaction.
+
 use std::path::Path;
 use std::sync::Arc;
 
 use jiff::Timestamp;
 use rusqlite::{Connection, TransactionBehavior, params};
 
-use super::{Attempt, Error, Outcome, Subscription, schema};
+use super::{Attempt, AuditRecord, Error, Outcome, Subscription, audit, schema};
 use crate::monitor::{AlertEvent, AlertEventKind};
 
 /// One change of the journal. Applying it must never fail for what it holds, only for the disk: a write
@@ -35,6 +37,7 @@ pub(super) enum Write {
     Maintain {
         now: Timestamp,
     },
+    Audit(Arc<AuditRecord>),
 }
 
 impl Write {
@@ -43,6 +46,7 @@ impl Write {
         match self {
             Self::Event { now, .. } | Self::Maintain { now } => Some(*now),
             Self::Attempt(Attempt { at, .. }) | Self::Disable { at, .. } | Self::Replay { at, .. } => Some(*at),
+            Self::Audit(record) => Some(record.at),
             Self::Enable { .. } => None,
         }
     }
@@ -110,6 +114,7 @@ impl Store {
                         params![endpoint, seq, at.as_microsecond()],
                     )?;
                 }
+                Write::Audit(record) => audit::put(&tx, record)?,
                 Write::Maintain { .. } => {}
             }
         }

@@ -4,8 +4,10 @@ use jiff::Timestamp;
 use serde_json::Value;
 
 use crate::claims::seconds;
-use crate::monitor::alert::SAME_PLACE_M;
-use crate::monitor::alert::{Alert, AlertEvent, AlertEventKind, AlertKind, AlertSource, AlertState, Severity};
+use crate::monitor::alert::{
+    Acknowledgement, Alert, AlertEvent, AlertEventKind, AlertKind, AlertSource, AlertState, SAME_PLACE_M, Severity,
+    Withdrawal,
+};
 
 /// What an alert is about: while one is open for a cause, the cause raises no other.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -213,6 +215,7 @@ impl AlertLifecycle {
                 frame,
                 file: self.source_file.clone(),
             },
+            acknowledgement: None,
         };
         finding.write_to(&mut alert);
         note_recurrences(&mut alert, recurrences);
@@ -295,15 +298,34 @@ impl AlertLifecycle {
         }
     }
 
-    pub fn acknowledge(&mut self, id: &str) -> Option<AlertEvent> {
-        let open = self.open.values_mut().find(|o| o.alert.id == id)?;
-        if open.alert.state != AlertState::Open {
+    /// `None` when no open alert has this id, or it is acknowledged already and there is nothing to add.
+    pub fn acknowledge(&mut self, id: &str, acknowledgement: Acknowledgement) -> Option<AlertEvent> {
+        let alert = &mut self.open.values_mut().find(|o| o.alert.id == id)?.alert;
+        if alert.state == AlertState::Acknowledged && acknowledgement.note.is_none() {
             return None;
         }
-        open.alert.state = AlertState::Acknowledged;
+        alert.state = AlertState::Acknowledged;
+        alert.acknowledgement = Some(acknowledgement);
         Some(AlertEvent {
             event: AlertEventKind::Acknowledged,
-            alert: open.alert.clone(),
+            alert: alert.clone(),
+        })
+    }
+
+    /// `None` when no acknowledged alert has this id.
+    pub fn unacknowledge(&mut self, id: &str, withdrawal: Withdrawal) -> Option<AlertEvent> {
+        let alert = &mut self.open.values_mut().find(|o| o.alert.id == id)?.alert;
+        if alert.state != AlertState::Acknowledged {
+            return None;
+        }
+        alert.state = AlertState::Open;
+        // An alert that was acknowledged before acknowledgements were kept has none.
+        if let Some(acknowledgement) = &mut alert.acknowledgement {
+            acknowledgement.withdrawn = Some(withdrawal);
+        }
+        Some(AlertEvent {
+            event: AlertEventKind::Unacknowledged,
+            alert: alert.clone(),
         })
     }
 

@@ -16,7 +16,9 @@ mod stats;
 mod summary;
 mod track;
 
-pub use alert::{Alert, AlertEvent, AlertEventKind, AlertKind, AlertSource, AlertState, Severity};
+pub use alert::{
+    Acknowledgement, Alert, AlertEvent, AlertEventKind, AlertKind, AlertSource, AlertState, Severity, Withdrawal,
+};
 pub use config::{Config, ConfigError, Source};
 pub use input::sensor_health::BLINDING_SHARE;
 pub use monitor::Monitor;

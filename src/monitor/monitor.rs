@@ -6,7 +6,7 @@ use jiff::Timestamp;
 use nalgebra::{Matrix2, Vector2};
 
 use crate::claims::{Beam, ClaimState, Standing, Store, seconds};
-use crate::monitor::alert::{Alert, AlertEvent, AlertKind};
+use crate::monitor::alert::{Acknowledgement, Alert, AlertEvent, AlertKind, Withdrawal};
 use crate::monitor::alert_lifecycle::{AlertLifecycle, Cause, Finding};
 use crate::monitor::config::{Config, Source};
 use crate::monitor::input::claim_state::{ActiveClaim, CLAIM_LIFE_S, Reach, User};
@@ -180,9 +180,15 @@ impl Monitor {
         self.restore(open);
     }
 
-    /// An operator has taken note. `None` when no open alert has this id, or it is acknowledged already.
-    pub fn acknowledge(&mut self, id: &str, _at: Timestamp) -> Option<AlertEvent> {
-        self.alerts.acknowledge(id)
+    /// An operator has taken note. `None` when no open alert has this id, or it is acknowledged already and the new
+    /// acknowledgement has no note.
+    pub fn acknowledge(&mut self, id: &str, acknowledgement: Acknowledgement) -> Option<AlertEvent> {
+        self.alerts.acknowledge(id, acknowledgement)
+    }
+
+    /// An operator has undone an acknowledgement. `None` when no acknowledged alert has this id.
+    pub fn unacknowledge(&mut self, id: &str, withdrawal: Withdrawal) -> Option<AlertEvent> {
+        self.alerts.unacknowledge(id, withdrawal)
     }
 
     /// Takes over the alerts that were open when the last run ended: they go on, or clear when their cause is gone.

@@ -1,3 +1,5 @@
+//! One HTTP request to a receiver and how its answer is classified.
+
 use std::error::Error as _;
 use std::time::Duration;
 

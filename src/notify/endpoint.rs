@@ -1,3 +1,5 @@
+//! Validates a `[[webhook]]` table and reads its secrets.
+
 use std::path::PathBuf;
 use std::time::Duration;
 

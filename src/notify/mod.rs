@@ -1,4 +1,4 @@
-//! Floor 4: signed webhooks, at least once, in order per alert, from a durable outbox.
+//! Layer 4: signed webhooks, at least once, in order per alert, from a durable outbox.
 //!
 //! The journal writes an outbox row with each alert event, in the same transaction; [`spawn`]'s worker sends
 //! what waits there until the receiver has confirmed it. docs/webhooks.md is the receiver's side of it.

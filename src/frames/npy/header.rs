@@ -31,6 +31,11 @@ impl Header {
         self.ny * self.nx * self.dtype.size()
     }
 
+    /// Bytes of a file that [`super::Writer`] wrote with these frames.
+    pub fn file_bytes(&self) -> u64 {
+        self.data_start + self.frames * self.frame_bytes() as u64
+    }
+
     pub(super) fn read(path: &Path, from: &mut impl Read) -> Result<Self, Error> {
         let path = || path.to_owned();
         let not_npy = |e: std::io::Error| match e.kind() {
@@ -86,7 +91,7 @@ impl Header {
 
     /// The header's bytes for a given number of frames. Their length does not depend on that number, so
     /// that the count can be patched in place.
-    pub(super) fn bytes(&self) -> Vec<u8> {
+    pub fn bytes(&self) -> Vec<u8> {
         let dict = format!(
             "{{'descr': '{}', 'fortran_order': False, 'shape': ({}, {}, {}), }}",
             self.dtype.descr(),

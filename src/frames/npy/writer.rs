@@ -19,8 +19,13 @@ pub struct Writer {
 
 impl Writer {
     /// Creates (or replaces) a frame file for frames of shape (Ny, Nx).
-    pub fn create(path: impl AsRef<Path>, (ny, nx): (usize, usize)) -> Result<Self, Error> {
-        let path = path.as_ref().to_owned();
+    pub fn create(path: impl AsRef<Path>, shape: (usize, usize)) -> Result<Self, Error> {
+        Self::create_with(File::create(&path), path.as_ref(), shape)
+    }
+
+    /// Writes to a file just opened, empty, at `path`.
+    pub fn create_with(file: std::io::Result<File>, path: &Path, (ny, nx): (usize, usize)) -> Result<Self, Error> {
+        let path = path.to_owned();
         let header = Header {
             dtype: Dtype::JOULES,
             frames: 0,
@@ -28,7 +33,7 @@ impl Writer {
             nx,
             data_start: WRITTEN_HEADER as u64,
         };
-        let created = File::create(&path).and_then(|mut file| {
+        let created = file.and_then(|mut file| {
             file.write_all(&header.bytes())?;
             Ok(file)
         });

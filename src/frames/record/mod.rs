@@ -3,16 +3,19 @@
 //! so that the ring does not take the journal's room.
 
 mod config;
+mod evidence;
 mod player;
 mod ring;
 mod standing;
 mod tape;
 
 pub use config::Config;
+pub use evidence::{Evidence, EvidenceFrame, file_name as evidence_file_name, frame_at};
 pub(super) use player::Player;
 pub(super) use ring::recordings;
 pub(super) use tape::index_of;
 
+use std::os::unix::fs::DirBuilderExt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -28,6 +31,8 @@ use crate::metric;
 use standing::Standing;
 use tape::{Entry, Seen, TapeReader, TapeWriter};
 
+/// Folder for evidence, within the recorder's own.
+pub const EVIDENCE: &str = "evidence";
 /// Evidence that may grow at a time; an alert beyond that lies within the time of another's.
 const MOST_CLIPS: usize = 8;
 /// Frames that may wait for the disk.
@@ -44,13 +49,17 @@ pub struct Recorder {
     segment_bytes: u64,
     next_number: u64,
     current: Option<Segment>,
-    /// The clerk could not write the latest frame it was given.
+    /// How long evidence goes on after its alert.
+    after: SignedDuration,
+    /// Evidence that is still growing: the alert's time and its file.
+    clips: Vec<(Timestamp, Arc<Path>)>,
+    /// The recorder thread could not write the latest frame it was given.
     failing: Arc<AtomicBool>,
     queue: Option<SyncSender<Order>>,
     thread: Option<JoinHandle<()>>,
 }
 
-/// The recorder's thread has it.
+/// A frame that the recorder thread has taken.
 #[derive(Clone, Debug)]
 pub struct Taken {
     /// The file that holds it; `None` while the disk fails. Claims stand in the next file's head all the same.
@@ -74,7 +83,7 @@ enum Order {
         seen: Seen,
     },
     Evidence {
-        name: String,
+        path: Arc<Path>,
         time: Timestamp,
     },
 }
@@ -90,12 +99,18 @@ impl Recorder {
             let path = path.to_owned();
             move |source| Error::Recording { path, source }
         };
-        let evidence = folder.join("evidence");
-        std::fs::create_dir_all(&evidence).map_err(failed(&evidence))?;
+        let evidence = folder.join(EVIDENCE);
+        // Folders that exist keep the mode that their owner gave them.
+        let mut builder = std::fs::DirBuilder::new();
+        builder
+            .recursive(true)
+            .mode(0o700)
+            .create(&evidence)
+            .map_err(failed(&evidence))?;
         let next_number = ring::next_number(&folder).map_err(failed(&folder))?;
         let (queue, orders) = sync_channel(QUEUE);
         let failing = Arc::new(AtomicBool::new(false));
-        let clerk = Clerk {
+        let worker = RecorderThread {
             folder: folder.clone(),
             evidence,
             config: config.clone(),
@@ -107,7 +122,7 @@ impl Recorder {
         };
         let thread = std::thread::Builder::new()
             .name("recorder".into())
-            .spawn(move || clerk.run(&orders))
+            .spawn(move || worker.run(&orders))
             .map_err(failed(&folder))?;
         Ok(Some(Self {
             segment: seconds(config.segment_s),
@@ -115,6 +130,8 @@ impl Recorder {
             folder,
             next_number,
             current: None,
+            after: seconds(config.after_s),
+            clips: Vec::new(),
             failing,
             queue: Some(queue),
             thread: Some(thread),
@@ -140,11 +157,28 @@ impl Recorder {
         self.write(None, 0, Seen { entry, pixels: None })
     }
 
-    /// Keeps what lies around an alert, under its id.
-    pub fn evidence(&mut self, alert: &str, time: Timestamp) {
-        // An id of ours needs no change; nothing else may name a path.
-        let name = alert.replace(|c: char| !(c.is_ascii_alphanumeric() || c == '-' || c == '_'), "_");
-        self.order(Order::Evidence { name, time });
+    /// Keeps what lies around an alert, under its id. Gives the file that holds it: its own or, where as many are being
+    /// written as may be at a time, that of the alert before it, which covers its time too. `None` while the disk fails.
+    pub fn evidence(&mut self, alert: &str, time: Timestamp) -> Option<Arc<Path>> {
+        if self.failing.load(Ordering::Relaxed) {
+            return None;
+        }
+        let after = self.after;
+        self.clips
+            .retain(|(began, _)| time.duration_since(*began).abs() <= after);
+        if self.clips.len() >= MOST_CLIPS {
+            return self.clips.last().map(|(_, path)| path.clone());
+        }
+        let path: Arc<Path> = self.folder.join(EVIDENCE).join(evidence_file_name(alert)).into();
+        let path_of_order = path.clone();
+        if !self.order(Order::Evidence {
+            path: path_of_order,
+            time,
+        }) {
+            return None;
+        }
+        self.clips.push((time, path.clone()));
+        Some(path)
     }
 
     fn write(&mut self, shape: Option<(usize, usize)>, bytes: u64, seen: Seen) -> Option<Taken> {
@@ -203,7 +237,7 @@ impl Drop for Recorder {
 }
 
 /// The recorder's thread.
-struct Clerk {
+struct RecorderThread {
     folder: PathBuf,
     evidence: PathBuf,
     config: Config,
@@ -221,13 +255,13 @@ struct Clip {
     until: Timestamp,
 }
 
-impl Clerk {
+impl RecorderThread {
     fn run(mut self, orders: &Receiver<Order>) {
         for order in orders {
             let was_failing = self.failing.load(Ordering::Relaxed);
             let done = match order {
                 Order::Write { path, shape, seen } => self.write(path, shape, &seen),
-                Order::Evidence { name, time } => self.keep(&name, time),
+                Order::Evidence { path, time } => self.keep(&path, time),
             };
             let Err(error) = done else { continue };
             metrics::counter!(metric::RECORDER_ERRORS).increment(1);
@@ -295,15 +329,7 @@ impl Clerk {
     }
 
     /// Starts a clip with what the ring holds of the time before the alert.
-    fn keep(&mut self, name: &str, time: Timestamp) -> Result<(), Error> {
-        if self.clips.len() >= MOST_CLIPS {
-            tracing::warn!(
-                alert = name,
-                "no evidence of its own: {MOST_CLIPS} alerts are being recorded already"
-            );
-            return Ok(());
-        }
-        let path = self.evidence.join(format!("{name}.npy"));
+    fn keep(&mut self, path: &Path, time: Timestamp) -> Result<(), Error> {
         let from = time
             .saturating_sub(seconds(self.config.before_s))
             .unwrap_or(Timestamp::MIN);
@@ -333,7 +359,7 @@ impl Clerk {
                 let shape = seen.pixels.as_ref().map_or((1, 1), ndarray::Array2::dim);
                 let writer = match &mut clip {
                     Some(writer) => writer,
-                    None => clip.insert(TapeWriter::create(&path, shape, standing.claims())?),
+                    None => clip.insert(TapeWriter::create(path, shape, standing.claims())?),
                 };
                 match writer.push(&seen) {
                     // A camera whose array changed its shape meanwhile: the evidence ends where it changed.
@@ -344,7 +370,7 @@ impl Clerk {
         }
         if let Some(tape) = clip {
             self.clips.push(Clip { tape, until });
-            self.trim(&self.evidence, self.config.evidence_limit_mb, &path);
+            self.trim(&self.evidence, self.config.evidence_limit_mb, path);
         }
         Ok(())
     }

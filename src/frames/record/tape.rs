@@ -3,6 +3,7 @@
 
 use std::fs::File;
 use std::io::{BufRead, BufReader, Write};
+use std::os::unix::fs::{OpenOptionsExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 
 use jiff::Timestamp;
@@ -105,6 +106,15 @@ pub(in crate::frames) fn index_of(npy: &Path) -> PathBuf {
     npy.with_extension("frames.ndjson")
 }
 
+/// Creates or empties a file that only its owner may read, whatever the umask: recordings show where every user was.
+fn create_private(path: &Path) -> std::io::Result<File> {
+    let mut options = File::options();
+    let file = options.write(true).create(true).truncate(true).mode(0o600).open(path)?;
+    // The mode above holds for a new file only. A file system without modes is no reason not to record.
+    let _ = file.set_permissions(std::fs::Permissions::from_mode(0o600));
+    Ok(file)
+}
+
 /// Writes one file. A frame's pixels go out before its line: what the index names is there.
 #[derive(Debug)]
 pub(super) struct TapeWriter {
@@ -123,8 +133,8 @@ impl TapeWriter {
     }
 
     fn create_both(path: &Path, shape: (usize, usize), claims: Vec<Claim>) -> Result<Self, Error> {
-        let frames = npy::Writer::create(path, shape)?;
-        let index = File::create(index_of(path)).map_err(|source| Error::Recording {
+        let frames = npy::Writer::create_with(create_private(path), path, shape)?;
+        let index = create_private(&index_of(path)).map_err(|source| Error::Recording {
             path: index_of(path),
             source,
         })?;
@@ -203,6 +213,11 @@ impl TapeReader {
                 source,
             }),
         }
+    }
+
+    /// The next entry of the index, without its pixels. Not to be mixed with [`TapeReader::next`].
+    pub fn entry(&mut self) -> Result<Option<Entry>, Error> {
+        self.line()
     }
 
     /// The next thing that was seen.

@@ -79,10 +79,10 @@ impl Default for SecondMomentScore {
 
 impl SecondMomentScore {
     /// What a frame says, its covariance times `inflation`.
-    pub fn of(frame: &estimate::SecondMomentScore, inflation: f64) -> Self {
-        let s = frame.information;
+    pub fn of(bend: &estimate::SecondMomentScore, inflation: f64) -> Self {
+        let s = bend.information;
         Self {
-            score: Vector3::from(frame.score) / inflation,
+            score: Vector3::from(bend.score) / inflation,
             information: Matrix3::from_fn(|r, c| 0.5 * (s[r][c] + s[c][r])) / inflation,
         }
     }
