@@ -8,7 +8,7 @@ use axum::response::Response;
 use serde::Deserialize;
 use tokio::sync::oneshot;
 
-use super::audit::Caller;
+use super::client::Caller;
 use super::extract::Path;
 use super::problem::Problem;
 use super::state::{Acknowledged, Command, State};

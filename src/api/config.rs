@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-use super::client::TrustedProxies;
+use super::client::{NoNetwork, TrustedProxies};
 use super::listener::Listen;
 
 /// `[api]`.
@@ -52,8 +52,8 @@ pub enum ConfigError {
         "api.hsts_max_age_s: expected 0 without api.tls_cert_file, since browsers take it over TLS only, found {found}"
     )]
     HstsWithoutTls { found: u64 },
-    #[error("api.trusted_proxies: expected networks such as \"10.0.0.0/8\", addresses or \"unix\", found {found:?}")]
-    NoNetwork { found: String },
+    #[error(transparent)]
+    NoNetwork(#[from] NoNetwork),
     #[error("api.{missing}: expected a file, since api.{given} is set; found nothing")]
     HalfTls { given: &'static str, missing: &'static str },
     #[error("api.{field}: expected {expected}, found {found}")]
@@ -106,7 +106,7 @@ impl Config {
                 found: self.hsts_max_age_s,
             });
         }
-        TrustedProxies::new(self)?;
+        TrustedProxies::new(&self.trusted_proxies)?;
         match (&self.tls_cert_file, &self.tls_key_file) {
             (Some(_), None) => {
                 return Err(ConfigError::HalfTls {

@@ -77,7 +77,7 @@ impl Server {
     pub fn new(config: Config) -> Result<Self, Error> {
         config.validate()?;
         let tokens = Arc::new(Tokens::load(&config)?);
-        let proxies = Arc::new(TrustedProxies::new(&config)?);
+        let proxies = Arc::new(TrustedProxies::new(&config.trusted_proxies).map_err(ConfigError::from)?);
         let tls = match (&config.tls_cert_file, &config.tls_key_file) {
             (Some(cert), Some(key)) => Some(Tls::load(cert.clone(), key.clone())?),
             _ => None,

@@ -9,7 +9,7 @@ use tokio::sync::{mpsc, oneshot, watch};
 
 use super::audit::Audit;
 use super::feed::Feed;
-use super::frame::Pictures;
+use super::picture_cache::PictureCache;
 use crate::claim::Claim;
 use crate::frames::record;
 use crate::journal::Journal;
@@ -28,7 +28,7 @@ pub struct State {
     pub ready: Arc<AtomicBool>,
     /// Webhook status and replay; none where no webhook is spoken of.
     pub(super) notifier: Option<Notifier>,
-    pub(super) pictures: Arc<Pictures>,
+    pub(super) pictures: Arc<PictureCache>,
     pub(super) audit: Audit,
     /// The recorder's folder for evidence, where frames are recorded.
     pub(super) evidence: Option<Arc<Path>>,
