@@ -1,11 +1,11 @@
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn, Vector2};
 
-use super::Monitor;
-use super::habits::median;
 use crate::estimate::Flags;
-use crate::monitor::detection::snr;
-use crate::monitor::tracks::Track;
-use crate::monitor::users::Asserted;
+use crate::monitor::input::claim_state::ActiveClaim;
+use crate::monitor::input::claim_timing::median;
+use crate::monitor::monitor::Monitor;
+use crate::monitor::track::detection::snr;
+use crate::monitor::track::tracker::Track;
 
 /// Spot widths σ within which two spots overlap by a tenth.
 const OVERLAP: f64 = 3.0;
@@ -17,36 +17,40 @@ const MOST_NEIGHBOURS: usize = 4;
 
 impl Monitor {
     /// How far apart two beams disturb each other, m.
-    pub(super) fn overlap_m(&self) -> f64 {
+    pub fn overlap_m(&self) -> f64 {
         OVERLAP * self.spot_m()
     }
 
     /// How far from its own place the beam of `track` may be taken for, m: where another user's beam overlaps it and has melted, was
     /// missed, or is fitted by a fit that doubts itself, which of them is where is a guess. Nothing where it stands alone.
-    pub(super) fn confused_m(&self, track: &Track, answers: &[Option<u64>]) -> f64 {
+    pub fn confusion_m(&self, track: &Track, association: &[Option<u64>]) -> f64 {
         let doubtful = |t: &Track| t.detection.flags.intersects(Flags::UNRESOLVED | Flags::NON_GAUSSIAN);
         let (here, overlap) = (track.motion.position(), self.overlap_m());
         let others = self.tracks.all.iter().filter(|t| t.id != track.id);
         others
             .filter_map(|t| {
                 let away = (t.motion.position() - here).norm();
-                let together = t.merged == Some(track.id) || track.merged == Some(t.id);
+                let together = t.merged_into == Some(track.id) || track.merged_into == Some(t.id);
                 let unsure = !t.hit || !track.hit || doubtful(t) || doubtful(track);
                 let may_be = together || (away < overlap && unsure);
-                (may_be && answers.contains(&Some(t.id))).then_some(away)
+                (may_be && association.contains(&Some(t.id))).then_some(away)
             })
             .fold(0.0, f64::max)
     }
 
     /// Notes which unanswered claims put a beam where it would not be told apart from those that are seen.
-    pub(super) fn note_hidden(&self, asserted: &mut [Asserted], answers: &[Option<u64>]) {
-        for (a, _) in asserted.iter_mut().zip(answers).filter(|(_, answer)| answer.is_none()) {
-            a.hidden = self.is_hidden(a);
+    pub fn mark_unresolvable(&self, active: &mut [ActiveClaim], association: &[Option<u64>]) {
+        for (a, _) in active
+            .iter_mut()
+            .zip(association)
+            .filter(|(_, answer)| answer.is_none())
+        {
+            a.is_unresolvable = self.is_unresolvable(a);
         }
     }
 
     /// Those that are seen beside it can take its light by moving and by brightening, up to what is left over.
-    fn is_hidden(&self, a: &Asserted) -> bool {
+    fn is_unresolvable(&self, a: &ActiveClaim) -> bool {
         let spot_m = self.spot_m();
         let seen = || self.tracks.all.iter().filter(|t| t.hit).map(|t| &t.detection);
         let mut near: Vec<Vector2<f64>> = seen().map(|d| (d.position - a.position) / spot_m).collect();
@@ -56,7 +60,7 @@ impl Monitor {
         let Some(neighbours) = Neighbours::new(&near) else {
             return false;
         };
-        let past = self.users.get(&a.claim.user).and_then(|u| u.blend.past_energy());
+        let past = self.users.get(&a.claim.user).and_then(|u| u.co_location.past_energy());
         let usual = past
             .map(|(ln, _)| ln.exp())
             .or_else(|| median(seen().map(|d| d.energy_j)));

@@ -1,22 +1,22 @@
 use jiff::Timestamp;
 use nalgebra::{Matrix2, Vector2};
 
-use super::blend::Blend;
-use super::clock::ClockEvidence;
-use super::pose::Witness;
-use super::residuals::Residuals;
 use crate::claims::{Claim, ClaimState, Standing, seconds};
+use crate::monitor::input::clock_offset::ClockOffset;
+use crate::monitor::pose::displacement::Witness;
+use crate::monitor::stats::claim_consistency::ClaimConsistency;
+use crate::monitor::stats::co_location::CoLocationTest;
 
 /// A user may leave their last claim by this much a second without a new one, beyond the pace they claimed, m/s.
 const FREE_SPEED_M_S: f64 = 3.0;
 /// Paces above this are not believed when they widen what is tolerated, m/s.
 const FASTEST_M_S: f64 = 20.0;
 /// A claim older than this answers for no beam that is not already known to be the user's, s.
-pub(super) const CLAIM_LIFE_S: f64 = 60.0;
+pub const CLAIM_LIFE_S: f64 = 60.0;
 
 /// A user's claim as it bears on the frame at hand.
 #[derive(Clone, Debug)]
-pub(super) struct Asserted {
+pub struct ActiveClaim {
     pub claim: Claim,
     /// Where the claim puts the beam; our own pose error is added once the frame has told it.
     pub position: Vector2<f64>,
@@ -32,12 +32,12 @@ pub(super) struct Asserted {
     pub expected: bool,
     pub ended: bool,
     /// No beam answers, and one at the claimed place would not be told apart from its neighbours.
-    pub hidden: bool,
+    pub is_unresolvable: bool,
     pub period_s: Option<f64>,
     pub came: Timestamp,
 }
 
-impl Asserted {
+impl ActiveClaim {
     /// `largest_sigma_m` bounds what a claim may say of its own error: a lie there must not hide a lie about the place.
     /// The log's clock is `ahead_s` ahead of ours.
     pub fn new(standing: &Standing, now: Timestamp, default_sigma_m: f64, largest_sigma_m: f64, ahead_s: f64) -> Self {
@@ -53,7 +53,7 @@ impl Asserted {
             age_s,
             slack_m: (FREE_SPEED_M_S + standing.pace_m_s.min(FASTEST_M_S)) * age_s,
             expected: false,
-            hidden: false,
+            is_unresolvable: false,
             ended: claim.state == ClaimState::Ended,
             period_s: standing.period_s,
             came: standing.came,
@@ -84,11 +84,11 @@ impl Asserted {
 
 /// What the monitor remembers of a user.
 #[derive(Clone, Debug, Default)]
-pub(super) struct User {
+pub struct User {
     /// The beam that answered last.
     pub track: Option<u64>,
-    pub residuals: Residuals,
-    pub clock: ClockEvidence,
+    pub residuals: ClaimConsistency,
+    pub clock: ClockOffset,
     /// First frame since which no beam answers.
     pub unanswered_since: Option<Timestamp>,
     /// ln likelihood ratio of "absent" to "missed by chance".
@@ -100,7 +100,7 @@ pub(super) struct User {
     /// A beam elsewhere took the user's place when they vanished.
     pub displaced: bool,
     /// Whether the beam is two.
-    pub blend: Blend,
+    pub co_location: CoLocationTest,
     /// Since when there are signs that it is: the present is not taken for the past.
     pub suspected_since: Option<Timestamp>,
     /// When an emitter that had its own alert was last beside the beam.

@@ -1,7 +1,7 @@
 use nalgebra::{Matrix2, Vector2};
 
-use super::bends::Moments;
 use crate::estimate::{Estimate, Flags};
+use crate::monitor::stats::second_moment::SecondMomentScore;
 use crate::optics::Camera;
 
 /// What a fit's covariance leaves out (calibration, pixel gains), m.
@@ -9,18 +9,18 @@ const POSITION_FLOOR_M: f64 = 0.02;
 
 /// One frame's emitter as the tracks take it.
 #[derive(Clone, Debug)]
-pub(super) struct Detection {
+pub struct Detection {
     pub position: Vector2<f64>,
     pub cov: Matrix2<f64>,
     pub energy_j: f64,
     pub flags: Flags,
-    pub moments: Moments,
+    pub moments: SecondMomentScore,
     /// Signal-to-noise ratio, less what the frame's misfit takes from it.
     pub snr: f64,
     /// Distance within which a second emitter of like energy cannot be told apart, m.
     pub resolution_m: f64,
     /// How probable a spurious detection is here in a frame.
-    pub ghost: f64,
+    pub clutter_probability: f64,
 }
 
 impl Detection {
@@ -51,15 +51,15 @@ impl Detection {
                     cov,
                     energy_j: e.energy_j,
                     flags: e.flags,
-                    moments: Moments::of(&e.second_moment, inflation),
+                    moments: SecondMomentScore::of(&e.second_moment, inflation),
                     snr: snr(camera, e.energy_j) / inflation.sqrt(),
                     resolution_m: resolution_m(camera, snr(camera, e.energy_j)),
-                    ghost: 0.0,
+                    clutter_probability: 0.0,
                 }
             })
             .collect();
         for i in 0..detections.len() {
-            detections[i].ghost = ghost(&detections, i, camera);
+            detections[i].clutter_probability = clutter_probability(&detections, i, camera);
         }
         detections
     }
@@ -86,7 +86,7 @@ impl Detection {
             position,
             cov: Matrix2::identity() * variance,
             energy_j,
-            moments: Moments::of_spread(spread.sum(), snr),
+            moments: SecondMomentScore::of_spread(spread.sum(), snr),
             snr,
             ..self.clone()
         }
@@ -99,7 +99,7 @@ impl Detection {
 }
 
 /// Signal-to-noise ratio of the matched filter for a spot wider than a pixel: A·pitch/(2√π·σ·σ_n).
-pub(super) fn snr(camera: &Camera, energy_j: f64) -> f64 {
+pub fn snr(camera: &Camera, energy_j: f64) -> f64 {
     let pitch = camera.x.pitch_m.max(camera.y.pitch_m);
     let spread = 2.0 * std::f64::consts::PI.sqrt() * camera.spot_sigma_m;
     energy_j.max(0.0) * pitch / (spread * camera.noise_std_j)
@@ -117,7 +117,7 @@ fn resolution_m(camera: &Camera, snr: f64) -> f64 {
 /// How probable it is that detection `i` is spurious: rare on its own, common where one spot may have been split in two.
 /// Even there it is no excuse for silence: nine detections in ten frames outweigh it, so that nobody gains more than a second
 /// by making the fit doubtful.
-fn ghost(detections: &[Detection], i: usize, camera: &Camera) -> f64 {
+fn clutter_probability(detections: &[Detection], i: usize, camera: &Camera) -> f64 {
     const ALONE: f64 = 1e-3;
     const NEIGHBOURED: f64 = 1e-2;
     const POORLY_FITTED: f64 = 0.03;

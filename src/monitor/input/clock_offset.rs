@@ -1,11 +1,11 @@
 use nalgebra::Vector2;
 
-use super::residuals::COMMON_SHARE;
+use crate::monitor::stats::claim_consistency::COMMON_SHARE;
 
 /// What one user's claims tell of the log's clock: the claim of a mover stamped τ too late lies τ·v behind the beam.
 /// Sums of a weighted regression of offset on velocity, older claims counting less.
 #[derive(Clone, Copy, Debug, Default)]
-pub(super) struct ClockEvidence {
+pub struct ClockOffset {
     information: f64,
     offset: f64,
     claims: f64,
@@ -17,7 +17,7 @@ const MEMORY: f64 = 64.0;
 const FEWEST: usize = 3;
 const CLEAR_S: f64 = 0.25;
 
-impl ClockEvidence {
+impl ClockOffset {
     /// Takes a claim of variance `variance` per axis that lies `offset` from where its beam, at `velocity`, was.
     pub fn push(&mut self, offset: Vector2<f64>, velocity: Vector2<f64>, variance: f64) {
         let keep = 1.0 - 1.0 / MEMORY;
@@ -37,8 +37,8 @@ impl ClockEvidence {
 
 /// Seconds by which the log's clock is ahead of ours: the median over those who move, within `limit_s`. Fewer than half of
 /// the movers cannot shift it, and whoever does gains `limit_s` of each user's own way and no more.
-pub(super) fn ahead_s<'a>(users: impl Iterator<Item = &'a ClockEvidence>, limit_s: f64) -> f64 {
-    let mut told: Vec<f64> = users.filter_map(ClockEvidence::ahead_s).collect();
+pub fn ahead_s<'a>(users: impl Iterator<Item = &'a ClockOffset>, limit_s: f64) -> f64 {
+    let mut told: Vec<f64> = users.filter_map(ClockOffset::ahead_s).collect();
     if told.len() < FEWEST {
         return 0.0;
     }
@@ -57,8 +57,8 @@ pub(super) fn ahead_s<'a>(users: impl Iterator<Item = &'a ClockEvidence>, limit_
 mod tests {
     use super::*;
 
-    fn mover(ahead: f64, speed: f64) -> ClockEvidence {
-        let mut evidence = ClockEvidence::default();
+    fn mover(ahead: f64, speed: f64) -> ClockOffset {
+        let mut evidence = ClockOffset::default();
         for k in 0..30 {
             let (sin, cos) = f64::from(k).sin_cos();
             let v = Vector2::new(speed * cos, speed * sin);

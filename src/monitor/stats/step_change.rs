@@ -3,9 +3,9 @@ use std::collections::VecDeque;
 use jiff::Timestamp;
 use nalgebra::Vector2;
 
-use super::detection::Detection;
-use super::motion::largest_eigenvalue;
 use crate::claims::seconds;
+use crate::monitor::track::detection::Detection;
+use crate::monitor::track::kalman::largest_eigenvalue;
 
 /// Frames of the way before a step, and of the ways after it that are tried.
 const BEFORE: usize = 3;
@@ -27,17 +27,17 @@ const MOST: f64 = 22.0;
 /// which no user who walks, drives, brakes or turns does. A line through the positions before, another through those after;
 /// where they meet the moment between the two there was no step.
 #[derive(Clone, Debug, Default)]
-pub(super) struct Steps {
+pub struct StepDetector {
     /// Positions and their larger variances.
     newest: VecDeque<(Timestamp, Vector2<f64>, f64)>,
     /// Of each newest frame, and the surprises before those.
-    judged: VecDeque<Stepped>,
+    judged: VecDeque<StepEvidence>,
     past: VecDeque<f64>,
 }
 
 /// What lies between the two lines, with its variance per axis.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Step {
+pub struct Step {
     /// m.
     pub aside: Vector2<f64>,
     /// Of the first frame after it.
@@ -51,35 +51,35 @@ pub(super) struct Step {
 
 /// How far aside, how surprising, and since when.
 #[derive(Clone, Copy, Debug, Default)]
-pub(super) struct Stepped {
+pub struct StepEvidence {
     pub length_m: f64,
-    pub surprise: f64,
+    pub neg_log_p: f64,
     pub since: Option<Timestamp>,
 }
 
 /// For each of `AFTER`, where there are frames enough.
-pub(super) const TRIED: usize = AFTER.len();
-pub(super) type Tried = [Option<Step>; TRIED];
+pub const TRIED: usize = AFTER.len();
+pub type CandidateSteps = [Option<Step>; TRIED];
 
 impl Step {
     /// Held against what all beams have in common. What leaves the disc of the turns is no farther from it than from its own true
     /// point, whose squared distance is χ² of two degrees.
-    fn judged(&self, common: Vector2<f64>) -> Stepped {
+    fn judged(&self, common: Vector2<f64>) -> StepEvidence {
         let aside = self.aside - common;
         let nearest = -aside.dot(&self.turn) / self.turn.norm_squared().max(f64::MIN_POSITIVE);
         let length_m = (aside + self.turn * nearest.clamp(-1.0, 1.0)).norm();
         let beyond = (length_m - self.way).max(0.0);
-        Stepped {
+        StepEvidence {
             length_m,
-            surprise: 0.5 * beyond * beyond / self.variance,
+            neg_log_p: 0.5 * beyond * beyond / self.variance,
             since: Some(self.since),
         }
     }
 }
 
-impl Steps {
+impl StepDetector {
     /// The frame's steps by windows, yet to be held against what all beams have in common.
-    pub fn look(&mut self, time: Timestamp, detection: &Detection) -> Tried {
+    pub fn look(&mut self, time: Timestamp, detection: &Detection) -> CandidateSteps {
         if self
             .newest
             .back()
@@ -94,12 +94,12 @@ impl Steps {
     }
 
     /// Takes the frame's steps, less what all beams have in common of each.
-    pub fn note(&mut self, tried: &Tried, common: &[Vector2<f64>; TRIED], learn: bool) {
+    pub fn note(&mut self, tried: &CandidateSteps, common: &[Vector2<f64>; TRIED], learn: bool) {
         let seen = tried
             .iter()
             .zip(common)
             .filter_map(|(step, common)| Some(step.as_ref()?.judged(*common)));
-        let Some(most) = seen.max_by(|a, b| a.surprise.total_cmp(&b.surprise)) else {
+        let Some(most) = seen.max_by(|a, b| a.neg_log_p.total_cmp(&b.neg_log_p)) else {
             return;
         };
         self.judged.push_back(most);
@@ -107,14 +107,14 @@ impl Steps {
             && let Some(old) = self.judged.pop_front()
             && learn
         {
-            self.past.push_back(old.surprise);
+            self.past.push_back(old.neg_log_p);
             self.past.drain(..self.past.len().saturating_sub(SCATTER[1]));
         }
     }
 
     /// The most surprising step of the newest frames, where the past tells how steps scatter: air and platform move beams about
     /// beyond what the fit's covariance says.
-    pub fn most(&self) -> Option<Stepped> {
+    pub fn most(&self) -> Option<StepEvidence> {
         if self.past.len() < SCATTER[0] {
             return None;
         }
@@ -122,9 +122,9 @@ impl Steps {
         let mut past: Vec<f64> = self.past.iter().copied().collect();
         past.sort_by(f64::total_cmp);
         let usual = past.get(past.len() * 9 / 10)? / std::f64::consts::LN_10;
-        let most = self.judged.iter().max_by(|a, b| a.surprise.total_cmp(&b.surprise))?;
-        Some(Stepped {
-            surprise: (most.surprise / usual.max(1.0)).min(MOST),
+        let most = self.judged.iter().max_by(|a, b| a.neg_log_p.total_cmp(&b.neg_log_p))?;
+        Some(StepEvidence {
+            neg_log_p: (most.neg_log_p / usual.max(1.0)).min(MOST),
             ..*most
         })
     }
@@ -194,15 +194,15 @@ mod tests {
 
     use super::*;
     use crate::estimate::Flags;
-    use crate::monitor::bends::Moments;
+    use crate::monitor::stats::second_moment::SecondMomentScore;
 
     const SIGMA_M: f64 = 0.05;
 
     /// The most surprising step of a way, seen ten times a second with an error of `SIGMA_M`.
-    fn most(way: impl Fn(f64) -> [f64; 2], seed: u64) -> Stepped {
+    fn most(way: impl Fn(f64) -> [f64; 2], seed: u64) -> StepEvidence {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        let mut steps = Steps::default();
-        let mut most = Stepped::default();
+        let mut steps = StepDetector::default();
+        let mut most = StepEvidence::default();
         for k in 0..100 {
             let t = 0.1 * f64::from(k);
             let noise = Vector2::from_fn(|_, _| -> f64 { StandardNormal.sample(&mut rng) }) * SIGMA_M;
@@ -211,15 +211,15 @@ mod tests {
                 cov: Matrix2::identity() * SIGMA_M * SIGMA_M,
                 energy_j: 1e-3,
                 flags: Flags::empty(),
-                moments: Moments::default(),
+                moments: SecondMomentScore::default(),
                 snr: 200.0,
                 resolution_m: 3.0,
-                ghost: 0.0,
+                clutter_probability: 0.0,
             };
             let time = Timestamp::UNIX_EPOCH + SignedDuration::from_secs_f64(t);
             let tried = steps.look(time, &detection);
             steps.note(&tried, &[Vector2::zeros(); TRIED], true);
-            if let Some(step) = steps.most().filter(|s| s.surprise > most.surprise) {
+            if let Some(step) = steps.most().filter(|s| s.neg_log_p > most.neg_log_p) {
                 most = step;
             }
         }
@@ -234,7 +234,7 @@ mod tests {
             let since = step
                 .since
                 .map(|t| t.duration_since(Timestamp::UNIX_EPOCH).as_secs_f64());
-            assert!(step.surprise > 10.0, "seed {seed}: {step:?}");
+            assert!(step.neg_log_p > 10.0, "seed {seed}: {step:?}");
             assert!((since.unwrap() - 8.0).abs() < 0.11, "seed {seed}: {since:?}");
         }
     }
@@ -260,7 +260,7 @@ mod tests {
                 most(lost, seed),
             ];
             for (worst, seen) in worst.iter_mut().zip(seen) {
-                *worst = worst.max(seen.surprise);
+                *worst = worst.max(seen.neg_log_p);
             }
         }
         assert!(worst.iter().all(|s| *s < 12.0), "{worst:?}");

@@ -1,12 +1,12 @@
 use std::collections::BTreeSet;
 
-use super::Monitor;
 use crate::assign::assign;
-use crate::monitor::AlertKind;
-use crate::monitor::book::Cause;
-use crate::monitor::motion::mahalanobis2;
-use crate::monitor::tracks::Track;
-use crate::monitor::users::{Asserted, CLAIM_LIFE_S};
+use crate::monitor::alert::AlertKind;
+use crate::monitor::alert_lifecycle::Cause;
+use crate::monitor::input::claim_state::{ActiveClaim, CLAIM_LIFE_S};
+use crate::monitor::monitor::Monitor;
+use crate::monitor::track::kalman::mahalanobis2;
+use crate::monitor::track::tracker::Track;
 
 /// Squared Mahalanobis distance within which a beam can answer a claim.
 const ANSWER_GATE: f64 = 25.0;
@@ -15,12 +15,12 @@ const INCUMBENCY: f64 = 4.0;
 
 impl Monitor {
     /// Which track answers which claim: near pairs by optimal assignment, then the beam that answered before.
-    pub(super) fn answer(&self, asserted: &[Asserted]) -> Vec<Option<u64>> {
+    pub fn answer(&self, active: &[ActiveClaim]) -> Vec<Option<u64>> {
         let seen: Vec<&Track> = self.tracks.all.iter().filter(|t| t.hit).collect();
-        let merged: Vec<&Track> = self.tracks.all.iter().filter(|t| t.merged.is_some()).collect();
-        let mut answers = vec![None; asserted.len()];
+        let merged_into: Vec<&Track> = self.tracks.all.iter().filter(|t| t.merged_into.is_some()).collect();
+        let mut association = vec![None; active.len()];
         // A frame that misses a user's beam must not let another beam nearby pass for it.
-        let held: Vec<bool> = asserted
+        let held: Vec<bool> = active
             .iter()
             .map(|a| {
                 let before = self.users.get(&a.claim.user).and_then(|u| u.track);
@@ -29,12 +29,12 @@ impl Monitor {
                     .is_some_and(Track::is_just_missed)
             })
             .collect();
-        for tracks in [&seen, &merged] {
-            let open: Vec<usize> = (0..asserted.len())
-                .filter(|&i| answers[i].is_none() && !held[i])
+        for tracks in [&seen, &merged_into] {
+            let open: Vec<usize> = (0..active.len())
+                .filter(|&i| association[i].is_none() && !held[i])
                 .collect();
             let matching = assign(open.len(), tracks.len(), ANSWER_GATE + INCUMBENCY, |i, j| {
-                let (a, t) = (&asserted[open[i]], tracks[j]);
+                let (a, t) = (&active[open[i]], tracks[j]);
                 let r = t.motion.position() - a.position;
                 let d2 = mahalanobis2(r, t.motion.position_cov() + a.spread(self.config.tolerated_distance_m));
                 let incumbent = self.users.get(&a.claim.user).and_then(|u| u.track) == Some(t.id);
@@ -47,11 +47,11 @@ impl Monitor {
                 }
             });
             for (i, j) in matching.pairs {
-                answers[open[i]] = Some(tracks[j].id);
+                association[open[i]] = Some(tracks[j].id);
             }
         }
-        let mut taken: BTreeSet<u64> = answers.iter().flatten().copied().collect();
-        for (a, answer) in asserted.iter().zip(&mut answers) {
+        let mut taken: BTreeSet<u64> = association.iter().flatten().copied().collect();
+        for (a, answer) in active.iter().zip(&mut association) {
             if answer.is_some() {
                 continue;
             }
@@ -63,12 +63,12 @@ impl Monitor {
                 *answer = Some(id);
             }
         }
-        answers
+        association
     }
     /// Age up to which a claim answers for a beam that was not its user's before, s: the longer a user is silent, the
     /// wider the ground that a stranger could appear on under their name.
-    fn fresh_s(&self, a: &Asserted) -> f64 {
-        if self.book.is_open(&Cause::Whole(AlertKind::ClaimsStale)) {
+    fn fresh_s(&self, a: &ActiveClaim) -> f64 {
+        if self.alerts.is_open(&Cause::Whole(AlertKind::ClaimsStale)) {
             return CLAIM_LIFE_S;
         }
         let period = self.period_s.unwrap_or(CLAIM_LIFE_S).max(a.period_s.unwrap_or(0.0));

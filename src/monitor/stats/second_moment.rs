@@ -2,8 +2,8 @@ use std::collections::VecDeque;
 
 use nalgebra::{Matrix2, Matrix3, Vector3};
 
-use super::watch::habits::median;
-use crate::estimate::SecondMomentScore;
+use crate::estimate;
+use crate::monitor::input::claim_timing::median;
 
 /// Newest frames that a test looks at.
 const WINDOWS: [usize; 5] = [3, 10, 20, 40, 80];
@@ -34,10 +34,10 @@ const DIRECTIONS: usize = 16;
 /// Whether a spot is wider than one beam's. Two beams d apart, with shares w and 1 − w of the light, have w(1 − w)·d² along the
 /// line between them, however they fade; frames add up what none of them shows.
 #[derive(Clone, Debug, Default)]
-pub(super) struct Bends {
-    newest: VecDeque<Moments>,
-    filling: (Moments, u32),
-    blocks: VecDeque<Moments>,
+pub struct SecondMomentTest {
+    newest: VecDeque<SecondMomentScore>,
+    filling: (SecondMomentScore, u32),
+    blocks: VecDeque<SecondMomentScore>,
     /// Mean squared Mahalanobis distance of a frame from those before, over its expectation, and the frames it is of.
     dispersion: f64,
     scattered: f64,
@@ -53,7 +53,7 @@ struct Seen {
 
 /// What the other beams show in each window: what befalls everybody is nobody's second beam.
 #[derive(Clone, Copy, Debug, Default)]
-pub(super) struct Common([Window; WINDOWS.len()]);
+pub struct CommonMode([Window; WINDOWS.len()]);
 
 #[derive(Clone, Copy, Debug, Default)]
 struct Window {
@@ -63,12 +63,12 @@ struct Window {
 
 /// Second moments in information form.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Moments {
+pub struct SecondMomentScore {
     score: Vector3<f64>,
     information: Matrix3<f64>,
 }
 
-impl Default for Moments {
+impl Default for SecondMomentScore {
     fn default() -> Self {
         Self {
             score: Vector3::zeros(),
@@ -77,9 +77,9 @@ impl Default for Moments {
     }
 }
 
-impl Moments {
+impl SecondMomentScore {
     /// What a frame says, its covariance times `inflation`.
-    pub fn of(bend: &SecondMomentScore, inflation: f64) -> Self {
+    pub fn of(bend: &estimate::SecondMomentScore, inflation: f64) -> Self {
         let s = bend.information;
         Self {
             score: Vector3::from(bend.score) / inflation,
@@ -115,8 +115,8 @@ impl Moments {
     }
 }
 
-impl Bends {
-    pub fn note(&mut self, frame: &Moments, learn: bool) {
+impl SecondMomentTest {
+    pub fn note(&mut self, frame: &SecondMomentScore, learn: bool) {
         let expected = self.before(0).unwrap_or_default();
         let Some(distance2) = frame.distance2(expected).filter(|d| d.is_finite()) else {
             return;
@@ -155,7 +155,7 @@ impl Bends {
     }
 
     /// Everything before the newest `n` frames, where that is enough.
-    fn sum_before(&self, n: usize) -> Option<Moments> {
+    fn sum_before(&self, n: usize) -> Option<SecondMomentScore> {
         let old = self.newest.len().checked_sub(n)?;
         let frames = self.blocks.len() as u32 * BLOCK + self.filling.1 + old as u32;
         (frames >= FEWEST).then(|| {
@@ -174,7 +174,7 @@ impl Bends {
 
     fn newest(&self, n: usize) -> Option<(Vector3<f64>, Matrix3<f64>)> {
         let first = self.newest.len().checked_sub(n)?;
-        let mut sum = Moments::default();
+        let mut sum = SecondMomentScore::default();
         self.newest.iter().skip(first).for_each(|m| sum.add(m));
         sum.solved()
     }
@@ -209,7 +209,7 @@ impl Bends {
 
     /// How much wider the spot is than expected (trace, σ²), and the surprise of the window and test that show it most: with no
     /// correction for their number, up to ten of which share data.
-    pub fn surprise(&self, common: &Common) -> (f64, f64) {
+    pub fn neg_log_p(&self, common: &CommonMode) -> (f64, f64) {
         let mut worst = (0.0, 0.0);
         let unlike = Matrix3::identity() * UNLIKE_OTHERS.powi(2);
         for (seen, common) in self.seen.iter().zip(&common.0) {
@@ -228,9 +228,9 @@ impl Bends {
     }
 }
 
-impl Common {
+impl CommonMode {
     /// Medians over `others`, where there are enough, with their own uncertainty.
-    pub fn of<'a>(others: impl Iterator<Item = &'a Bends> + Clone) -> Self {
+    pub fn of<'a>(others: impl Iterator<Item = &'a SecondMomentTest> + Clone) -> Self {
         Self(std::array::from_fn(|k| {
             let seen = || others.clone().filter_map(|b| b.seen[k]);
             Window {
@@ -270,9 +270,9 @@ fn spread(off: Vector3<f64>, inverse: Matrix3<f64>) -> (f64, f64) {
         let (y, x) = (std::f64::consts::PI * k as f64 / DIRECTIONS as f64).sin_cos();
         let v = Vector3::new(x * x, x * y, y * y);
         let (slope, curvature) = (v.dot(&(inverse * off)), v.dot(&(inverse * v)));
-        let surprise = 0.5 * slope * slope / curvature - 1.5f64.ln();
-        if slope > 0.0 && surprise > best.1 {
-            best = (slope / curvature, surprise);
+        let neg_log_p = 0.5 * slope * slope / curvature - 1.5f64.ln();
+        if slope > 0.0 && neg_log_p > best.1 {
+            best = (slope / curvature, neg_log_p);
         }
     }
     best
@@ -287,7 +287,7 @@ mod tests {
     use super::*;
 
     /// Frames of a beam of SNR 40, moments to 0.07 σ², whose moments are `truth`.
-    fn frames(n: usize, truth: [f64; 3], seed: u64) -> Vec<Moments> {
+    fn frames(n: usize, truth: [f64; 3], seed: u64) -> Vec<SecondMomentScore> {
         let information = [200.0, 400.0, 200.0];
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         (0..n)
@@ -296,7 +296,7 @@ mod tests {
                     let z: f64 = StandardNormal.sample(&mut rng);
                     information[k] * truth[k] + z * f64::sqrt(information[k])
                 });
-                Moments {
+                SecondMomentScore {
                     score,
                     information: Matrix3::from_diagonal(&Vector3::from(information)),
                 }
@@ -304,10 +304,10 @@ mod tests {
             .collect()
     }
 
-    fn told(frames: &[Moments]) -> Bends {
-        let mut bends = Bends::default();
-        frames.iter().for_each(|m| bends.note(m, true));
-        bends
+    fn told(frames: &[SecondMomentScore]) -> SecondMomentTest {
+        let mut moment_test = SecondMomentTest::default();
+        frames.iter().for_each(|m| moment_test.note(m, true));
+        moment_test
     }
 
     #[test]
@@ -315,10 +315,10 @@ mod tests {
         let shape = [0.05, -0.02, 0.03];
         let mut most: f64 = 0.0;
         for seed in 0..20 {
-            let mut bends = Bends::default();
+            let mut moment_test = SecondMomentTest::default();
             for m in frames(2000, shape, seed) {
-                bends.note(&m, true);
-                most = most.max(bends.surprise(&Common::default()).1);
+                moment_test.note(&m, true);
+                most = most.max(moment_test.neg_log_p(&CommonMode::default()).1);
             }
         }
         assert!((5.0..16.0).contains(&most), "{most}");
@@ -328,27 +328,27 @@ mod tests {
     fn a_second_beam_that_no_frame_shows_is_found_in_a_second() {
         // Equal beams a σ apart along the diagonal, after five seconds of one.
         for seed in 0..20 {
-            let mut bends = told(&frames(50, [0.0; 3], seed));
+            let mut moment_test = told(&frames(50, [0.0; 3], seed));
             for m in frames(10, [0.125; 3], 100 + seed) {
-                bends.note(&m, true);
+                moment_test.note(&m, true);
             }
-            let (wider, surprise) = bends.surprise(&Common::default());
+            let (wider, neg_log_p) = moment_test.neg_log_p(&CommonMode::default());
             assert!(
-                surprise > 19.0 && (wider - 0.25).abs() < 0.1,
-                "seed {seed}: {surprise}, {wider}"
+                neg_log_p > 19.0 && (wider - 0.25).abs() < 0.1,
+                "seed {seed}: {neg_log_p}, {wider}"
             );
         }
     }
 
     #[test]
     fn what_all_spots_show_and_a_single_frame_prove_nothing() {
-        let mut bends = told(&frames(600, [0.0; 3], 1));
+        let mut moment_test = told(&frames(600, [0.0; 3], 1));
         let smear = Vector3::new(0.2, 0.0, 0.2);
         for m in frames(10, smear.into(), 2) {
-            bends.note(&m, false);
+            moment_test.note(&m, false);
         }
-        assert!(bends.surprise(&Common::default()).1 > 20.0);
-        let others: Vec<Bends> = (10..15)
+        assert!(moment_test.neg_log_p(&CommonMode::default()).1 > 20.0);
+        let others: Vec<SecondMomentTest> = (10..15)
             .map(|seed| {
                 let mut other = told(&frames(600, [0.0; 3], seed));
                 frames(10, smear.into(), 100 + seed)
@@ -357,9 +357,11 @@ mod tests {
                 other
             })
             .collect();
-        assert!(bends.surprise(&Common::of(others.iter())).1 < 10.0);
-        let mut bends = told(&frames(600, [0.0; 3], 3));
-        frames(1, [5.0, 0.0, 5.0], 4).iter().for_each(|m| bends.note(m, false));
-        assert!(bends.surprise(&Common::default()).1 < 15.0);
+        assert!(moment_test.neg_log_p(&CommonMode::of(others.iter())).1 < 10.0);
+        let mut moment_test = told(&frames(600, [0.0; 3], 3));
+        frames(1, [5.0, 0.0, 5.0], 4)
+            .iter()
+            .for_each(|m| moment_test.note(m, false));
+        assert!(moment_test.neg_log_p(&CommonMode::default()).1 < 15.0);
     }
 }

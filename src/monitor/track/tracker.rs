@@ -3,10 +3,10 @@ use std::collections::VecDeque;
 use jiff::Timestamp;
 use nalgebra::{Matrix2, Vector2};
 
-use super::detection::Detection;
-use super::motion::{Motion, largest_eigenvalue, mahalanobis2};
 use crate::assign::assign;
 use crate::claims::seconds;
+use crate::monitor::track::detection::Detection;
+use crate::monitor::track::kalman::{KalmanFilter, largest_eigenvalue, mahalanobis2};
 
 /// Squared Mahalanobis gate of the association: χ² of two degrees exceeds it 4 times in 10⁶.
 const GATE: f64 = 25.0;
@@ -30,9 +30,9 @@ const TRAIL_STEP_S: f64 = 0.05;
 
 /// A beam over time. Its identity comes from its positions alone.
 #[derive(Clone, Debug)]
-pub(super) struct Track {
+pub struct Track {
     pub id: u64,
-    pub motion: Motion,
+    pub motion: KalmanFilter,
     pub since: Timestamp,
     pub last_hit: Timestamp,
     pub detection: Detection,
@@ -40,9 +40,9 @@ pub(super) struct Track {
     /// Detected in the newest frame.
     pub hit: bool,
     /// The track whose spot the beam has melted into in the newest frame.
-    pub merged: Option<u64>,
+    pub merged_into: Option<u64>,
     /// The track whose spot it melted into, until the two have been seen beside each other again or it has taken the other's place.
-    pub shadows: Option<u64>,
+    pub unresolved_from: Option<u64>,
     /// ln likelihood ratio of "an emitter" to "spurious detections".
     pub score: f64,
     /// Newest hits, one bit a frame.
@@ -53,7 +53,7 @@ pub(super) struct Track {
 }
 
 #[derive(Debug)]
-pub(super) struct Tracks {
+pub struct Tracker {
     pub all: Vec<Track>,
     next_id: u64,
     time: Option<Timestamp>,
@@ -67,14 +67,14 @@ impl Track {
     fn start(id: u64, time: Timestamp, detection: &Detection) -> Self {
         Self {
             id,
-            motion: Motion::start(detection.position, detection.cov),
+            motion: KalmanFilter::start(detection.position, detection.cov),
             since: time,
             last_hit: time,
             confirmed: false,
             hit: true,
-            merged: None,
-            shadows: None,
-            score: (DETECTED / detection.ghost).ln(),
+            merged_into: None,
+            unresolved_from: None,
+            score: (DETECTED / detection.clutter_probability).ln(),
             hits: 1,
             frames: 1,
             missed_s: 0.0,
@@ -85,7 +85,7 @@ impl Track {
 
     /// In a spot of its own or in another's.
     pub fn is_seen(&self) -> bool {
-        self.hit || self.merged.is_some()
+        self.hit || self.merged_into.is_some()
     }
 
     /// Followed well and missed only just now: its place is not free yet.
@@ -110,14 +110,14 @@ impl Track {
         self.motion.update(detection.position, cov);
         self.last_hit = time;
         self.hit = true;
-        self.merged = None;
-        self.score = (self.score + (DETECTED / detection.ghost).ln()).min(ceiling);
+        self.merged_into = None;
+        self.score = (self.score + (DETECTED / detection.clutter_probability).ln()).min(ceiling);
         self.detection = detection.clone();
         self.note(true);
         if beside || self.hits & SUCCEEDED == SUCCEEDED {
-            self.shadows = None;
+            self.unresolved_from = None;
         }
-        if self.shadows.is_none() {
+        if self.unresolved_from.is_none() {
             self.missed_s = 0.0;
         }
         let due = self.trail.back().is_none_or(|(t, _)| seconds(*t, time) >= TRAIL_STEP_S);
@@ -129,11 +129,11 @@ impl Track {
         }
     }
 
-    fn miss(&mut self, dt: f64, ghost: f64) {
+    fn miss(&mut self, dt: f64, clutter_probability: f64) {
         self.hit = false;
-        self.merged = None;
+        self.merged_into = None;
         self.missed_s += dt;
-        self.score += ((1.0 - DETECTED) / (1.0 - ghost)).ln();
+        self.score += ((1.0 - DETECTED) / (1.0 - clutter_probability)).ln();
         self.note(false);
     }
 
@@ -154,7 +154,7 @@ impl Track {
     }
 }
 
-impl Tracks {
+impl Tracker {
     /// `score_ceiling` bounds how far a long life can outweigh later misses.
     pub fn new(score_ceiling: f64) -> Self {
         Self {
@@ -187,7 +187,7 @@ impl Tracks {
                 let (track, d) = (&self.all[rows[i]], &detections[columns[j]]);
                 let spread = track.motion.position_cov() + d.cov + floor;
                 // A spot that two beams share stays with the one it was followed by.
-                let shares = if track.merged.is_some() { SHARING } else { 0.0 };
+                let shares = if track.merged_into.is_some() { SHARING } else { 0.0 };
                 mahalanobis2(d.position - track.motion.position(), spread) + shares
             });
             for (i, j) in matching.pairs {
@@ -212,7 +212,7 @@ impl Tracks {
                     track.merge(into, &detections[j], dt_s);
                     melted[j] = true;
                 }
-                None => track.miss(dt_s, track.detection.ghost),
+                None => track.miss(dt_s, track.detection.clutter_probability),
             }
         }
         let unseen: Vec<u64> = self
@@ -224,7 +224,7 @@ impl Tracks {
             .collect();
         for (track, found) in self.all.iter_mut().zip(&hit) {
             if let Some(j) = *found {
-                let beside = track.shadows.is_none_or(|other| !unseen.contains(&other));
+                let beside = track.unresolved_from.is_none_or(|other| !unseen.contains(&other));
                 track.take(time, &detections[j], melted[j], beside, self.score_ceiling);
             }
         }
@@ -271,8 +271,8 @@ impl Track {
     /// It is known to be there, as well as the two can be told apart.
     fn merge(&mut self, into: u64, spot: &Detection, dt_s: f64) {
         self.motion.update(spot.position, spot.shared_cov());
-        self.merged = Some(into);
-        self.shadows = Some(into);
+        self.merged_into = Some(into);
+        self.unresolved_from = Some(into);
         self.hit = false;
         self.note(false);
         // Bounds a track that shadows another one: it lives a few times longer than one lost in the open.
@@ -293,15 +293,15 @@ mod tests {
             moments: Default::default(),
             snr: 100.0,
             resolution_m: 2.0,
-            ghost: 1e-4,
+            clutter_probability: 1e-4,
         }
     }
 
     #[test]
     fn one_spot_is_no_evidence_of_a_second_beam() {
-        let mut tracks = Tracks::new(50.0);
+        let mut tracks = Tracker::new(50.0);
         let mut frame = 0;
-        let mut show = |tracks: &mut Tracks, places: &[f64]| {
+        let mut show = |tracks: &mut Tracker, places: &[f64]| {
             frame += 1;
             let time = Timestamp::from_millisecond(100 * frame).unwrap();
             let detections: Vec<_> = places.iter().map(|&x| seen(x)).collect();
@@ -312,12 +312,12 @@ mod tests {
         }
         let [a, b] = [0, 1].map(|k| tracks.all[k].id);
         show(&mut tracks, &[0.0]);
-        assert_eq!(tracks.get(b).unwrap().shadows, Some(a));
+        assert_eq!(tracks.get(b).unwrap().unresolved_from, Some(a));
         // A jump to where the other one was: its own track takes the detection.
         show(&mut tracks, &[2.4]);
         let track = tracks.get(b).unwrap();
-        assert!(track.hit && track.shadows == Some(a), "{track:?}");
+        assert!(track.hit && track.unresolved_from == Some(a), "{track:?}");
         show(&mut tracks, &[0.0, 2.4]);
-        assert_eq!(tracks.get(b).unwrap().shadows, None);
+        assert_eq!(tracks.get(b).unwrap().unresolved_from, None);
     }
 }

@@ -3,7 +3,7 @@ use nalgebra::{Matrix2, Matrix2x4, Matrix4, Vector2, Vector4};
 /// A constant-velocity Kalman filter of one beam on the ground: state (x, y, vx, vy) in m and m/s, white-noise
 /// acceleration (Bar-Shalom, Li and Kirubarajan, 2001, eqs. 6.2.2-10 to 6.2.2-13).
 #[derive(Clone, Debug)]
-pub(super) struct Motion {
+pub struct KalmanFilter {
     state: Vector4<f64>,
     cov: Matrix4<f64>,
 }
@@ -15,7 +15,7 @@ const SPEED_STD: f64 = 8.0;
 /// Squared Mahalanobis innovation past which the beam has manoeuvred: χ² of two degrees exceeds it once in 3,000.
 const MANOEUVRE: f64 = 16.0;
 
-impl Motion {
+impl KalmanFilter {
     pub fn start(z: Vector2<f64>, r: Matrix2<f64>) -> Self {
         let mut cov = Matrix4::zeros();
         cov.fixed_view_mut::<2, 2>(0, 0).copy_from(&r);
@@ -95,13 +95,13 @@ impl Motion {
 }
 
 /// rᵀ S⁻¹ r; infinite when S is singular.
-pub(super) fn mahalanobis2(r: Vector2<f64>, s: Matrix2<f64>) -> f64 {
+pub fn mahalanobis2(r: Vector2<f64>, s: Matrix2<f64>) -> f64 {
     s.try_inverse()
         .map_or(f64::INFINITY, |inverse| (r.transpose() * inverse * r)[0])
 }
 
 /// The larger eigenvalue of a symmetric 2 × 2 matrix.
-pub(super) fn largest_eigenvalue(s: &Matrix2<f64>) -> f64 {
+pub fn largest_eigenvalue(s: &Matrix2<f64>) -> f64 {
     let mean = 0.5 * (s[(0, 0)] + s[(1, 1)]);
     mean + (0.5 * (s[(0, 0)] - s[(1, 1)])).hypot(s[(0, 1)])
 }
@@ -113,7 +113,7 @@ mod tests {
     #[test]
     fn follows_a_walker_and_a_turn() {
         let r = Matrix2::identity() * 0.01;
-        let mut m = Motion::start(Vector2::zeros(), r);
+        let mut m = KalmanFilter::start(Vector2::zeros(), r);
         let mut truth = Vector2::zeros();
         for k in 1..100 {
             let velocity = if k < 50 { 1.5 } else { -1.5 };
@@ -128,7 +128,7 @@ mod tests {
 
     #[test]
     fn a_long_gap_grows_no_faster_than_the_speed_bound() {
-        let mut m = Motion::start(Vector2::zeros(), Matrix2::identity());
+        let mut m = KalmanFilter::start(Vector2::zeros(), Matrix2::identity());
         for _ in 0..100 {
             m.predict(1.0);
         }

@@ -3,11 +3,11 @@ use std::collections::BTreeMap;
 use jiff::Timestamp;
 use serde_json::Value;
 
-use super::alert::SAME_PLACE_M;
-use super::{
-    Acknowledgement, Alert, AlertEvent, AlertEventKind, AlertKind, AlertSource, AlertState, Severity, Withdrawal,
-};
 use crate::claims::seconds;
+use crate::monitor::alert::{
+    Acknowledgement, Alert, AlertEvent, AlertEventKind, AlertKind, AlertSource, AlertState, SAME_PLACE_M, Severity,
+    Withdrawal,
+};
 
 /// What an alert is about: while one is open for a cause, the cause raises no other.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -59,7 +59,7 @@ struct Cleared {
 
 /// The alerts of a run: raised once per cause, updated, acknowledged, cleared.
 #[derive(Debug)]
-pub(super) struct Book {
+pub(super) struct AlertLifecycle {
     open: BTreeMap<Cause, Open>,
     cleared: BTreeMap<Cause, Cleared>,
     /// Alerts of each kind raised at the newest instant: a flood of them must not cost more than their number.
@@ -105,7 +105,7 @@ impl Finding {
     }
 }
 
-impl Book {
+impl AlertLifecycle {
     pub fn new(source_kind: String, source_file: Option<String>, cool_down_s: f64) -> Self {
         Self {
             open: BTreeMap::new(),

@@ -3,10 +3,10 @@ use std::collections::VecDeque;
 use jiff::Timestamp;
 use nalgebra::{Matrix2, Vector2};
 
-use super::bends::{Bends, Common};
-use super::detection::Detection;
-use super::motion::mahalanobis2;
-use super::steps::{Stepped, Steps};
+use crate::monitor::stats::second_moment::{CommonMode, SecondMomentTest};
+use crate::monitor::stats::step_change::{StepDetector, StepEvidence};
+use crate::monitor::track::detection::Detection;
+use crate::monitor::track::kalman::mahalanobis2;
 
 use crate::claims::seconds;
 use crate::estimate::Flags;
@@ -44,19 +44,19 @@ const INDEPENDENT: f64 = 0.514;
 /// is. Two beams too near to be told apart show one spot at their centre of light; they fade independently, so the spot is
 /// brighter than before and wanders between the two from frame to frame; and it is spread along the line between them.
 #[derive(Clone, Debug, Default)]
-pub(super) struct Blend {
+pub struct CoLocationTest {
     /// With the time of each.
     energies: VecDeque<(Timestamp, f64)>,
     filling: Block,
     blocks: VecDeque<Block>,
     /// Each with the time of the first of its three positions.
-    unrest: VecDeque<(Timestamp, f64)>,
+    jitter: VecDeque<(Timestamp, f64)>,
     /// Mean unrest before the newest frames, and how many it is of.
     rest: f64,
     rested: u32,
     last: VecDeque<(Timestamp, Vector2<f64>, Matrix2<f64>)>,
-    pub steps: Steps,
-    pub bends: Bends,
+    pub steps: StepDetector,
+    pub moment_test: SecondMomentTest,
 }
 
 #[derive(Clone, Copy, Debug, Default)]
@@ -69,13 +69,13 @@ struct Block {
 
 /// A second difference of positions.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Jump {
+pub struct SecondDifference {
     since: Timestamp,
     pub by: Vector2<f64>,
     cov: Matrix2<f64>,
 }
 
-impl Jump {
+impl SecondDifference {
     pub fn less(self, common: Vector2<f64>) -> Self {
         Self {
             by: self.by - common,
@@ -86,52 +86,52 @@ impl Jump {
 
 /// Sum of squared deviations and its degrees of freedom.
 #[derive(Clone, Copy, Debug, Default)]
-pub(super) struct Scatter {
+pub struct Scatter {
     pub squares: f64,
     pub freedom: f64,
 }
 
 /// The users beside the one at hand: what befalls everybody is nobody's second beam.
 #[derive(Clone, Copy, Debug, Default)]
-pub(super) struct Company {
+pub struct OtherBeams {
     /// Medians over the others of the rise in ln energy and of the unrest, where there are enough.
     pub rise: Option<f64>,
-    pub unrest: Option<f64>,
-    pub moments: Common,
+    pub jitter: Option<f64>,
+    pub moments: CommonMode,
     /// Scatter of everybody's blocks.
     pub scatter: Scatter,
 }
 
 /// What speaks for a second beam in a spot. Each surprise s has a chance of at most e⁻ˢ with one beam.
 #[derive(Clone, Copy, Debug, Default)]
-pub(super) struct Suspicion {
+pub struct CoLocationEvidence {
     /// Mean energy of the newest frames over the past.
     pub brighter: f64,
-    pub energy_surprise: f64,
+    pub energy_neg_log_p: f64,
     /// Frame-to-frame unrest over what is expected.
-    pub restless: f64,
-    pub unrest_surprise: f64,
-    pub stepped: Stepped,
+    pub jitter_ratio: f64,
+    pub jitter_neg_log_p: f64,
+    pub stepped: StepEvidence,
     /// Of energy and unrest since the step.
     pub energy_after: f64,
-    pub unrest_after: f64,
+    pub jitter_after: f64,
     /// Second moment beyond one spot's, σ².
     pub wider: f64,
-    pub width_surprise: f64,
+    pub width_neg_log_p: f64,
 }
 
-impl Suspicion {
+impl CoLocationEvidence {
     /// All at once: energies, positions and shapes are independent, and several sums of them are asked, each with its share of the
     /// chance of a false alert. Two beams on top of each other have the shape of one; who was there from the start made no step.
-    pub fn surprise(&self) -> f64 {
-        let (energy, unrest, width) = (self.energy_surprise, self.unrest_surprise, self.width_surprise);
-        let (step, brighter, restless) = (self.stepped.surprise, self.energy_after, self.unrest_after);
+    pub fn neg_log_p(&self) -> f64 {
+        let (energy, jitter, width) = (self.energy_neg_log_p, self.jitter_neg_log_p, self.width_neg_log_p);
+        let (step, brighter, jitter_ratio) = (self.stepped.neg_log_p, self.energy_after, self.jitter_after);
         let sums = [
-            (0.6, together(&[energy, unrest])),
-            (0.05, together(&[energy, unrest, width])),
+            (0.6, together(&[energy, jitter])),
+            (0.05, together(&[energy, jitter, width])),
             (0.25, together(&[step, brighter])),
             (0.05, together(&[step, brighter, width])),
-            (0.05, together(&[step, brighter, restless, width])),
+            (0.05, together(&[step, brighter, jitter_ratio, width])),
         ];
         sums.into_iter()
             .fold(0.0, |most, (share, sum)| most.max(sum + f64::ln(share)))
@@ -164,7 +164,7 @@ impl Block {
     }
 }
 
-impl Blend {
+impl CoLocationTest {
     /// A beam known from before a restart by the mean and standard deviation of its ln energy.
     pub fn remembering(mean: f64, std: f64) -> Self {
         let block = Block {
@@ -196,7 +196,7 @@ impl Blend {
     }
 
     /// Second difference of the newest three positions and its covariance, where they are from frames in a row.
-    pub fn jump(&mut self, time: Timestamp, detection: &Detection) -> Option<Jump> {
+    pub fn jump(&mut self, time: Timestamp, detection: &Detection) -> Option<SecondDifference> {
         self.last.push_back((time, detection.position, detection.cov));
         if self.last.len() > 3 {
             self.last.pop_front();
@@ -205,7 +205,7 @@ impl Blend {
         let (first, second) = (seconds(t0, t1), seconds(t1, t2));
         let even = first > 0.0 && (second / first - 1.0).abs() < 0.2 && second < 0.5;
         let motion = Matrix2::identity() * (ACCELERATION * first * second).powi(2);
-        even.then(|| Jump {
+        even.then(|| SecondDifference {
             since: t0,
             by: p2 - p1 * 2.0 + p0,
             cov: c2 + c1 * 4.0 + c0 + motion,
@@ -218,10 +218,10 @@ impl Blend {
     }
 
     /// Takes a frame: the spot's energy, and its jump less what all beams have in common. `learn` adds what grows old to the past.
-    pub fn note(&mut self, time: Timestamp, detection: &Detection, jump: Option<Jump>, learn: bool) {
+    pub fn note(&mut self, time: Timestamp, detection: &Detection, jump: Option<SecondDifference>, learn: bool) {
         let spoilt = Flags::SATURATED | Flags::MASKED | Flags::NEAR_EDGE | Flags::OUT_OF_TIME;
         if detection.energy_j > 0.0 && !detection.flags.intersects(spoilt) {
-            self.bends.note(&detection.moments, learn);
+            self.moment_test.note(&detection.moments, learn);
             self.energies.push_back((time, detection.energy_j.ln()));
             if self.energies.len() > LONGEST
                 && let Some((_, old)) = self.energies.pop_front()
@@ -236,11 +236,11 @@ impl Blend {
                 }
             }
         }
-        if let Some(Jump { since, by, cov }) = jump {
-            self.unrest
+        if let Some(SecondDifference { since, by, cov }) = jump {
+            self.jitter
                 .push_back((since, (0.5 * mahalanobis2(by, cov)).min(MOST_UNREST)));
-            if self.unrest.len() > LONGEST
-                && let Some((_, old)) = self.unrest.pop_front()
+            if self.jitter.len() > LONGEST
+                && let Some((_, old)) = self.jitter.pop_front()
                 && learn
             {
                 self.rested = (self.rested + 1).min(BLOCK * BLOCKS as u32);
@@ -258,8 +258,8 @@ impl Blend {
     }
 
     /// Mean unrest of the newest frames, once there are enough.
-    pub fn recent_unrest(&self) -> Option<f64> {
-        (self.unrest.len() >= WINDOWS[1]).then(|| newest(&self.unrest, WINDOWS[1]))
+    pub fn recent_jitter(&self) -> Option<f64> {
+        (self.jitter.len() >= WINDOWS[1]).then(|| newest(&self.jitter, WINDOWS[1]))
     }
 
     /// Rise of the mean ln energy over the past.
@@ -273,36 +273,37 @@ impl Blend {
     }
 
     /// A beam may honestly grow brighter by the factor `brightening`: it is pointed a little better.
-    pub fn suspicion(&self, brightening: f64, company: &Company) -> Suspicion {
-        let mut worst = Suspicion::default();
-        let honest = brightening.ln() + company.rise.unwrap_or(0.0).max(0.0);
+    pub fn evaluate(&self, brightening: f64, other_beams: &OtherBeams) -> CoLocationEvidence {
+        let mut worst = CoLocationEvidence::default();
+        let honest = brightening.ln() + other_beams.rise.unwrap_or(0.0).max(0.0);
         for n in WINDOWS {
-            if let Some((brighter, s)) = self.energy_surprise(n, honest, company.scatter)
-                && s >= worst.energy_surprise
+            if let Some((brighter, s)) = self.energy_neg_log_p(n, honest, other_beams.scatter)
+                && s >= worst.energy_neg_log_p
             {
-                (worst.brighter, worst.energy_surprise) = (brighter, s);
+                (worst.brighter, worst.energy_neg_log_p) = (brighter, s);
             }
-            if let Some((restless, s)) = self.unrest_surprise(n, company.unrest)
-                && s >= worst.unrest_surprise
+            if let Some((jitter_ratio, s)) = self.jitter_neg_log_p(n, other_beams.jitter)
+                && s >= worst.jitter_neg_log_p
             {
-                (worst.restless, worst.unrest_surprise) = (restless, s);
+                (worst.jitter_ratio, worst.jitter_neg_log_p) = (jitter_ratio, s);
             }
         }
         worst.stepped = self.steps.most().unwrap_or_default();
         if let Some(since) = worst.stepped.since {
-            let energy = after(&self.energies, since).and_then(|n| self.energy_surprise(n, honest, company.scatter));
-            let unrest = after(&self.unrest, since).and_then(|n| self.unrest_surprise(n, company.unrest));
+            let energy =
+                after(&self.energies, since).and_then(|n| self.energy_neg_log_p(n, honest, other_beams.scatter));
+            let jitter = after(&self.jitter, since).and_then(|n| self.jitter_neg_log_p(n, other_beams.jitter));
             worst.energy_after = energy.map_or(0.0, |(_, s)| s);
-            worst.unrest_after = unrest.map_or(0.0, |(_, s)| s);
+            worst.jitter_after = jitter.map_or(0.0, |(_, s)| s);
         }
-        (worst.wider, worst.width_surprise) = self.bends.surprise(&company.moments);
+        (worst.wider, worst.width_neg_log_p) = self.moment_test.neg_log_p(&other_beams.moments);
         worst
     }
 
     /// Student's test of the newest mean ln energy against the past, `honest` rise allowed. The past's blocks scatter by more
     /// than its frames explain where light drifts slowly: a random effect of variance τ², which no window averages out. The
     /// tail of t falls as (1 + t²/ν)^(−(ν+1)/2), with ν from Satterthwaite (1946): a few blocks of history prove little.
-    fn energy_surprise(&self, n: usize, honest: f64, company: Scatter) -> Option<(f64, f64)> {
+    fn energy_neg_log_p(&self, n: usize, honest: f64, other_beams: Scatter) -> Option<(f64, f64)> {
         if self.energies.len() < n {
             return None;
         }
@@ -312,9 +313,9 @@ impl Blend {
         let within = self.within();
         let of_block = within / f64::from(BLOCK);
         let own = self.scatter();
-        let scatter = match own.variance() > UNLIKE_DRIFT * company.variance() {
+        let scatter = match own.variance() > UNLIKE_DRIFT * other_beams.variance() {
             true => own,
-            false => company,
+            false => other_beams,
         };
         let (drift, drift_freedom) = if scatter.freedom >= DRIFT_BLOCKS as f64 {
             ((scatter.variance() - of_block).max(0.0), scatter.freedom)
@@ -331,11 +332,11 @@ impl Blend {
     }
 
     /// Chernoff's bound on the mean of k independent χ² of two degrees halved: P(mean ≥ r) ≤ exp(−k(r − 1 − ln r)).
-    fn unrest_surprise(&self, n: usize, others: Option<f64>) -> Option<(f64, f64)> {
-        if self.unrest.len() < n {
+    fn jitter_neg_log_p(&self, n: usize, others: Option<f64>) -> Option<(f64, f64)> {
+        if self.jitter.len() < n {
             return None;
         }
-        let mean = newest(&self.unrest, n);
+        let mean = newest(&self.jitter, n);
         let own = (self.rested >= BLOCK * FEWEST_BLOCKS as u32).then(|| HONEST_UNREST * self.rest.max(0.5));
         let theirs = others.map(|o| UNLIKE_OTHERS * o.max(0.5));
         // What makes everybody restless is nobody's second beam.

@@ -1,10 +1,10 @@
 use nalgebra::Vector2;
 
-use super::{Displacement, Witness};
+use crate::monitor::pose::displacement::{Displacement, Witness};
 
 /// A claim and how far from it its beam was found.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Pair {
+pub struct Pair {
     pub claimed: Vector2<f64>,
     pub offset: Vector2<f64>,
 }
@@ -19,7 +19,7 @@ const MOST_PAIRS: usize = 8;
 const BASELINE_M: f64 = 10.0;
 
 /// The witnesses that find a beam of their own at `displaced`.
-pub(super) fn agreeing(beams: &[Vector2<f64>], witnesses: &[Witness], displaced: &Displacement) -> Vec<Pair> {
+pub fn agreeing(beams: &[Vector2<f64>], witnesses: &[Witness], displaced: &Displacement) -> Vec<Pair> {
     let mut free: Vec<bool> = vec![true; beams.len()];
     let mut pairs = Vec::with_capacity(witnesses.len().min(beams.len()));
     for w in witnesses {
@@ -42,7 +42,7 @@ pub(super) fn agreeing(beams: &[Vector2<f64>], witnesses: &[Witness], displaced:
 }
 
 /// The shift between some beam and some claim that most witnesses agree on; the smallest of equals.
-pub(super) fn search(beams: &[Vector2<f64>], witnesses: &[Witness]) -> Option<(Displacement, Vec<Pair>)> {
+pub fn search(beams: &[Vector2<f64>], witnesses: &[Witness]) -> Option<(Displacement, Vec<Pair>)> {
     let searched = &witnesses[..witnesses.len().min(MOST_SEARCHED)];
     let candidates = searched
         .iter()
@@ -62,7 +62,7 @@ pub(super) fn search(beams: &[Vector2<f64>], witnesses: &[Witness]) -> Option<(D
 }
 
 /// The same with a turn and a scale, proposed by two claims far apart and two beams.
-pub(super) fn search_turned(beams: &[Vector2<f64>], witnesses: &[Witness]) -> Option<(Displacement, Vec<Pair>)> {
+pub fn search_turned(beams: &[Vector2<f64>], witnesses: &[Witness]) -> Option<(Displacement, Vec<Pair>)> {
     let searched = &witnesses[..witnesses.len().min(MOST_SEARCHED)];
     let mut pairs: Vec<(Vector2<f64>, Vector2<f64>)> = Vec::new();
     for (i, a) in searched.iter().enumerate() {
@@ -118,7 +118,7 @@ fn through(a: (Vector2<f64>, Vector2<f64>), b: (Vector2<f64>, Vector2<f64>)) -> 
 
 /// Shift, scale and turn by repeated medians (Siegel, 1982): over each witness the median of what it says with each other,
 /// then over witnesses.
-pub(super) fn turn_of(pairs: &[Pair]) -> Displacement {
+pub fn turn_of(pairs: &[Pair]) -> Displacement {
     let mut said = Vec::with_capacity(pairs.len());
     for (i, a) in pairs.iter().enumerate() {
         let others = pairs.iter().enumerate().filter(|(j, _)| *j != i).filter_map(|(_, b)| {
@@ -143,7 +143,7 @@ pub(super) fn turn_of(pairs: &[Pair]) -> Displacement {
 }
 
 /// Component-wise; zero of none.
-pub(super) fn median(offsets: impl Iterator<Item = Vector2<f64>>) -> Vector2<f64> {
+pub fn median(offsets: impl Iterator<Item = Vector2<f64>>) -> Vector2<f64> {
     let offsets: Vec<_> = offsets.collect();
     let middle = |axis: usize| {
         let mut values: Vec<f64> = offsets.iter().map(|o| o[axis]).collect();

@@ -4,18 +4,18 @@ use jiff::Timestamp;
 use nalgebra::Vector2;
 use serde_json::json;
 
-use super::habits::median;
-use super::{ESCALATE_S, Monitor};
 use crate::claims::seconds;
-use crate::monitor::bends::Common;
-use crate::monitor::blend::{Blend, Company, Scatter};
-use crate::monitor::book::{Cause, Finding};
-use crate::monitor::motion::largest_eigenvalue;
-use crate::monitor::steps::{TRIED, Tried};
-use crate::monitor::thresholds::Family;
-use crate::monitor::tracks::Track;
-use crate::monitor::users::Asserted;
-use crate::monitor::{AlertKind, Severity};
+use crate::monitor::alert::{AlertKind, Severity};
+use crate::monitor::alert_lifecycle::{Cause, Finding};
+use crate::monitor::input::claim_state::ActiveClaim;
+use crate::monitor::input::claim_timing::median;
+use crate::monitor::monitor::{ESCALATE_S, Monitor};
+use crate::monitor::stats::co_location::{CoLocationTest, OtherBeams, Scatter};
+use crate::monitor::stats::error_budget::TestFamily;
+use crate::monitor::stats::second_moment::CommonMode;
+use crate::monitor::stats::step_change::{CandidateSteps, TRIED};
+use crate::monitor::track::kalman::largest_eigenvalue;
+use crate::monitor::track::tracker::Track;
 
 /// Users besides the one at hand whose median tells what befalls everybody.
 const FEWEST_OTHERS: usize = 2;
@@ -26,30 +26,30 @@ const BESIDE: f64 = 3.0;
 
 impl Monitor {
     /// Looks for a second beam within each user's spot.
-    pub(super) fn decide_spots(&mut self, asserted: &[Asserted], answers: &[Option<u64>], now: Timestamp) {
-        let level = self.thresholds.level(Family::Blended, asserted.len() as f64);
-        let watched: Vec<(usize, Track)> = (0..asserted.len())
-            .filter_map(|i| Some((i, self.tracks.get(answers[i]?)?.clone())))
-            .filter(|(i, t)| t.hit && t.confirmed && !self.is_shared(*i, t, asserted, answers))
-            .map(|(i, t)| (i, self.with_whole_spot(t, answers)))
+    pub fn decide_co_located(&mut self, active: &[ActiveClaim], association: &[Option<u64>], now: Timestamp) {
+        let level = self.budget.level(TestFamily::Blended, active.len() as f64);
+        let watched: Vec<(usize, Track)> = (0..active.len())
+            .filter_map(|i| Some((i, self.tracks.get(association[i]?)?.clone())))
+            .filter(|(i, t)| t.hit && t.confirmed && !self.is_shared(*i, t, active, association))
+            .map(|(i, t)| (i, self.with_whole_spot(t, association)))
             .collect();
-        self.note_spots(asserted, &watched);
+        self.note_co_located(active, &watched);
         let brightening = self.config.tolerated_brightening;
         let patience_s = self.patience_s();
         let mut suspects = BTreeSet::new();
         for (i, track) in &watched {
-            let name = &asserted[*i].claim.user;
+            let name = &active[*i].claim.user;
             let cause = Cause::Spot(name.clone());
-            let company = self.company(name, asserted, &watched);
+            let other_beams = self.other_beams(name, active, &watched);
             let is_accompanied = self.is_beside_unclaimed(track);
             let Some(user) = self.users.get_mut(name) else { continue };
             if is_accompanied {
                 user.accompanied = Some(now);
             }
             let accompanied = user.accompanied;
-            let seen = user.blend.suspicion(brightening, &company);
-            let is_suspect = seen.surprise() > SUSPECT * level;
-            let began = match seen.stepped.surprise > SUSPECT * level {
+            let seen = user.co_location.evaluate(brightening, &other_beams);
+            let is_suspect = seen.neg_log_p() > SUSPECT * level;
+            let began = match seen.stepped.neg_log_p > SUSPECT * level {
                 true => seen.stepped.since.unwrap_or(now),
                 false => now,
             };
@@ -57,21 +57,21 @@ impl Monitor {
             let Some(suspected) = user.suspected_since else {
                 continue;
             };
-            let open = self.book.is_open(&cause);
+            let open = self.alerts.is_open(&cause);
             // A second beam may be a user's whose claim has yet to come.
-            if !open && (seen.surprise() <= level || seconds(suspected, now) < patience_s) {
+            if !open && (seen.neg_log_p() <= level || seconds(suspected, now) < patience_s) {
                 continue;
             }
-            let past = user.blend.past_energy();
+            let past = user.co_location.past_energy();
             // One detection that goes astray does not part the two.
             if !open && accompanied.is_some_and(|t| seconds(t, now) < patience_s) {
                 continue;
             }
             suspects.insert(name.clone());
             if !open && let Some(old) = self.alert_melted_into(track) {
-                self.book.rename(&old, cause.clone());
+                self.alerts.rename(&old, cause.clone());
             }
-            let since = self.book.raised_at(&cause).unwrap_or(now);
+            let since = self.alerts.raised_at(&cause).unwrap_or(now);
             let severity = match seconds(since, now) >= ESCALATE_S {
                 true => Severity::Critical,
                 false => Severity::Warning,
@@ -83,36 +83,36 @@ impl Monitor {
                 "energy_j": track.detection.energy_j,
                 "energy_over_the_past": {
                     "ratio": seen.brighter,
-                    "surprise": seen.energy_surprise,
+                    "surprise": seen.energy_neg_log_p,
                     "past_ln_j": past.map(|p| p.0),
                     "past_ln_std": past.map(|p| p.1),
                 },
-                "power_against_reported": self.against_reported(asserted, answers, *i),
-                "unrest_over_the_expected": { "ratio": seen.restless, "surprise": seen.unrest_surprise },
+                "power_against_reported": self.against_reported(active, association, *i),
+                "unrest_over_the_expected": { "ratio": seen.jitter_ratio, "surprise": seen.jitter_neg_log_p },
                 "step_aside": {
                     "length_m": seen.stepped.length_m,
-                    "surprise": seen.stepped.surprise,
+                    "surprise": seen.stepped.neg_log_p,
                     "since": seen.stepped.since,
                     "energy_surprise": seen.energy_after,
-                    "unrest_surprise": seen.unrest_after,
+                    "unrest_surprise": seen.jitter_after,
                 },
-                "width_over_the_expected": { "moment_in_sigma2": seen.wider, "surprise": seen.width_surprise },
-                "surprise": seen.surprise(),
+                "width_over_the_expected": { "moment_in_sigma2": seen.wider, "surprise": seen.width_neg_log_p },
+                "surprise": seen.neg_log_p(),
                 "threshold": level,
                 "flags": track.detection.flags,
             });
             let finding = self.at_track(Finding::new(severity, evidence), track);
-            self.book.report(&cause, finding, now, self.frame);
+            self.alerts.report(&cause, finding, now, self.frame);
         }
         // A spot that cannot be judged now keeps its alert; one whose beam is gone does not.
         let unjudged = |name: &str| {
-            let i = asserted.iter().position(|a| a.claim.user == name);
-            let answered = i.is_some_and(|i| answers[i].is_some());
+            let i = active.iter().position(|a| a.claim.user == name);
+            let answered = i.is_some_and(|i| association[i].is_some());
             let watched = watched.iter().any(|(j, _)| Some(*j) == i);
-            answered && !(watched && self.users.get(name).is_some_and(|u| u.blend.is_judged()))
+            answered && !(watched && self.users.get(name).is_some_and(|u| u.co_location.is_judged()))
         };
         let over: Vec<Cause> = self
-            .book
+            .alerts
             .open()
             .filter_map(|(cause, _)| match cause {
                 Cause::Spot(name) => Some((cause.clone(), name)),
@@ -122,75 +122,77 @@ impl Monitor {
             .map(|(cause, _)| cause)
             .collect();
         for cause in over {
-            self.book.absent(&cause, now);
+            self.alerts.absent(&cause, now);
         }
     }
 
     /// `track` with all the light of its spot that answers nobody else's claim.
-    fn with_whole_spot(&self, mut track: Track, answers: &[Option<u64>]) -> Track {
+    fn with_whole_spot(&self, mut track: Track, association: &[Option<u64>]) -> Track {
         let detection = &track.detection;
         let others = self.tracks.all.iter().filter(|t| {
             let near = &t.detection;
             let reach = detection.resolution_m + 2.0 * largest_eigenvalue(&near.cov).sqrt().min(detection.resolution_m);
             let is_near = (near.position - detection.position).norm() < reach;
-            t.hit && t.id != track.id && is_near && !answers.contains(&Some(t.id))
+            t.hit && t.id != track.id && is_near && !association.contains(&Some(t.id))
         });
         track.detection = detection.united(others.map(|t| &t.detection), &self.camera);
         track
     }
 
     /// Whether another user's beam may be in this spot, by tracks or by claims.
-    fn is_shared(&self, i: usize, track: &Track, asserted: &[Asserted], answers: &[Option<u64>]) -> bool {
+    fn is_shared(&self, i: usize, track: &Track, active: &[ActiveClaim], association: &[Option<u64>]) -> bool {
         let (here, reach) = (track.motion.position(), track.detection.resolution_m);
-        self.confused_m(track, answers) > 0.0
-            || (0..asserted.len())
-                .filter(|&j| j != i && answers[j].is_none())
+        self.confusion_m(track, association) > 0.0
+            || (0..active.len())
+                .filter(|&j| j != i && association[j].is_none())
                 .any(|j| {
-                    let a = &asserted[j];
+                    let a = &active[j];
                     let away = (a.position - here).norm() - a.slack_m - 2.0 * a.variance.sqrt();
-                    away < reach + self.config.tolerated_distance_m || (a.hidden && away < self.overlap_m())
+                    away < reach + self.config.tolerated_distance_m || (a.is_unresolvable && away < self.overlap_m())
                 })
     }
 
-    fn note_spots(&mut self, asserted: &[Asserted], watched: &[(usize, Track)]) {
-        let names: BTreeSet<&str> = watched.iter().map(|(i, _)| asserted[*i].claim.user.as_str()).collect();
+    fn note_co_located(&mut self, active: &[ActiveClaim], watched: &[(usize, Track)]) {
+        let names: BTreeSet<&str> = watched.iter().map(|(i, _)| active[*i].claim.user.as_str()).collect();
         for (name, user) in &mut self.users {
             if !names.contains(name.as_str()) {
-                user.blend.pause();
+                user.co_location.pause();
             }
         }
         let jumps: Vec<_> = watched
             .iter()
             .map(|(i, track)| {
-                let user = self.users.get_mut(&asserted[*i].claim.user)?;
-                user.blend.jump(track.last_hit, &track.detection)
+                let user = self.users.get_mut(&active[*i].claim.user)?;
+                user.co_location.jump(track.last_hit, &track.detection)
             })
             .collect();
-        let steps: Vec<Tried> = watched
+        let steps: Vec<CandidateSteps> = watched
             .iter()
             .map(|(i, track)| {
-                let user = self.users.get_mut(&asserted[*i].claim.user);
-                user.map_or_else(Tried::default, |u| u.blend.steps.look(track.last_hit, &track.detection))
+                let user = self.users.get_mut(&active[*i].claim.user);
+                user.map_or_else(CandidateSteps::default, |u| {
+                    u.co_location.steps.look(track.last_hit, &track.detection)
+                })
             })
             .collect();
         let common_jump = common(jumps.iter().flatten().map(|jump| jump.by));
         let common_steps =
             std::array::from_fn::<_, { TRIED }, _>(|k| common(steps.iter().filter_map(|s| Some(s[k]?.aside))));
         for (((i, track), jump), steps) in watched.iter().zip(jumps).zip(steps) {
-            if let Some(user) = self.users.get_mut(&asserted[*i].claim.user) {
+            if let Some(user) = self.users.get_mut(&active[*i].claim.user) {
                 let jump = jump.map(|jump| jump.less(common_jump));
                 let learn = user.suspected_since.is_none();
-                user.blend.note(track.last_hit, &track.detection, jump, learn);
-                user.blend.steps.note(&steps, &common_steps, learn);
+                user.co_location.note(track.last_hit, &track.detection, jump, learn);
+                user.co_location.steps.note(&steps, &common_steps, learn);
             }
         }
     }
 
-    fn company(&self, name: &str, asserted: &[Asserted], watched: &[(usize, Track)]) -> Company {
-        let blends: Vec<(bool, &Blend)> = watched
+    fn other_beams(&self, name: &str, active: &[ActiveClaim], watched: &[(usize, Track)]) -> OtherBeams {
+        let blends: Vec<(bool, &CoLocationTest)> = watched
             .iter()
-            .map(|(i, _)| &asserted[*i].claim.user)
-            .filter_map(|user| Some((user != name, &self.users.get(user)?.blend)))
+            .map(|(i, _)| &active[*i].claim.user)
+            .filter_map(|user| Some((user != name, &self.users.get(user)?.co_location)))
             .collect();
         let others = || blends.iter().filter(|(other, _)| *other).map(|(_, b)| b);
         let enough = |values: Vec<f64>| match values.len() >= FEWEST_OTHERS {
@@ -198,10 +200,10 @@ impl Monitor {
             false => None,
         };
         let scatters = blends.iter().map(|(_, b)| b.scatter());
-        Company {
-            moments: Common::of(others().map(|b| &b.bends)),
+        OtherBeams {
+            moments: CommonMode::of(others().map(|b| &b.moment_test)),
             rise: enough(others().filter_map(|b| b.recent_rise()).collect()),
-            unrest: enough(others().filter_map(|b| b.recent_unrest()).collect()),
+            jitter: enough(others().filter_map(|b| b.recent_jitter()).collect()),
             scatter: scatters.fold(Scatter::default(), |sum, s| Scatter {
                 squares: sum.squares + s.squares,
                 freedom: sum.freedom + s.freedom,
@@ -212,7 +214,7 @@ impl Monitor {
     /// Whether an emitter that has its alert stands so near that its light explains what is odd about this beam.
     fn is_beside_unclaimed(&self, track: &Track) -> bool {
         let here = track.motion.position();
-        self.book.open().any(|(cause, _)| match cause {
+        self.alerts.open().any(|(cause, _)| match cause {
             Cause::Track(AlertKind::UnclaimedEmitter, id) => self.tracks.get(*id).is_some_and(|t| {
                 t.is_seen() && (t.motion.position() - here).norm() < BESIDE * track.detection.resolution_m
             }),
@@ -223,7 +225,7 @@ impl Monitor {
     /// The alert of an emitter that can no longer be told apart from this beam: the same cause.
     fn alert_melted_into(&self, track: &Track) -> Option<Cause> {
         let here = track.motion.position();
-        self.book.open().find_map(|(cause, alert)| {
+        self.alerts.open().find_map(|(cause, alert)| {
             let Cause::Track(AlertKind::UnclaimedEmitter, id) = cause else {
                 return None;
             };

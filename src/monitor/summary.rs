@@ -1,16 +1,17 @@
 use jiff::Timestamp;
 
-use super::Monitor;
 use crate::estimate::Flags;
-use crate::monitor::book::Cause;
-use crate::monitor::users::Asserted;
-use crate::monitor::{AlertKind, PositionStatus, Report, TrackedPosition};
+use crate::monitor::alert::AlertKind;
+use crate::monitor::alert_lifecycle::Cause;
+use crate::monitor::input::claim_state::ActiveClaim;
+use crate::monitor::monitor::Monitor;
+use crate::monitor::report::{PositionStatus, Report, TrackedPosition};
 
 impl Monitor {
-    pub(super) fn report(&mut self, asserted: &[Asserted], frame: u64, now: Timestamp) -> Report {
-        let events = self.book.take_events();
+    pub fn report(&mut self, active: &[ActiveClaim], frame: u64, now: Timestamp) -> Report {
+        let events = self.alerts.take_events();
         let owner = |id: u64| {
-            asserted.iter().find(|a| {
+            active.iter().find(|a| {
                 self.users
                     .get(&a.claim.user)
                     .is_some_and(|u| u.track == Some(id) && u.unanswered_since.is_none())
@@ -24,8 +25,8 @@ impl Monitor {
             .map(|t| {
                 let user = owner(t.id).map(|a| a.claim.user.clone());
                 let is_open = |kind: AlertKind| match (&user, kind) {
-                    (Some(user), kind) => self.book.is_open(&Cause::User(kind, user.clone())),
-                    (None, kind) => self.book.is_open(&Cause::Track(kind, t.id)),
+                    (Some(user), kind) => self.alerts.is_open(&Cause::User(kind, user.clone())),
+                    (None, kind) => self.alerts.is_open(&Cause::Track(kind, t.id)),
                 };
                 let status = match &user {
                     Some(_) if is_open(AlertKind::PositionMismatch) => PositionStatus::Mismatch,
@@ -42,21 +43,21 @@ impl Monitor {
                     energy_j: t.detection.energy_j,
                     user,
                     status,
-                    flags: match t.merged.is_some() {
+                    flags: match t.merged_into.is_some() {
                         true => (t.detection.flags | Flags::UNRESOLVED).names(),
                         false => t.detection.flags.names(),
                     },
                 }
             })
             .collect();
-        let unseen = asserted
+        let unseen = active
             .iter()
             .filter(|a| {
-                self.book
+                self.alerts
                     .is_open(&Cause::User(AlertKind::UserUnseen, a.claim.user.clone()))
             })
             .map(|a| a.claim.user.clone())
-            .chain(self.strangers.iter().cloned())
+            .chain(self.never_seen.iter().cloned())
             .collect();
         Report {
             time: now,
@@ -64,7 +65,7 @@ impl Monitor {
             emitters,
             unseen,
             events,
-            claims: asserted.iter().map(|a| a.claim.clone()).collect(),
+            claims: active.iter().map(|a| a.claim.clone()).collect(),
         }
     }
 }

@@ -3,13 +3,13 @@ use std::collections::VecDeque;
 use jiff::Timestamp;
 use nalgebra::{Matrix2, Vector2};
 
-use super::motion::largest_eigenvalue;
+use crate::monitor::track::kalman::largest_eigenvalue;
 
 /// Window lengths of the sequential test, in claims.
-pub(super) const WINDOWS: [usize; 6] = [1, 2, 4, 8, 16, 32];
+pub const WINDOWS: [usize; 6] = [1, 2, 4, 8, 16, 32];
 /// Share of a claim's variance that is common to its neighbours in time (satellite errors wander over minutes) and so
 /// does not average out.
-pub(super) const COMMON_SHARE: f64 = 0.25;
+pub const COMMON_SHARE: f64 = 0.25;
 
 /// One claim held against where its beam was at the claim's own time.
 #[derive(Clone, Copy, Debug)]
@@ -23,16 +23,16 @@ struct Residual {
 
 /// The residuals of one user, newest last; each claim counts once.
 #[derive(Clone, Debug, Default)]
-pub(super) struct Residuals {
+pub struct ClaimConsistency {
     kept: VecDeque<Residual>,
     newest: Option<Timestamp>,
 }
 
 /// How far a weighted mean of residuals lies outside what is tolerated.
 #[derive(Clone, Copy, Debug, Default)]
-pub(super) struct Excess {
+pub struct Excess {
     /// Half the squared distance from the tolerated disc, in standard deviations: −ln of the bound on its probability.
-    pub surprise: f64,
+    pub neg_log_p: f64,
     pub distance_m: f64,
     pub window: usize,
 }
@@ -42,7 +42,7 @@ pub(super) struct Excess {
 /// point of it that is true, whose square is χ² of two degrees: s = t²/2, t in standard deviations beyond the disc. And
 /// where the disc is wide against the error, its edge is nearly straight: the worst honest offset lies on the edge, and
 /// averaging the one-sided tail Q over the transverse error (Laplace's method) gives Q(t)/√(1 − t·σ/radius).
-pub(super) fn surprise(offset: Vector2<f64>, cov: &Matrix2<f64>, radius_m: f64) -> f64 {
+pub fn neg_log_p(offset: Vector2<f64>, cov: &Matrix2<f64>, radius_m: f64) -> f64 {
     let sigma = largest_eigenvalue(cov).max(1e-12).sqrt();
     let t = (offset.norm() - radius_m).max(0.0) / sigma;
     let whole = 0.5 * t * t;
@@ -58,7 +58,7 @@ pub(super) fn surprise(offset: Vector2<f64>, cov: &Matrix2<f64>, radius_m: f64) 
     whole.max(-tail.ln() + 0.5 * curvature.ln())
 }
 
-impl Residuals {
+impl ClaimConsistency {
     /// Time of the newest claim that counted.
     pub fn newest(&self) -> Option<Timestamp> {
         self.newest
@@ -94,10 +94,10 @@ impl Residuals {
             let own: f64 = weighted().map(|(w, r)| w * w * r.claim).sum();
             let claim = COMMON_SHARE * of(&|r| r.claim) + (1.0 - COMMON_SHARE) * own;
             let cov = beam + Matrix2::identity() * claim + floor;
-            let s = surprise(mean, &cov, radius_m);
-            if s > worst.surprise || m == 1 {
+            let s = neg_log_p(mean, &cov, radius_m);
+            if s > worst.neg_log_p || m == 1 {
                 worst = Excess {
-                    surprise: s,
+                    neg_log_p: s,
                     distance_m: mean.norm(),
                     window: m,
                 };
@@ -142,7 +142,7 @@ mod tests {
     fn a_surprise_bounds_its_own_probability() {
         for sigma in [0.05, 0.2, 0.4, 1.0, 5.0] {
             for t in [1.5, 3.0, 5.0, 7.0] {
-                let s = surprise(
+                let s = neg_log_p(
                     Vector2::new(5.0 + t * sigma, 0.0),
                     &(Matrix2::identity() * sigma * sigma),
                     5.0,
@@ -158,16 +158,16 @@ mod tests {
     #[test]
     fn many_small_offsets_weigh_what_one_cannot() {
         let stamp = Timestamp::UNIX_EPOCH;
-        let mut r = Residuals::default();
+        let mut r = ClaimConsistency::default();
         let none = Matrix2::zeros();
         r.push(stamp, Vector2::new(6.0, 0.0), none, 0.25);
-        let one = r.excess(5.0, &none).surprise;
+        let one = r.excess(5.0, &none).neg_log_p;
         for _ in 0..15 {
             r.push(stamp, Vector2::new(6.0, 0.0), none, 0.25);
         }
         let many = r.excess(5.0, &none);
-        assert!(many.surprise > 2.0 * one && many.window == 16, "{one} {many:?}");
+        assert!(many.neg_log_p > 2.0 * one && many.window == 16, "{one} {many:?}");
         // But not without limit: a common error does not average out.
-        assert!(many.surprise < 16.0 * one / 3.0);
+        assert!(many.neg_log_p < 16.0 * one / 3.0);
     }
 }

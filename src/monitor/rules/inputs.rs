@@ -2,14 +2,14 @@ use jiff::Timestamp;
 use nalgebra::Vector2;
 use serde_json::json;
 
-use super::Monitor;
-use super::users::claimed;
 use crate::claims::{Store, seconds};
-use crate::monitor::book::{Cause, Finding};
-use crate::monitor::residuals::surprise;
-use crate::monitor::thresholds::Family;
-use crate::monitor::users::Asserted;
-use crate::monitor::{AlertKind, Severity};
+use crate::monitor::alert::{AlertKind, Severity};
+use crate::monitor::alert_lifecycle::{Cause, Finding};
+use crate::monitor::input::claim_state::ActiveClaim;
+use crate::monitor::monitor::Monitor;
+use crate::monitor::rules::mismatch::claimed;
+use crate::monitor::stats::claim_consistency::neg_log_p;
+use crate::monitor::stats::error_budget::TestFamily;
 
 /// Claims in a row that may be lost, and how much longer than the whole log one user may be silent.
 const MOST_LOST: f64 = 20.0;
@@ -17,24 +17,24 @@ const USER_PATIENCE: f64 = 4.0;
 
 impl Monitor {
     /// The health of what we are given: frames and claims.
-    pub(super) fn watch_inputs(&mut self, asserted: &[Asserted], claims: &Store, now: Timestamp) {
+    pub fn watch_inputs(&mut self, active: &[ActiveClaim], claims: &Store, now: Timestamp) {
         let lost = Cause::Whole(AlertKind::SensorLost);
-        let blind_s = self.sight.blind_s(now);
+        let blind_s = self.sensor.blind_s(now);
         if blind_s >= self.config.sensor_lost_s {
-            let finding = Finding::new(Severity::Critical, self.sight.evidence(now));
-            self.book.report(&lost, finding, now, self.frame);
+            let finding = Finding::new(Severity::Critical, self.sensor.evidence(now));
+            self.alerts.report(&lost, finding, now, self.frame);
         } else if blind_s == 0.0 {
-            self.book.absent(&lost, now);
+            self.alerts.absent(&lost, now);
         }
         self.watch_pose(now);
         let stale = Cause::Whole(AlertKind::ClaimsStale);
         let period = self.period_s.unwrap_or(0.0);
         let limit = self.config.claims_stale_s.max(5.0 * period);
         let log_is_stale =
-            self.book.is_open(&stale) || claims.quiet_s(now).is_some_and(|(came, made)| came.max(made) > limit);
-        self.watch_users_claims(asserted, log_is_stale, now);
+            self.alerts.is_open(&stale) || claims.quiet_s(now).is_some_and(|(came, made)| came.max(made) > limit);
+        self.watch_users_claims(active, log_is_stale, now);
         match claims.quiet_s(now) {
-            Some((came, made)) if came.max(made) > limit && self.expects_claims(asserted) => {
+            Some((came, made)) if came.max(made) > limit && self.expects_claims(active) => {
                 let severity = if came.max(made) > 6.0 * limit {
                     Severity::Critical
                 } else {
@@ -46,26 +46,26 @@ impl Monitor {
                     "limit_s": limit,
                     "typical_period_s": period,
                 });
-                self.book
+                self.alerts
                     .report(&stale, Finding::new(severity, evidence), now, self.frame);
             }
-            _ => self.book.absent(&stale, now),
+            _ => self.alerts.absent(&stale, now),
         }
     }
 
     /// A beam whose user's claims have stopped while the others' go on: somebody may hold them back. Lost claims are no
     /// matter: thirty in a hundred lost at random leave a gap of twenty periods once in 10¹⁰.
-    fn watch_users_claims(&mut self, asserted: &[Asserted], log_is_stale: bool, now: Timestamp) {
+    fn watch_users_claims(&mut self, active: &[ActiveClaim], log_is_stale: bool, now: Timestamp) {
         let period = self.period_s.unwrap_or(0.0);
-        for a in asserted {
+        for a in active {
             let cause = Cause::User(AlertKind::ClaimsStale, a.claim.user.clone());
             let periods = MOST_LOST * a.period_s.unwrap_or(0.0).clamp(period, 10.0 * period.max(0.1));
             let limit = periods.max(USER_PATIENCE * self.config.claims_stale_s);
             let user = self.users.get(&a.claim.user);
             let is_lit = user.is_some_and(|u| u.last_answered.is_some_and(|t| seconds(t, now) < 1.0));
             // The whole log's silence is one cause and not one a user.
-            if a.ended || a.age_s <= limit || !is_lit || (log_is_stale && !self.book.is_open(&cause)) {
-                self.book.absent(&cause, now);
+            if a.ended || a.age_s <= limit || !is_lit || (log_is_stale && !self.alerts.is_open(&cause)) {
+                self.alerts.absent(&cause, now);
                 continue;
             }
             let evidence = json!({
@@ -75,7 +75,7 @@ impl Monitor {
             });
             let mut finding = Finding::new(Severity::Warning, evidence);
             finding.claimed = claimed(a);
-            self.book.report(&cause, finding, now, self.frame);
+            self.alerts.report(&cause, finding, now, self.frame);
         }
     }
 
@@ -88,10 +88,10 @@ impl Monitor {
         let pose = self.pose.displacement();
         let (agreeing, of) = self.pose.support();
         let (place, worst) = self.worst_displacement();
-        let surprise = surprise(worst, &self.floor(place), limit);
-        let level = self.thresholds.level(Family::Pose, 1.0);
-        let is_open = self.book.is_open(&cause);
-        if surprise > level || (is_open && worst.norm() > 0.9 * limit) {
+        let neg_log_p = neg_log_p(worst, &self.floor(place), limit);
+        let level = self.budget.level(TestFamily::PoseConsensus, 1.0);
+        let is_open = self.alerts.is_open(&cause);
+        if neg_log_p > level || (is_open && worst.norm() > 0.9 * limit) {
             let severity = if worst.norm() > 4.0 * limit {
                 Severity::Critical
             } else {
@@ -105,13 +105,13 @@ impl Monitor {
                 "limit_m": limit,
                 "users_agreeing": agreeing,
                 "users": of,
-                "surprise": surprise,
+                "surprise": neg_log_p,
                 "threshold": level,
             });
-            self.book
+            self.alerts
                 .report(&cause, Finding::new(severity, evidence), now, self.frame);
         } else {
-            self.book.absent(&cause, now);
+            self.alerts.absent(&cause, now);
         }
     }
 
@@ -128,7 +128,7 @@ impl Monitor {
     }
 
     /// A network without users has nothing to say.
-    fn expects_claims(&self, asserted: &[Asserted]) -> bool {
-        asserted.iter().any(|a| !a.ended) || self.tracks.all.iter().any(|t| t.confirmed)
+    fn expects_claims(&self, active: &[ActiveClaim]) -> bool {
+        active.iter().any(|a| !a.ended) || self.tracks.all.iter().any(|t| t.confirmed)
     }
 }

@@ -4,13 +4,13 @@ use jiff::Timestamp;
 use nalgebra::{Matrix2, Vector2};
 use serde_json::{Value, json};
 
-use super::{COINCIDENCE_S, ESCALATE_S, Monitor, SYSTEMATIC_M};
 use crate::claims::seconds;
-use crate::monitor::book::{Cause, Finding};
-use crate::monitor::residuals::{WINDOWS, surprise};
-use crate::monitor::thresholds::Family;
-use crate::monitor::users::{Asserted, User};
-use crate::monitor::{AlertKind, Severity};
+use crate::monitor::alert::{AlertKind, Severity};
+use crate::monitor::alert_lifecycle::{Cause, Finding};
+use crate::monitor::input::claim_state::{ActiveClaim, User};
+use crate::monitor::monitor::{COINCIDENCE_S, ESCALATE_S, Monitor, SYSTEMATIC_M};
+use crate::monitor::stats::claim_consistency::{WINDOWS, neg_log_p};
+use crate::monitor::stats::error_budget::TestFamily;
 
 /// Frames in a row that must show a beam outside before a single claim's evidence stands.
 const OUTSIDE_FRAMES: u32 = 3;
@@ -21,7 +21,7 @@ const MOST_NAMES: usize = 20;
 
 /// Users who are claimed and were never seen, too many for an alert each.
 #[derive(Debug, Default)]
-struct Strangers {
+struct NeverSeen {
     names: Vec<String>,
     longest_s: f64,
     /// Users with an alert of their own, lately. Counted only when somebody asks.
@@ -30,20 +30,20 @@ struct Strangers {
 
 impl Monitor {
     /// Adds the frame's and the new claims' evidence to what is known of each user.
-    pub(super) fn weigh(&mut self, asserted: &[Asserted], answers: &[Option<u64>], now: Timestamp) {
+    pub fn weigh(&mut self, active: &[ActiveClaim], association: &[Option<u64>], now: Timestamp) {
         let tolerated = self.config.tolerated_distance_m;
-        let gate = self.thresholds.level(Family::Mismatch, asserted.len() as f64);
+        let gate = self.budget.level(TestFamily::Mismatch, active.len() as f64);
         let displacement = self.pose.displacement();
         let unsure_s = self.unsure_of_clock_s(now);
         // Before everybody has claimed once our own pose and the log's clock are not known.
         let settled = self.claims_settled(now);
-        for (a, answer) in asserted.iter().zip(answers) {
+        for (a, answer) in active.iter().zip(association) {
             let track = answer.and_then(|id| self.tracks.get(id));
-            let confused_m = track.map_or(0.0, |t| self.confused_m(t, answers));
+            let confusion_m = track.map_or(0.0, |t| self.confusion_m(t, association));
             let user = self.users.entry(a.claim.user.clone()).or_default();
             let Some(track) = track else {
                 user.outside = 0;
-                if !a.expected || a.hidden {
+                if !a.expected || a.is_unresolvable {
                     user.unanswered_since = None;
                     user.absence = 0.0;
                 } else {
@@ -63,7 +63,7 @@ impl Monitor {
             let claimed = Vector2::new(a.claim.x_m, a.claim.y_m);
             let claimed = claimed + displacement.at(claimed);
             if user.residuals.newest().is_none_or(|t| t < a.claim.time) {
-                let is_clear = track.confirmed && track.merged.is_none() && confused_m == 0.0;
+                let is_clear = track.confirmed && track.merged_into.is_none() && confusion_m == 0.0;
                 if let Some(stamped) = track.at(a.claim.time).filter(|_| is_clear && !user.mismatched) {
                     user.clock.push(stamped - claimed, track.motion.velocity(), a.variance);
                 }
@@ -79,12 +79,12 @@ impl Monitor {
             let floor = Matrix2::identity() * (SYSTEMATIC_M.powi(2) + self.pose.variance(a.position));
             let cov = track.motion.position_cov() + Matrix2::identity() * a.variance + floor;
             let offset = track.motion.position() - a.position;
-            let reach = tolerated + a.slack_m + confused_m + unsure_s * track.motion.velocity().norm();
-            let is_outside = track.hit && track.confirmed && surprise(offset, &cov, reach) > gate;
+            let reach = tolerated + a.slack_m + confusion_m + unsure_s * track.motion.velocity().norm();
+            let is_outside = track.hit && track.confirmed && neg_log_p(offset, &cov, reach) > gate;
             user.outside = if is_outside { user.outside + 1 } else { 0 };
         }
-        let present: BTreeSet<&str> = asserted.iter().map(|a| a.claim.user.as_str()).collect();
-        let book = &self.book;
+        let present: BTreeSet<&str> = active.iter().map(|a| a.claim.user.as_str()).collect();
+        let alerts = &self.alerts;
         self.users.retain(|name, _| {
             present.contains(name.as_str())
                 || [
@@ -93,47 +93,47 @@ impl Monitor {
                     AlertKind::ClaimsStale,
                 ]
                 .iter()
-                .any(|k| book.is_open(&Cause::User(*k, name.clone())))
-                || book.is_open(&Cause::Spot(name.clone()))
+                .any(|k| alerts.is_open(&Cause::User(*k, name.clone())))
+                || alerts.is_open(&Cause::Spot(name.clone()))
         });
     }
-    pub(super) fn decide_users(&mut self, asserted: &[Asserted], answers: &[Option<u64>], now: Timestamp) {
-        let each = (asserted.len() * WINDOWS.len()) as f64;
+    pub fn decide_users(&mut self, active: &[ActiveClaim], association: &[Option<u64>], now: Timestamp) {
+        let each = (active.len() * WINDOWS.len()) as f64;
         let level = self
-            .thresholds
-            .level_every(self.period_s.unwrap_or(0.0), Family::Mismatch, each);
-        let level_unseen = self.thresholds.level(Family::Unseen, asserted.len() as f64);
-        let mut strangers = Strangers::default();
-        for (i, a) in asserted.iter().enumerate() {
-            self.decide_mismatch(asserted, answers, i, level, now);
-            self.decide_unseen(a, level_unseen, &mut strangers, now);
+            .budget
+            .level_every(self.period_s.unwrap_or(0.0), TestFamily::Mismatch, each);
+        let level_unseen = self.budget.level(TestFamily::Unseen, active.len() as f64);
+        let mut never_seen = NeverSeen::default();
+        for (i, a) in active.iter().enumerate() {
+            self.decide_mismatch(active, association, i, level, now);
+            self.decide_unseen(a, level_unseen, &mut never_seen, now);
         }
-        self.decide_strangers(strangers, now);
-        let present: BTreeSet<&str> = asserted.iter().map(|a| a.claim.user.as_str()).collect();
+        self.decide_never_seen(never_seen, now);
+        let present: BTreeSet<&str> = active.iter().map(|a| a.claim.user.as_str()).collect();
         let orphans: Vec<Cause> = self
-            .book
+            .alerts
             .open()
             .filter(|(c, _)| matches!(c, Cause::User(_, user) if !present.contains(user.as_str())))
             .map(|(c, _)| c.clone())
             .collect();
         for cause in orphans {
-            self.book.absent(&cause, now);
+            self.alerts.absent(&cause, now);
         }
     }
 
     fn decide_mismatch(
         &mut self,
-        asserted: &[Asserted],
-        answers: &[Option<u64>],
+        active: &[ActiveClaim],
+        association: &[Option<u64>],
         i: usize,
         level: f64,
         now: Timestamp,
     ) {
-        let a = &asserted[i];
+        let a = &active[i];
         let tolerated = self.config.tolerated_distance_m;
         let floor = self.floor(a.position);
         let cause = Cause::User(AlertKind::PositionMismatch, a.claim.user.clone());
-        let track = answers[i].and_then(|id| self.tracks.get(id));
+        let track = association[i].and_then(|id| self.tracks.get(id));
         let unsure_s = self.unsure_of_clock_s(now);
         let settled = self.claims_settled(now);
         let Some(user) = self.users.get_mut(&a.claim.user) else {
@@ -147,9 +147,9 @@ impl Monitor {
         }
         let unsure = track.map_or(0.0, |t| unsure_s * t.motion.velocity().norm());
         let excess = user.residuals.excess(tolerated + unsure, &floor);
-        user.mismatched |= settled && (user.outside >= OUTSIDE_FRAMES || excess.surprise > level);
+        user.mismatched |= settled && (user.outside >= OUTSIDE_FRAMES || excess.neg_log_p > level);
         let Some(track) = track.filter(|_| !a.ended && user.mismatched) else {
-            self.book.absent(&cause, now);
+            self.alerts.absent(&cause, now);
             return;
         };
         let distance = (track.motion.position() - a.position).norm();
@@ -163,21 +163,21 @@ impl Monitor {
             "track": track.id,
             "distance_m": distance,
             "tolerated_distance_m": tolerated,
-            "surprise": excess.surprise,
+            "surprise": excess.neg_log_p,
             "threshold": level,
             "claims_in_window": excess.window,
             "mean_distance_m": excess.distance_m,
             "frames_outside": outside,
             "clock_offset_s": self.ahead_s,
             "answered_from_elsewhere": is_displaced,
-            "power_against_reported": self.against_reported(asserted, answers, i),
+            "power_against_reported": self.against_reported(active, association, i),
         });
         let mut finding = self.at_track(Finding::new(severity, evidence), track);
         finding.claimed = claimed(a);
-        self.book.report(&cause, finding, now, self.frame);
+        self.alerts.report(&cause, finding, now, self.frame);
     }
 
-    fn decide_unseen(&mut self, a: &Asserted, level: f64, strangers: &mut Strangers, now: Timestamp) {
+    fn decide_unseen(&mut self, a: &ActiveClaim, level: f64, never_seen: &mut NeverSeen, now: Timestamp) {
         let cause = Cause::User(AlertKind::UserUnseen, a.claim.user.clone());
         let Some(user) = self.users.get(&a.claim.user) else {
             return;
@@ -191,19 +191,19 @@ impl Monitor {
             && gone_s >= self.config.decision_s
             && claimed_since
             && self.claims_settled(now)
-            && !self.awaits_newcomer(user, gone_s);
-        let goes_on = self.book.is_open(&cause) && a.expected && user.absence > 0.0;
+            && !self.awaits_unassociated(user, gone_s);
+        let goes_on = self.alerts.is_open(&cause) && a.expected && user.absence > 0.0;
         if !is_unseen && !goes_on {
-            self.book.absent(&cause, now);
+            self.alerts.absent(&cause, now);
             return;
         }
-        if user.last_answered.is_none() && !self.book.is_open(&cause) {
-            let with_alert = strangers
+        if user.last_answered.is_none() && !self.alerts.is_open(&cause) {
+            let with_alert = never_seen
                 .with_alert
-                .get_or_insert_with(|| self.book.users_lately(AlertKind::UserUnseen, now));
-            if *with_alert >= MOST_NEVER_SEEN || self.book.is_open(&Cause::Whole(AlertKind::UserUnseen)) {
-                strangers.names.push(a.claim.user.clone());
-                strangers.longest_s = strangers.longest_s.max(gone_s);
+                .get_or_insert_with(|| self.alerts.users_lately(AlertKind::UserUnseen, now));
+            if *with_alert >= MOST_NEVER_SEEN || self.alerts.is_open(&Cause::Whole(AlertKind::UserUnseen)) {
+                never_seen.names.push(a.claim.user.clone());
+                never_seen.longest_s = never_seen.longest_s.max(gone_s);
                 return;
             }
             *with_alert += 1;
@@ -217,37 +217,37 @@ impl Monitor {
         });
         let mut finding = Finding::new(severity, evidence);
         finding.claimed = claimed(a);
-        self.book.report(&cause, finding, now, self.frame);
+        self.alerts.report(&cause, finding, now, self.frame);
     }
 
     /// One alert for all who were never seen, beyond the first few: who floods the log with invented users must not bury
     /// the alerts of others. A user who was ever seen always has their own.
-    fn decide_strangers(&mut self, strangers: Strangers, now: Timestamp) {
+    fn decide_never_seen(&mut self, never_seen: NeverSeen, now: Timestamp) {
         let cause = Cause::Whole(AlertKind::UserUnseen);
-        self.strangers = strangers.names;
-        if self.strangers.is_empty() {
-            self.book.absent(&cause, now);
+        self.never_seen = never_seen.names;
+        if self.never_seen.is_empty() {
+            self.alerts.absent(&cause, now);
             return;
         }
         let evidence = json!({
-            "users_never_seen": self.strangers.len(),
-            "users": &self.strangers[..self.strangers.len().min(MOST_NAMES)],
-            "unseen_s": strangers.longest_s,
+            "users_never_seen": self.never_seen.len(),
+            "users": &self.never_seen[..self.never_seen.len().min(MOST_NAMES)],
+            "unseen_s": never_seen.longest_s,
         });
-        let finding = Finding::new(severity_after(strangers.longest_s), evidence);
-        self.book.report(&cause, finding, now, self.frame);
+        let finding = Finding::new(severity_after(never_seen.longest_s), evidence);
+        self.alerts.report(&cause, finding, now, self.frame);
     }
 
     /// Whether a beam that came as the user went is still being judged: it may be the user answering from elsewhere, which is
     /// one alert and not two. New beams without end put the verdict off by no more than a coincidence lasts.
-    fn awaits_newcomer(&self, user: &User, gone_s: f64) -> bool {
+    fn awaits_unassociated(&self, user: &User, gone_s: f64) -> bool {
         let Some(gone) = user.unanswered_since else {
             return false;
         };
         gone_s < self.config.decision_s + COINCIDENCE_S
-            && self.alone.iter().any(|(id, since)| {
+            && self.unassociated_since.iter().any(|(id, since)| {
                 let coincides = seconds(gone, *since).abs() <= COINCIDENCE_S;
-                coincides && !self.book.is_open(&Cause::Track(AlertKind::UnclaimedEmitter, *id))
+                coincides && !self.alerts.is_open(&Cause::Track(AlertKind::UnclaimedEmitter, *id))
             })
     }
 }
@@ -260,7 +260,7 @@ fn severity_after(gone_s: f64) -> Severity {
     }
 }
 
-pub(super) fn claimed(a: &Asserted) -> Option<Value> {
+pub fn claimed(a: &ActiveClaim) -> Option<Value> {
     Some(json!({
         "x_m": a.claim.x_m,
         "y_m": a.claim.y_m,

@@ -2,15 +2,15 @@ use jiff::Timestamp;
 use nalgebra::Vector2;
 use serde_json::{Value, json};
 
-use super::habits::median;
-use super::power::likelihood_ratio;
-use super::{COINCIDENCE_S, ESCALATE_S, Monitor};
 use crate::claims::seconds;
 use crate::monitor::alert::SAME_PLACE_M;
-use crate::monitor::book::{Cause, Finding};
-use crate::monitor::tracks::Track;
-use crate::monitor::users::Asserted;
-use crate::monitor::{AlertKind, Severity};
+use crate::monitor::alert::{AlertKind, Severity};
+use crate::monitor::alert_lifecycle::{Cause, Finding};
+use crate::monitor::evidence::likelihood_ratio;
+use crate::monitor::input::claim_state::ActiveClaim;
+use crate::monitor::input::claim_timing::median;
+use crate::monitor::monitor::{COINCIDENCE_S, ESCALATE_S, Monitor};
+use crate::monitor::track::tracker::Track;
 
 /// ln likelihood ratio from which a user counts as vanished: three frames in a row.
 const VANISHED: f64 = 6.9;
@@ -20,40 +20,40 @@ const PATIENCE: f64 = 0.65;
 
 impl Monitor {
     /// Notes since when each beam has had no claim.
-    pub(super) fn note_alone(&mut self, answers: &[Option<u64>], now: Timestamp) {
+    pub fn note_unassociated(&mut self, association: &[Option<u64>], now: Timestamp) {
         let tracks = &self.tracks;
-        self.alone.retain(|id, _| tracks.get(*id).is_some());
+        self.unassociated_since.retain(|id, _| tracks.get(*id).is_some());
         for track in &self.tracks.all {
-            if answers.contains(&Some(track.id)) {
-                self.alone.remove(&track.id);
-            } else if track.hit && track.shadows.is_none() {
-                self.alone.entry(track.id).or_insert(now);
+            if association.contains(&Some(track.id)) {
+                self.unassociated_since.remove(&track.id);
+            } else if track.hit && track.unresolved_from.is_none() {
+                self.unassociated_since.entry(track.id).or_insert(now);
             }
         }
     }
 
     /// How long what may be a user's waits for a claim.
-    pub(super) fn patience_s(&self) -> f64 {
+    pub fn patience_s(&self) -> f64 {
         PATIENCE * self.config.decision_s + self.delay_s
     }
 
-    pub(super) fn decide_unclaimed(&mut self, asserted: &[Asserted], answers: &mut [Option<u64>], now: Timestamp) {
+    pub fn decide_unclaimed(&mut self, active: &[ActiveClaim], association: &mut [Option<u64>], now: Timestamp) {
         let settled = self.claims_settled(now);
         let patience = self.patience_s();
         let candidates: Vec<Track> = self
             .tracks
             .all
             .iter()
-            .filter(|t| self.alone.contains_key(&t.id))
+            .filter(|t| self.unassociated_since.contains_key(&t.id))
             .cloned()
             .collect();
         for track in &candidates {
             let cause = Cause::Track(AlertKind::UnclaimedEmitter, track.id);
-            let since = self.alone[&track.id];
-            let open = self.book.is_open(&cause);
+            let since = self.unassociated_since[&track.id];
+            let open = self.alerts.is_open(&cause);
             let ripe = settled
                 && track.hit
-                && track.shadows.is_none()
+                && track.unresolved_from.is_none()
                 && track.confirmed
                 && track.score >= self.level_unclaimed
                 && seconds(since, now) >= patience;
@@ -61,27 +61,27 @@ impl Monitor {
                 continue;
             }
             if !open {
-                if let Some(i) = self.displaced_user(asserted, answers, since) {
-                    answers[i] = Some(track.id);
-                    let user = self.users.entry(asserted[i].claim.user.clone()).or_default();
+                if let Some(i) = self.displaced_user(active, association, since) {
+                    association[i] = Some(track.id);
+                    let user = self.users.entry(active[i].claim.user.clone()).or_default();
                     user.track = Some(track.id);
                     user.unanswered_since = None;
                     user.absence = 0.0;
                     user.displaced = true;
-                    self.alone.remove(&track.id);
+                    self.unassociated_since.remove(&track.id);
                     continue;
                 }
                 if let Some(old) = self.lost_alert_near(track) {
-                    self.book.rename(&old, cause.clone());
+                    self.alerts.rename(&old, cause.clone());
                 }
             }
             if track.hit {
-                let finding = self.unclaimed(asserted, track, since, now);
-                self.book.report(&cause, finding, now, self.frame);
+                let finding = self.unclaimed(active, track, since, now);
+                self.alerts.report(&cause, finding, now, self.frame);
             }
         }
         let open: Vec<(Cause, u64)> = self
-            .book
+            .alerts
             .open()
             .filter_map(|(c, _)| match c {
                 Cause::Track(_, id) => Some((c.clone(), *id)),
@@ -89,15 +89,15 @@ impl Monitor {
             })
             .collect();
         for (cause, id) in open {
-            let still = self.tracks.get(id).is_some_and(Track::is_seen) && self.alone.contains_key(&id);
+            let still = self.tracks.get(id).is_some_and(Track::is_seen) && self.unassociated_since.contains_key(&id);
             if !still {
-                match self.swapped_with(id, answers) {
+                match self.swapped_with(id, association) {
                     Some(other) => {
-                        self.alone.insert(other, now);
-                        self.book
+                        self.unassociated_since.insert(other, now);
+                        self.alerts
                             .rename(&cause, Cause::Track(AlertKind::UnclaimedEmitter, other));
                     }
-                    None => self.book.absent(&cause, now),
+                    None => self.alerts.absent(&cause, now),
                 }
             }
         }
@@ -105,13 +105,17 @@ impl Monitor {
 
     /// The beam without a claim in the spot that track `id` is in, when `id` itself answers one: where two beams melt, which
     /// is whose is a guess, and that one of them is nobody's is not.
-    fn swapped_with(&self, id: u64, answers: &[Option<u64>]) -> Option<u64> {
-        let track = self.tracks.get(id).filter(|_| answers.contains(&Some(id)))?;
+    fn swapped_with(&self, id: u64, association: &[Option<u64>]) -> Option<u64> {
+        let track = self.tracks.get(id).filter(|_| association.contains(&Some(id)))?;
         let here = track.motion.position();
         let reach = 2.0 * track.detection.resolution_m;
         let others = self.tracks.all.iter().filter(|t| {
             let cause = Cause::Track(AlertKind::UnclaimedEmitter, t.id);
-            t.id != id && t.is_seen() && t.confirmed && !answers.contains(&Some(t.id)) && !self.book.is_open(&cause)
+            t.id != id
+                && t.is_seen()
+                && t.confirmed
+                && !association.contains(&Some(t.id))
+                && !self.alerts.is_open(&cause)
         });
         let near = others.filter(|t| (t.motion.position() - here).norm() < reach);
         near.map(|t| t.id).next()
@@ -119,16 +123,16 @@ impl Monitor {
 
     /// A user whose beam vanished as this one appeared, or who has not been seen yet. Where several have not been seen, which
     /// of them it is would be a guess, and the beam is nobody's.
-    fn displaced_user(&self, asserted: &[Asserted], answers: &[Option<u64>], since: Timestamp) -> Option<usize> {
+    fn displaced_user(&self, active: &[ActiveClaim], association: &[Option<u64>], since: Timestamp) -> Option<usize> {
         let seen = |i: usize| {
-            let user = self.users.get(&asserted[i].claim.user);
+            let user = self.users.get(&active[i].claim.user);
             user.is_some_and(|u| u.last_answered.is_some())
         };
-        let candidates = (0..asserted.len())
-            .filter(|&i| answers[i].is_none() && asserted[i].expected)
+        let candidates = (0..active.len())
+            .filter(|&i| association[i].is_none() && active[i].expected)
             .filter_map(|i| {
-                let name = &asserted[i].claim.user;
-                if self.book.is_open(&Cause::User(AlertKind::UserUnseen, name.clone())) {
+                let name = &active[i].claim.user;
+                if self.alerts.is_open(&Cause::User(AlertKind::UserUnseen, name.clone())) {
                     return None;
                 }
                 let user = self.users.get(name)?;
@@ -144,10 +148,10 @@ impl Monitor {
     /// An open alert near here whose own track was lost, or took the place of the beam that answered a claim: the same cause.
     fn lost_alert_near(&self, track: &Track) -> Option<Cause> {
         let p = track.motion.position();
-        self.book.open().find_map(|(cause, alert)| {
+        self.alerts.open().find_map(|(cause, alert)| {
             let lost = match cause {
                 Cause::Track(AlertKind::UnclaimedEmitter, id) => {
-                    !self.alone.contains_key(id) || self.tracks.get(*id).is_none_or(|t| !t.hit)
+                    !self.unassociated_since.contains_key(id) || self.tracks.get(*id).is_none_or(|t| !t.hit)
                 }
                 Cause::Spot(_) => true,
                 _ => return None,
@@ -158,10 +162,10 @@ impl Monitor {
     }
 
     /// What else tells of an eavesdropper, each with its likelihood ratio against an honest stray beam.
-    fn unclaimed(&self, asserted: &[Asserted], track: &Track, since: Timestamp, now: Timestamp) -> Finding {
+    fn unclaimed(&self, active: &[ActiveClaim], track: &Track, since: Timestamp, now: Timestamp) -> Finding {
         let lasted = seconds(since, now);
         let here = track.motion.position();
-        let nearest = asserted
+        let nearest = active
             .iter()
             .filter(|a| !a.ended)
             .map(|a| (a, (a.position - here).norm()))
@@ -171,7 +175,7 @@ impl Monitor {
         let beside = nearest.map(|(a, distance)| {
             // One who wants a user's light stands within its spot; one who does not is anywhere in view.
             let spot = 3.0 * self.spot_m();
-            let by_chance = (std::f64::consts::PI * spot * spot * asserted.len() as f64 / (width * height)).min(1.0);
+            let by_chance = (std::f64::consts::PI * spot * spot * active.len() as f64 / (width * height)).min(1.0);
             json!({
                 "user": a.claim.user,
                 "distance_m": distance,
@@ -179,7 +183,7 @@ impl Monitor {
                 "second_beam_for_claim": distance <= self.config.tolerated_distance_m + a.slack_m,
             })
         });
-        let vanished: Vec<Value> = asserted
+        let vanished: Vec<Value> = active
             .iter()
             .filter_map(|a| {
                 let gone = self.users.get(&a.claim.user)?.unanswered_since?;
