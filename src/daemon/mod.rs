@@ -32,13 +32,13 @@ use publish::Outlet;
 use status::State;
 use supervisor::Supervisor;
 
-/// Requests that may wait for the compute thread; more are told to come back.
+/// Most requests that wait for the compute thread; further ones are answered 503.
 const COMMANDS: usize = 64;
-/// How often the journal is held to its limits.
+/// Interval of journal maintenance (age and size limits).
 const MAINTENANCE: Duration = Duration::from_secs(3600);
-/// How often measurements are added up: until then each one is kept, and nobody may ever ask for the metrics.
+/// Interval of aggregating histogram samples: until then each sample is kept, also where no server asks for the metrics.
 const UPKEEP: Duration = Duration::from_secs(5);
-/// Deliveries under way when the daemon stops have this long.
+/// Time that deliveries under way have when the daemon stops.
 const LAST_DELIVERIES: Duration = Duration::from_millis(800);
 
 /// A daemon whose config has been checked and whose files have been opened; no port is bound yet.
@@ -182,7 +182,7 @@ impl Daemon {
             },
         };
 
-        // First the intake, then those who live on it; the journal, dropped last, writes what is left.
+        // The compute thread stops first, then its readers; the journal is dropped last and writes what is left.
         halt.store(true, Ordering::Relaxed);
         if !compute.is_finished() {
             compute.await?;
