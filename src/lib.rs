@@ -3,7 +3,7 @@
 //! Data flows one way: frame → heatmap → peaks → emitters → ground positions → matches → tracks →
 //! verdicts → alerts → journal → API and webhooks. The modules are that chain, and imports go down only;
 //! ARCHITECTURE.md has the map.
-// One room is let out of this: frames/v4l2/sys, which speaks to the kernel and says why at each place.
+// frames/v4l2/sys alone allows it, for ioctls and mapped memory, with the reason at each place.
 #![deny(unsafe_code)]
 
 pub mod claim;

@@ -1,3 +1,5 @@
+//! `oapwatch tradeoff`: measures accuracy against time.
+
 use std::path::PathBuf;
 
 use indicatif::{ProgressBar, ProgressStyle};
@@ -13,13 +15,13 @@ pub struct Args {
     /// Under a minute, fewer frames
     #[arg(long)]
     quick: bool,
-    /// Frames a cell
+    /// Frames per cell
     #[arg(long)]
     frames: Option<usize>,
     /// Only these cells, as "P8/60,E1/64"
     #[arg(long, value_delimiter = ',')]
     cells: Vec<String>,
-    /// Only these rungs, as "pencil,ml"
+    /// Only these estimators, as "pencil,ml"
     #[arg(long, value_delimiter = ',')]
     rungs: Vec<String>,
     /// Folder of trained networks with their cards: `network` and `hybrid` are measured with each where it was trained
@@ -49,7 +51,7 @@ pub fn run(args: Args) -> Outcome {
     }
     if plan.is_empty() {
         return Err(Failure::input(anyhow::anyhow!(
-            "nothing to measure: no such cell or rung; a run without --cells and --rungs names them all"
+            "nothing to measure: no such cell or estimator; a run without --cells and --rungs names them all"
         )));
     }
     let style =

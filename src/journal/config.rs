@@ -1,3 +1,5 @@
+//! `[journal]`: the file and what is kept in it.
+
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};

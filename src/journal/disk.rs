@@ -1,3 +1,6 @@
+//! The thread that writes batches to the SQLite file and applies retention, so that no other thread waits for the
+//! disk.
+
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, Sender};

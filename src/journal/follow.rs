@@ -1,3 +1,5 @@
+//! An in-order reader of alert events as they become durable.
+
 use tokio::sync::watch;
 
 use super::{Error, Journal, Recorded};

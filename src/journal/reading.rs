@@ -4,7 +4,9 @@ use std::collections::{BTreeMap, HashSet};
 
 use super::store::Store;
 use super::writer::lock;
-use super::{DeadLetter, EndpointRecord, Error, Filter, HISTORY, Journal, Page, READERS, Recorded, Waiting};
+use super::{
+    AuditRecord, DeadLetter, EndpointRecord, Error, Filter, HISTORY, Journal, Page, READERS, Recorded, Waiting,
+};
 use crate::monitor::Alert;
 
 impl Journal {
@@ -81,6 +83,18 @@ impl Journal {
     pub fn dead_letters(&self, endpoint: &str, limit: usize) -> Result<Vec<DeadLetter>, Error> {
         let (held, disk) = self.read(|store| store.dead_letters(endpoint, limit))?;
         Ok(disk.into_iter().chain(held).flatten().collect())
+    }
+
+    /// The audit log, newest first; `before` is the id of the last row of the page before.
+    pub fn audit_log(&self, before: Option<u64>, limit: usize) -> Result<Vec<AuditRecord>, Error> {
+        let (held, disk) = self.read(|store| store.audit(before, limit))?;
+        let by_id: BTreeMap<u64, AuditRecord> = disk
+            .into_iter()
+            .chain(held)
+            .flatten()
+            .map(|record| (record.id, record))
+            .collect();
+        Ok(by_id.into_values().rev().take(limit).collect())
     }
 
     pub fn endpoint(&self, id: &str) -> Result<EndpointRecord, Error> {

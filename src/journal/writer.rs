@@ -1,3 +1,5 @@
+//! The writer thread: decides whether events are on disk or in memory and when readers hear of them.
+
 use std::collections::VecDeque;
 use std::path::PathBuf;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender};
@@ -5,15 +7,19 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
+use jiff::Timestamp;
 use tokio::sync::watch;
 
 use super::retention::Retention;
 use super::store::{Store, Write};
-use super::{Attempt, Error, Health, Outcome, Subscription, disk};
+use super::{Attempt, AuditEntry, AuditRecord, Error, Health, Outcome, Subscription, disk};
 use crate::metric;
 
 /// Alert events that may wait for a disk that refuses them.
 pub(super) const BACKLOG: usize = 20_000;
+
+/// Rows of the audit log that may wait for a disk that refuses them: a flood of requests must not fill the memory.
+pub(super) const MOST_AUDIT_ROWS: usize = 2_000;
 
 /// Writes in one transaction: bounds how long it takes.
 const BATCH: usize = 2_000;
@@ -52,6 +58,9 @@ struct Queue {
     accepted: u64,
     /// Alert events here and in the writer's hands.
     events: usize,
+    /// Rows of the audit log, likewise.
+    audit_rows: usize,
+    last_audit: u64,
     closing: bool,
 }
 
@@ -82,6 +91,8 @@ impl Shared {
                 last_seq,
                 accepted: 0,
                 events: 0,
+                audit_rows: 0,
+                last_audit: 0,
                 closing: false,
             }),
             wake: Condvar::new(),
@@ -124,11 +135,6 @@ impl Shared {
         Ok(queue.last_seq)
     }
 
-    pub(super) fn number_above(&self, seq: u64) {
-        let mut queue = lock(&self.queue);
-        queue.last_seq = queue.last_seq.max(seq);
-    }
-
     /// Hands over any other write; gives the count of `done` at which it is through.
     pub(super) fn push(&self, write: Write) -> u64 {
         let mut queue = lock(&self.queue);
@@ -136,6 +142,26 @@ impl Shared {
         queue.accepted += 1;
         self.wake.notify_one();
         queue.accepted
+    }
+
+    /// Hands over a row of the audit log, numbered by its time.
+    pub(super) fn push_audit(&self, entry: AuditEntry, now: Timestamp) -> bool {
+        let mut queue = lock(&self.queue);
+        if queue.audit_rows >= MOST_AUDIT_ROWS {
+            return false;
+        }
+        let micros = u64::try_from(now.as_microsecond()).unwrap_or(0);
+        queue.last_audit = micros.max(queue.last_audit + 1);
+        let record = AuditRecord {
+            id: queue.last_audit,
+            at: now,
+            entry,
+        };
+        queue.writes.push_back(Write::Audit(Arc::new(record)));
+        queue.audit_rows += 1;
+        queue.accepted += 1;
+        self.wake.notify_one();
+        true
     }
 
     pub(super) fn accepted(&self) -> u64 {
@@ -165,8 +191,11 @@ impl Shared {
         (writes, queue.closing && queue.writes.is_empty())
     }
 
-    fn settled(&self, events: usize) {
-        lock(&self.queue).events -= events;
+    /// The writes are on disk, or in memory where there is no disk.
+    fn settled(&self, writes: &[Write]) {
+        let mut queue = lock(&self.queue);
+        queue.events -= events_in(writes);
+        queue.audit_rows -= writes.iter().filter(|w| matches!(w, Write::Audit(_))).count();
     }
 }
 
@@ -246,7 +275,7 @@ impl Writer {
     fn write(&mut self, writes: &[Write]) -> bool {
         if self.disk.is_none() {
             self.hold(writes);
-            self.shared.settled(events_in(writes));
+            self.shared.settled(writes);
             return false;
         }
         for write in writes {
@@ -280,7 +309,7 @@ impl Writer {
                 let written: Vec<Write> = self.deferred.drain(..link.pending).collect();
                 link.pending = 0;
                 self.failing = false;
-                self.shared.settled(events_in(&written));
+                self.shared.settled(&written);
                 lock(&self.shared.health).working(size, events_in(&self.deferred));
                 true
             }

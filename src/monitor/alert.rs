@@ -20,16 +20,19 @@ pub enum AlertKind {
     ClaimsStale,
     /// All users are shifted alike: our own pose is off.
     PoseInconsistent,
+    /// More is claimed than there is room or time for: claims are refused or shed.
+    ClaimsFlooded,
 }
 
 impl AlertKind {
-    pub const ALL: [Self; 6] = [
+    pub const ALL: [Self; 7] = [
         Self::UnclaimedEmitter,
         Self::PositionMismatch,
         Self::UserUnseen,
         Self::SensorLost,
         Self::ClaimsStale,
         Self::PoseInconsistent,
+        Self::ClaimsFlooded,
     ];
 }
 
@@ -80,6 +83,31 @@ pub struct Alert {
     pub claimed: Option<serde_json::Value>,
     pub evidence: serde_json::Value,
     pub source: AlertSource,
+    /// The latest acknowledgement; it stays, marked as withdrawn, when it is undone.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub acknowledgement: Option<Acknowledgement>,
+}
+
+/// That an operator took note of an alert.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+pub struct Acknowledgement {
+    #[schema(value_type = String, format = DateTime)]
+    pub at: Timestamp,
+    /// Name of the operator's token; null where the token has none, or none is asked for.
+    pub by: Option<String>,
+    pub note: Option<String>,
+    /// Set when the acknowledgement was undone; the alert is open again.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub withdrawn: Option<Withdrawal>,
+}
+
+/// That an acknowledgement was undone.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+pub struct Withdrawal {
+    #[schema(value_type = String, format = DateTime)]
+    pub at: Timestamp,
+    /// Name of the operator's token, as for the acknowledgement.
+    pub by: Option<String>,
 }
 
 impl Alert {
@@ -95,6 +123,13 @@ impl Alert {
     }
 }
 
+impl AlertEventKind {
+    /// Whether it is an operator's own act, of which webhooks do not tell.
+    pub fn is_by_operator(self) -> bool {
+        matches!(self, Self::Acknowledged | Self::Unacknowledged)
+    }
+}
+
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, utoipa::ToSchema)]
 pub enum AlertEventKind {
     #[serde(rename = "alert.raised")]
@@ -103,6 +138,9 @@ pub enum AlertEventKind {
     Updated,
     #[serde(rename = "alert.acknowledged")]
     Acknowledged,
+    /// An acknowledgement was undone.
+    #[serde(rename = "alert.unacknowledged")]
+    Unacknowledged,
     #[serde(rename = "alert.cleared")]
     Cleared,
 }

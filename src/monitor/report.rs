@@ -1,9 +1,9 @@
 use jiff::Timestamp;
 use serde::Serialize;
 
-use super::AlertEvent;
 use crate::claims::Claim;
 use crate::estimate::{Error, Estimate};
+use crate::monitor::alert::AlertEvent;
 
 /// What the sensor gave for one frame, as the monitor takes it.
 #[derive(Clone, Copy, Debug)]

@@ -1,3 +1,5 @@
+//! `[[webhook]]`: its keys and defaults.
+
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};

@@ -77,7 +77,7 @@ impl CoolDown {
             AlertEventKind::Raised => self.raised(delivery, alert, now),
             AlertEventKind::Updated => self.updated(delivery, alert, now),
             AlertEventKind::Cleared => self.cleared(delivery, alert, now),
-            AlertEventKind::Acknowledged => Ruling::Send(vec![delivery]),
+            AlertEventKind::Acknowledged | AlertEventKind::Unacknowledged => Ruling::Send(vec![delivery]),
         }
     }
 
@@ -238,6 +238,7 @@ mod tests {
                     frame: 0,
                     file: None,
                 },
+                acknowledgement: None,
             };
             let numbers = |rows: Vec<Waiting>| rows.iter().map(|r| r.seq.to_string()).collect::<Vec<_>>().join(" ");
             match self.cool_down.judge(delivery, &AlertEvent { event, alert }, s(now)) {

@@ -1,4 +1,4 @@
-//! Floor 4: signed webhooks, at least once, in order per alert, from a durable outbox.
+//! Layer 4: signed webhooks, at least once, in order per alert, from a durable outbox.
 //!
 //! The journal writes an outbox row with each alert event, in the same transaction; [`spawn`]'s worker sends
 //! what waits there until the receiver has confirmed it. docs/webhooks.md is the receiver's side of it.
@@ -8,6 +8,8 @@ mod clock;
 mod config;
 mod cooling;
 mod endpoint;
+mod error;
+mod http;
 mod payload;
 mod queue;
 mod schedule;
@@ -28,7 +30,8 @@ use worker::{Command, Worker};
 
 pub use clock::Clock;
 pub use config::Config;
-pub use endpoint::{Endpoint, Error, load};
+pub use endpoint::{Endpoint, load};
+pub use error::Error;
 pub use status::{EndpointState, EndpointStatus};
 
 /// How long a request of the operator waits for a busy disk, and in which steps.

@@ -1,4 +1,4 @@
-//! Who is there, and where, at a time.
+//! The emitters present at a time, and their positions.
 
 use rand::RngExt;
 
@@ -34,7 +34,7 @@ pub(super) struct Actor {
     pub entity: u64,
 }
 
-/// A motion ready to be evaluated at any time.
+/// A motion prepared for evaluation at any time.
 #[derive(Debug)]
 enum Path {
     Own(Motion),
@@ -122,7 +122,7 @@ impl Population {
         }
     }
 
-    /// Says who is there.
+    /// Notes who is simulated in the plan.
     pub fn explain(&self, decisions: &mut Decisions) {
         match &self.random {
             Some(random) => {
@@ -139,11 +139,11 @@ impl Population {
             .count();
         let moving = self.actors.iter().filter(|a| self.speed(&a.path) > 0.0).count();
         match (moving, roaming) {
-            (0, _) => decisions.note(Effect::Motion, Status::Off, "nobody moves"),
+            (0, _) => decisions.note(Effect::Motion, Status::Off, "no emitter moves"),
             (_, 0) => decisions.note(
                 Effect::Motion,
                 Status::On,
-                format!("{moving} move, each where its time says"),
+                format!("{moving} move, each a function of time"),
             ),
             _ => {
                 let reason = format!("{moving} move, {roaming} of them at random, drawn once");
@@ -176,7 +176,7 @@ impl Population {
         self.along(&self.actors[actor].path, t)
     }
 
-    /// Where the network's log says a user is at `t` seconds, m.
+    /// Claimed position of a user at `t` seconds, m.
     pub fn claimed(&self, actor: usize, t: f64) -> [f64; 2] {
         match &self.actors[actor].claimed {
             Some(path) => self.along(path, t),

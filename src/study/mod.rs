@@ -1,4 +1,4 @@
-//! Floor 4: studies: what accuracy costs in time, numerical stability, training data.
+//! Layer 4: studies of accuracy against time and of numerical stability, and training data.
 
 pub mod golden;
 pub mod samples;

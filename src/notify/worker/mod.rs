@@ -1,3 +1,5 @@
+//! The delivery loop: takes due deliveries from every endpoint's queue, sends them and notes the outcome.
+
 mod intake;
 
 use std::collections::{BTreeSet, HashMap};
@@ -139,7 +141,7 @@ impl Worker {
                 Some(ended) = self.requests.join_next_with_id(), if !self.requests.is_empty() => self.settle(ended),
                 Some(Ok(found)) = self.reads.join_next(), if !self.reads.is_empty() => self.found(found),
                 Ok(()) = heard.changed() => {}
-                Some(command) = self.commands.recv() => self.obey(command).await,
+                Some(command) = self.commands.recv() => self.handle_command(command).await,
                 () = self.clock.sleep_until(wake) => {}
             }
         }
@@ -265,7 +267,7 @@ impl Worker {
         });
     }
 
-    async fn obey(&mut self, command: Command) {
+    async fn handle_command(&mut self, command: Command) {
         match command {
             Command::Enable { endpoint, done } => {
                 self.journal.enable(self.lanes[endpoint].endpoint.name()).await;
