@@ -8,9 +8,11 @@
 
 pub mod claim;
 pub mod frame;
+pub mod hash;
 pub mod logging;
 pub mod metric;
 pub mod optics;
+pub mod stats;
 pub mod toml_file;
 
 pub mod assign;

@@ -9,6 +9,8 @@ const LAYERS: &[&str] = &[
     "toml_file",
     "logging",
     "metric",
+    "hash",
+    "stats",
     "frame",
     "claim",
     "optics",

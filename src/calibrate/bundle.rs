@@ -8,9 +8,10 @@ use super::device::{DEVICE, Prior, device_of, set_device};
 use super::exposure::{Exposure, NormalEquations, PER_SPOT, ScaledCholesky, Spot};
 use super::maps;
 use super::sources::{add_missing, background_strength, drop_dark, solve_energies};
-use super::survey_residuals::{Displacement, displacements, excess_variance, median};
+use super::survey_residuals::{Displacement, displacements, excess_variance};
 use super::truth::Beacon;
 use crate::optics::{Camera, Distortion};
+use crate::stats::median;
 
 /// Mahalanobis distance beyond which a surveyed position is rejected. A position error is Gaussian to about here: 4·10⁻⁶ of
 /// honest ones lie beyond (χ² with two degrees of freedom), while a swapped or mistyped one lies far beyond.

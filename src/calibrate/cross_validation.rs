@@ -7,6 +7,7 @@ use super::truth::Beacon;
 use crate::assign::assign;
 use crate::estimate::Estimator;
 use crate::frame::Frame;
+use crate::stats::median;
 
 /// Distance to the nearest emitter beyond which a beacon counts as missed, m.
 const CUTOFF_M: f64 = 25.0;
@@ -58,6 +59,6 @@ pub fn score(estimator: &mut dyn Estimator, frames: &[(usize, &Array2<f64>)], be
         missed,
         cost_m2: (sum + missed as f64 * CUTOFF_M * CUTOFF_M) / total as f64,
         mse_m2: sum / squared.len() as f64,
-        median_m2: super::survey_residuals::median(squared).unwrap_or(f64::NAN),
+        median_m2: median(squared).unwrap_or(f64::NAN),
     }
 }

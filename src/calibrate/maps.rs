@@ -4,6 +4,7 @@ use ndarray::Array2;
 
 use super::exposure::Exposure;
 use crate::optics::{Camera, PixelMaps};
+use crate::stats::median;
 
 /// Fewest frames that maps are estimated from.
 const MIN_FRAMES: usize = 10;
@@ -111,17 +112,15 @@ fn find_bad(sums: &[Sums], noise2: f64) -> Vec<bool> {
         .zip(&free)
         .map(|(s, f)| (s.zz - f.excess * s.zm - f.dark * s.z).max(0.0) / s.n.max(1.0))
         .collect();
-    let mut sorted: Vec<f64> = sums
+    let used: Vec<f64> = sums
         .iter()
         .zip(&left)
         .filter(|(s, _)| s.n > 0.0)
         .map(|(_, l)| *l)
         .collect();
-    if sorted.is_empty() {
+    let Some(typical) = median(used) else {
         return vec![true; sums.len()];
-    }
-    sorted.sort_by(f64::total_cmp);
-    let typical = sorted[sorted.len() / 2];
+    };
     sums.iter()
         .zip(free.iter().zip(&left))
         .map(|(s, (f, &left))| {

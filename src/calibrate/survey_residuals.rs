@@ -2,6 +2,8 @@
 
 use faer::Mat;
 
+use crate::stats::{mahalanobis2, median};
+
 use super::exposure::{Exposure, NormalEquations, ScaledCholesky};
 
 /// Fitted position of a spot without the survey prior, minus the predicted one, m on the sensor.
@@ -14,9 +16,7 @@ pub(super) struct Displacement {
 impl Displacement {
     pub fn mahalanobis2(&self, survey_var_m2: f64) -> f64 {
         let [[a, b], [_, c]] = self.cov;
-        let (a, c) = (a + survey_var_m2, c + survey_var_m2);
-        let [x, y] = self.offset;
-        (c * x * x - 2.0 * b * x * y + a * y * y) / (a * c - b * b)
+        mahalanobis2([[a + survey_var_m2, b], [b, c + survey_var_m2]], self.offset)
     }
 }
 
@@ -66,13 +66,4 @@ pub(super) fn excess_variance(axes: &[(f64, f64)]) -> f64 {
         }
     }
     (low * high).sqrt().max(low)
-}
-
-/// The middle value; none of an empty list.
-pub(super) fn median(mut values: Vec<f64>) -> Option<f64> {
-    if values.is_empty() {
-        return None;
-    }
-    let middle = values.len() / 2;
-    Some(*values.select_nth_unstable_by(middle, f64::total_cmp).1)
 }

@@ -1,11 +1,12 @@
 //! `oapwatch tradeoff`: measures accuracy against time.
 
+use std::io::Write;
 use std::path::PathBuf;
 
 use indicatif::{ProgressBar, ProgressStyle};
 
-use super::{Failure, Outcome};
-use crate::study::tradeoff::{Plan, Trained, run as study};
+use super::{Failure, Outcome, progress};
+use crate::study::tradeoff::{Oracle, Plan, Trained, run as study};
 
 #[derive(Debug, clap::Args)]
 pub struct Args {
@@ -30,9 +31,20 @@ pub struct Args {
     /// The same seed gives the same frames
     #[arg(long)]
     seed: Option<u64>,
+    /// Print instead how far `map` is from the most probable hypothesis: its search against one that starts from the truth
+    #[arg(long, conflicts_with_all = ["rungs", "networks"])]
+    oracle: bool,
 }
 
+/// Frames per cell and seed of `--oracle`, unless given.
+const ORACLE_FRAMES: usize = 1000;
+const ORACLE_QUICK_FRAMES: usize = 20;
+const ORACLE_SEED: u64 = 2;
+
 pub fn run(args: Args) -> Outcome {
+    if args.oracle {
+        return oracle(&args);
+    }
     let mut plan = if args.quick { Plan::quick() } else { Plan::full() };
     if let Some(frames) = args.frames {
         plan.frames = frames.max(1);
@@ -68,5 +80,36 @@ pub fn run(args: Args) -> Outcome {
         std::fs::read_to_string(args.out.join("tradeoff.md")).map_err(Failure::other)?
     );
     eprintln!("written to {}", args.out.display());
+    Ok(())
+}
+
+/// Prints one row per cell as soon as it is measured.
+fn oracle(args: &Args) -> Outcome {
+    let mut cells = Oracle::cells();
+    if !args.cells.is_empty() {
+        cells.retain(|c| args.cells.contains(&c.name()));
+    }
+    if cells.is_empty() {
+        let names: Vec<String> = Oracle::cells().iter().map(|c| c.name()).collect();
+        return Err(Failure::input(anyhow::anyhow!(
+            "--cells: expected some of {}, found {}",
+            names.join(", "),
+            args.cells.join(", ")
+        )));
+    }
+    let frames = args
+        .frames
+        .map_or(if args.quick { ORACLE_QUICK_FRAMES } else { ORACLE_FRAMES }, |n| {
+            n.max(1)
+        });
+    let bar = progress::bar(cells.len() as u64, "cells");
+    let mut out = std::io::stdout().lock();
+    writeln!(out, "{}", Oracle::HEAD).map_err(Failure::other)?;
+    for cell in cells {
+        let row = Oracle::measure(cell, frames, args.seed.unwrap_or(ORACLE_SEED)).map_err(Failure::other)?;
+        bar.suspend(|| writeln!(out, "{row}")).map_err(Failure::other)?;
+        bar.inc(1);
+    }
+    bar.finish_and_clear();
     Ok(())
 }

@@ -9,6 +9,7 @@ use super::process::GaussianProcess;
 use super::report::{Decisions, Status};
 use super::stream::{Ledger, Streams};
 use super::truth::Role;
+use crate::hash::fnv1a;
 
 /// One beam in one frame.
 #[derive(Clone, Copy, Debug)]
@@ -227,9 +228,7 @@ impl Population {
     }
 }
 
-/// Keys an actor's streams by its name (FNV-1a, 64 bit), so that adding another leaves them as they are.
+/// Keys an actor's streams by its name, so that adding another leaves them unchanged.
 fn entity(name: &str) -> u64 {
-    name.bytes().fold(0xcbf2_9ce4_8422_2325, |hash, byte| {
-        (hash ^ u64::from(byte)).wrapping_mul(0x0000_0100_0000_01b3)
-    })
+    fnv1a(name.bytes())
 }

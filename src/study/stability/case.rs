@@ -4,6 +4,7 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::time::{Duration, Instant};
 
 use crate::estimate;
+use crate::hash::fnv1a;
 
 /// Options of a run.
 #[derive(Clone, Debug)]
@@ -76,10 +77,7 @@ impl Case {
     /// requirement.
     pub fn run(&self, options: &Options) -> Row {
         let start = Instant::now();
-        // FNV-1a is the same on every platform and version, unlike the hashes of the standard library.
-        let own = self.name.bytes().fold(0xcbf2_9ce4_8422_2325, |hash: u64, byte| {
-            (hash ^ u64::from(byte)).wrapping_mul(0x100_0000_01b3)
-        });
+        let own = fnv1a(self.name.bytes());
         let options = &Options {
             seed: options.seed.wrapping_add(own),
             ..options.clone()

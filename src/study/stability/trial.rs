@@ -13,6 +13,7 @@ use super::{Observed, Options, Worst};
 use crate::estimate::{self, Error, Estimate, Flags};
 use crate::frame::Frame;
 use crate::optics::{Camera, Config, psf};
+use crate::stats::mahalanobis2;
 
 /// An emitter as it appears on the sensor.
 #[derive(Clone, Copy, Debug)]
@@ -260,20 +261,4 @@ impl Tally {
             fit: Some(self.worst),
         }
     }
-}
-
-/// dᵀC⁻¹d; 0 for no difference, ∞ where C is singular along d.
-pub fn mahalanobis2(cov: [[f64; 2]; 2], d: [f64; 2]) -> f64 {
-    if d == [0.0, 0.0] {
-        return 0.0;
-    }
-    // Whitened axis by axis, so that covariances of 1e-300 do not underflow in a determinant.
-    let (sx, sy) = (cov[0][0].sqrt(), cov[1][1].sqrt());
-    if sx == 0.0 || sy == 0.0 {
-        return f64::INFINITY;
-    }
-    let rho = cov[0][1] / sx / sy;
-    let (u, v) = (d[0] / sx, d[1] / sy);
-    let across = (v - rho * u).powi(2) / ((1.0 - rho) * (1.0 + rho)).max(f64::EPSILON);
-    u * u + across
 }

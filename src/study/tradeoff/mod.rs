@@ -3,7 +3,6 @@
 mod condition;
 mod error;
 mod networks;
-#[cfg(test)]
 mod oracle;
 mod picture;
 mod report;
@@ -18,6 +17,7 @@ pub(in crate::study) use networks::Candidate;
 pub use condition::Condition;
 pub use error::{Error, PictureError};
 pub use networks::{Trained, Training};
+pub use oracle::Oracle;
 pub use scene::{Cell, Noise};
 pub use score::{Row, Study};
 
