@@ -1,4 +1,4 @@
-//! The whole configuration: each room owns its table, this file only composes and loads them.
+//! The configuration file: composes the tables that each module defines, loads and validates them.
 
 use std::path::{Path, PathBuf};
 
@@ -41,7 +41,7 @@ pub enum CameraError {
 }
 
 impl Config {
-    /// The camera that frames come from. Where a scene is simulated and `[optics]` says nothing, it is the scene's.
+    /// The camera of the frames: the scene's for a simulated scene without `[optics]`, else that of `[optics]`.
     pub fn camera(&self) -> Result<optics::Camera, CameraError> {
         let is_simulated = self.source.kind == frames::SourceKind::Simulator;
         let scene = self
@@ -74,7 +74,7 @@ impl Config {
         Ok(config)
     }
 
-    /// The same without reading the calibration that it names.
+    /// Reads a config without the calibration that it names.
     pub fn load_uncalibrated(path: &Path) -> Result<Self, Error> {
         let mut config: Self = toml_file::read(path)?;
         let base = path.parent().unwrap_or(Path::new("")).to_owned();
@@ -112,11 +112,11 @@ impl Config {
     }
 }
 
-/// What a path in a config may begin with to name a credential that systemd hands over.
+/// Prefix of a path in a config that names a credential passed by systemd.
 const CREDENTIALS: &str = "$CREDENTIALS_DIRECTORY";
 
-/// Where a path in a config of the folder `base` leads. Without credentials, one among them stays as it is written, so
-/// that the error that nothing is there tells why.
+/// Resolves a path of a config in the folder `base`. A credential stays as written where systemd passes none, so that the error
+/// about the missing file names it.
 fn located(base: &Path, path: &Path, credentials: Option<&Path>) -> PathBuf {
     match (path.strip_prefix(CREDENTIALS), credentials) {
         (Ok(name), Some(folder)) => folder.join(name),
@@ -158,19 +158,19 @@ mod tests {
 
     /// The example with its commented keys and tables in force.
     fn in_full(text: &str) -> String {
-        let stands = |line: &&str| {
+        let is_setting = |line: &&str| {
             let rest = line.strip_prefix("# ").unwrap_or(line);
             let key = rest.split(" = ").next().unwrap_or_default();
             let is_key = rest.contains(" = ") && key.chars().all(|c| c.is_ascii_alphanumeric() || c == '_');
             is_key || rest.starts_with('[')
         };
-        let lines = text.lines().filter(stands);
+        let lines = text.lines().filter(is_setting);
         lines
             .map(|line| line.trim_start_matches("# ").to_owned() + "\n")
             .collect()
     }
 
-    /// What serde would have expected in a table.
+    /// The keys that serde expects in a table.
     fn keys_of(table: &str) -> Vec<String> {
         let error = toml::from_str::<Config>(&format!("{table}\nno_such_key = 1\n")).expect_err("an unknown key");
         let names = error.message().split('`').skip(1).step_by(2).skip(1);

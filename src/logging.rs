@@ -1,4 +1,4 @@
-//! Where log lines go: human to a terminal, structured to journald or, elsewhere, JSON on stderr.
+//! Logging: text to a terminal, structured fields to journald, JSON to any other stderr.
 
 use std::io::IsTerminal;
 

@@ -1,5 +1,5 @@
-//! Names of all metrics, by Prometheus conventions: base units, `_total` on counters, no user ids as labels.
-//! Rooms count with the `metrics` macros under these names; what a name means is described here and nowhere else.
+//! Names and descriptions of all metrics, by Prometheus conventions: base units, `_total` on counters, no user ids as labels.
+//! Modules count with the `metrics` macros under these names.
 
 use metrics::Unit;
 use metrics_exporter_prometheus::{BuildError, Matcher, PrometheusBuilder, PrometheusRecorder};
@@ -7,7 +7,7 @@ use metrics_exporter_prometheus::{BuildError, Matcher, PrometheusBuilder, Promet
 pub const FRAMES_CAPTURED: &str = "oapwatch_frames_captured_total";
 pub const FRAMES_DROPPED: &str = "oapwatch_frames_dropped_total";
 pub const FRAMES_UNUSABLE: &str = "oapwatch_frames_unusable_total";
-/// The estimator's budget ended before it had tried everything.
+/// The time budget of the estimator ended before its search did.
 pub const FRAMES_CUT_SHORT: &str = "oapwatch_frames_cut_short_total";
 pub const LAST_GOOD_FRAME: &str = "oapwatch_last_good_frame_timestamp_seconds";
 /// Label `stage`: one of [`STAGES`].
@@ -21,9 +21,10 @@ pub const USERS_UNSEEN: &str = "oapwatch_users_unseen";
 pub const ALERTS_RAISED: &str = "oapwatch_alerts_raised_total";
 /// Label `kind`.
 pub const ALERTS_OPEN: &str = "oapwatch_alerts_open";
-/// Label `outcome`: accepted, late (kept as history), duplicate, refused (contradicts, too old, no room), malformed.
+/// Label `outcome`: accepted, late (kept as history), duplicate, refused (contradicts, too old, store full), malformed, shed (more than there is time for).
 pub const CLAIMS: &str = "oapwatch_claims_total";
 pub const CLAIMS_LAST: &str = "oapwatch_claims_last_timestamp_seconds";
+pub const CLAIMS_SKIPPED: &str = "oapwatch_claims_log_skipped_bytes_total";
 /// Labels `endpoint` and `outcome`.
 pub const WEBHOOK_ATTEMPTS: &str = "oapwatch_webhook_attempts_total";
 /// Label `endpoint`, as of the three.
@@ -71,14 +72,14 @@ pub fn recorder() -> Result<PrometheusRecorder, BuildError> {
         .build_recorder())
 }
 
-/// Gives every metric its help text, and counters that must not be absent their zero.
+/// Registers the help text of every metric and the initial values of those that must not be absent.
 pub fn describe() {
     use metrics::{counter, describe_counter as c, describe_gauge as g, describe_histogram as h, gauge};
 
     c!(FRAMES_CAPTURED, "Frames the source delivered.");
     c!(
         FRAMES_DROPPED,
-        "Frames replaced by a newer one before they were looked at."
+        "Frames replaced by a newer one before they were processed."
     );
     c!(
         FRAMES_UNUSABLE,
@@ -86,12 +87,12 @@ pub fn describe() {
     );
     c!(
         FRAMES_CUT_SHORT,
-        "Frames whose best answer within the time budget was taken."
+        "Frames whose estimate was cut short by the time budget."
     );
     g!(
         LAST_GOOD_FRAME,
         Unit::Seconds,
-        "Unix time of the last frame that gave a result."
+        "Unix time of the last frame with a result; 0 before the first."
     );
     h!(STAGE_SECONDS, Unit::Seconds, "Time a frame spends in each stage.");
     h!(
@@ -99,31 +100,36 @@ pub fn describe() {
         Unit::Seconds,
         "Time from a frame's arrival to its published report."
     );
-    g!(EMITTERS, "Beams seen in the latest frame, by status.");
-    g!(USERS_UNSEEN, "Active users in view that no beam answers for.");
+    g!(EMITTERS, "Emitters in the latest frame, by status.");
+    g!(USERS_UNSEEN, "Active users in view without an emitter.");
     c!(ALERTS_RAISED, "Alerts raised, by kind.");
-    g!(ALERTS_OPEN, "Alerts not yet cleared, by kind.");
+    g!(ALERTS_OPEN, "Alerts that are not cleared, by kind.");
     c!(CLAIMS, "Claims received, by outcome.");
+    c!(
+        CLAIMS_SKIPPED,
+        Unit::Bytes,
+        "Bytes of the claims log that were not read: its beginning at the start, or more than could be read."
+    );
     g!(
         CLAIMS_LAST,
         Unit::Seconds,
-        "Unix time that the newest accepted claim was made for."
+        "Unix time stated by the newest accepted claim; 0 before the first."
     );
     c!(WEBHOOK_ATTEMPTS, "Webhook delivery attempts, by endpoint and outcome.");
-    g!(WEBHOOK_QUEUED, "Webhook deliveries that wait.");
+    g!(WEBHOOK_QUEUED, "Webhook deliveries in the queue.");
     g!(
         WEBHOOK_OLDEST,
         Unit::Seconds,
-        "Age of the oldest webhook delivery that waits."
+        "Age of the oldest webhook delivery in the queue."
     );
     g!(
         WEBHOOK_DEAD_LETTERS,
-        "Webhook deliveries given up on and kept for a replay."
+        "Webhook deliveries that failed for good and are kept for a replay."
     );
     g!(JOURNAL_BYTES, Unit::Bytes, "Size of the journal on disk.");
     g!(JOURNAL_WRITABLE, "1 while alerts reach the disk, else 0.");
-    g!(JOURNAL_UNWRITTEN, "Alert events in memory that the disk has not taken.");
-    c!(JOURNAL_LOST, "Alert events that found disk and memory full.");
+    g!(JOURNAL_UNWRITTEN, "Alert events in memory that are not on disk yet.");
+    c!(JOURNAL_LOST, "Alert events lost because disk and memory were full.");
     c!(JOURNAL_FAILURES, "Writes to the journal that failed.");
     h!(
         JOURNAL_WRITE_SECONDS,
@@ -135,26 +141,33 @@ pub fn describe() {
         RECORDER_DROPPED,
         "Frames and evidence not recorded because the disk could not keep up."
     );
-    c!(RECORDER_ERRORS, "Recordings that failed: disk full, folder gone.");
+    c!(
+        RECORDER_ERRORS,
+        "Writes of the recorder that failed, such as on a full disk."
+    );
     c!(SOURCE_OPENED, "Times the camera was opened.");
-    c!(SOURCE_FRAMES_LOST, "Frames the driver lost before we saw them.");
+    c!(SOURCE_FRAMES_LOST, "Frames lost by the driver.");
     c!(SOURCE_FAULTS, "Faults of the camera, by kind.");
     c!(HTTP_REQUESTS, "Requests answered, by method, route and status.");
     h!(HTTP_SECONDS, Unit::Seconds, "Time to answer a request, by route.");
     g!(HTTP_CONNECTIONS, "Open connections.");
-    c!(HTTP_REFUSED, "Connections and requests turned away, by reason.");
+    c!(HTTP_REFUSED, "Connections and requests refused, by reason.");
     g!(STREAM_CLIENTS, "Open streams, by protocol.");
-    c!(STREAM_POSITIONS_MISSED, "Position messages that slow readers lost.");
+    c!(STREAM_POSITIONS_MISSED, "Position messages dropped for slow readers.");
     g!(BUILD_INFO, "The running version; always 1.");
 
     for name in [
         FRAMES_CAPTURED,
         FRAMES_DROPPED,
         FRAMES_UNUSABLE,
+        CLAIMS_SKIPPED,
         STREAM_POSITIONS_MISSED,
         JOURNAL_FAILURES,
     ] {
         counter!(name).increment(0);
+    }
+    for outcome in ["accepted", "late", "duplicate", "refused", "malformed", "shed"] {
+        counter!(CLAIMS, "outcome" => outcome).increment(0);
     }
     gauge!(BUILD_INFO, "version" => env!("CARGO_PKG_VERSION")).set(1.0);
 }

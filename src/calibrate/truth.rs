@@ -1,15 +1,15 @@
-//! Known positions, as a user would write them down: NDJSON, one object a frame.
+//! Reads known positions: NDJSON, one object a frame.
 //!
 //! Accepted: `{"frame":0,"emitters":[{"x_m":1,"y_m":2},…]}` (what `simulate` writes), `{"frame":0,"positions":[[1,2],…]}`,
 //! `{"frame":0,"xy_m":[[1,2],…]}`, `{"frame":0,"x_m":1,"y_m":2}` (one beacon a line, several lines a frame). Without
-//! `frame`, the n-th line belongs to the n-th frame. A frame may be left out, and so may be emitters nobody surveyed.
+//! `frame`, the n-th line belongs to the n-th frame. Frames and emitters without a surveyed position may be left out.
 
 use std::io::BufRead;
 use std::path::{Path, PathBuf};
 
 use serde_json::Value;
 
-/// A surveyed position: what somebody says, which may be wrong.
+/// A surveyed position. It may be wrong: the fit rejects outliers.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Beacon {
     /// Frame number in the recording.
@@ -43,7 +43,7 @@ pub enum Error {
     Empty { path: PathBuf, example: &'static str },
 }
 
-/// A field that is not what it should be; the reader adds file and line.
+/// A field with an unexpected value; the reader adds file and line.
 struct Wrong {
     field: &'static str,
     expected: &'static str,
@@ -162,7 +162,7 @@ mod tests {
     }
 
     #[test]
-    fn every_form_a_user_would_write_is_read() {
+    fn every_accepted_form_is_read() {
         let all = [
             r#"{"frame":3,"emitters":[{"x_m":1,"y_m":2,"energy_j":0.1},{"x_m":3,"y_m":4}]}"#,
             r#"{"frame":3,"positions":[[1,2],[3,4]]}"#,

@@ -1,3 +1,5 @@
+//! `oapwatch calibrate`: fits the calibration of a device to frames with known positions.
+
 use std::path::PathBuf;
 
 use anyhow::{Context, anyhow};
@@ -13,7 +15,7 @@ use crate::optics::Camera;
 
 #[derive(Debug, clap::Args)]
 pub struct Args {
-    /// The device as its data sheet has it; a calibration that it names is what the new one must beat
+    /// Config with the data sheet of the device; the result must improve on a calibration that it names
     #[arg(long)]
     config: PathBuf,
     /// NDJSON with the known positions of each frame
@@ -26,7 +28,7 @@ pub struct Args {
     frames: PathBuf,
 }
 
-/// Rejected lines of the truth file that the report names.
+/// Most rejected lines of the truth file that the report names.
 const NAMED: usize = 20;
 
 pub fn run(args: Args) -> Outcome {
@@ -35,7 +37,7 @@ pub fn run(args: Args) -> Outcome {
     if let Some(path) = config.optics.calibration.take() {
         match file::read(&path) {
             Ok(calibration) => config.optics.calibrated = Some(calibration),
-            // The very file that is to be written now.
+            // The file that this command will write.
             Err(file::Error::Io { source, .. }) if source.kind() == std::io::ErrorKind::NotFound => {}
             Err(e) => return Err(Failure::config(e)),
         }
@@ -59,7 +61,7 @@ pub fn run(args: Args) -> Outcome {
         bar.tick();
     };
     let mut build = |camera: &Camera| estimate::build(&config.estimator, camera);
-    // Fails here rather than after the fit.
+    // Checked before the long fit.
     build(&camera).with_context(in_config).map_err(Failure::Config)?;
     let outcome = calibrate::calibrate(&camera, &list, &beacons, &mut build, &mut progress);
     bar.finish_and_clear();
@@ -100,7 +102,7 @@ pub fn run(args: Args) -> Outcome {
     Ok(())
 }
 
-/// The frames that have beacons.
+/// Reads the frames that have beacons.
 fn read_frames(args: &Args, camera: &Camera, beacons: &[truth::Beacon]) -> Result<Vec<(usize, Array2<f64>)>, Failure> {
     let reader = npy::Reader::open(&args.frames, camera.joules_per_count).map_err(Failure::input)?;
     let (ny, nx) = reader.shape();
@@ -137,9 +139,9 @@ fn report(c: &Calibrated) -> Vec<String> {
     let k = &fitted.calibration;
     let d = &k.distortion;
     let mut lines = vec![format!(
-        "{} frames, {} positions believed, {} rejected, {} frames unexplained; reduced χ² {:.3}",
+        "{} frames, {} positions used, {} rejected, {} frames unexplained; reduced χ² {:.3}",
         c.frames,
-        fitted.believed.len(),
+        fitted.accepted.len(),
         fitted.rejected.len(),
         fitted.unexplained.len(),
         fitted.reduced_chi2

@@ -1,3 +1,5 @@
+//! `oapwatch check`: validates a config or scene.
+
 use std::path::PathBuf;
 
 use super::{Failure, Outcome};
@@ -6,7 +8,7 @@ use crate::pipeline::Pipeline;
 use crate::scene::{Plan, Scene};
 use crate::{api, frames, notify, toml_file};
 
-/// Keys that a scene has and a config has not.
+/// Keys of a scene that no config has.
 const OF_SCENES: [&str; 7] = [
     "about",
     "rate_hz",

@@ -1,3 +1,5 @@
+//! `oapwatch completions`: prints shell completions.
+
 use clap::CommandFactory;
 
 use super::Outcome;

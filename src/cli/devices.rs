@@ -1,3 +1,5 @@
+//! `oapwatch devices`: lists V4L2 devices with their formats and sizes.
+
 use std::io::Write;
 
 use super::{Failure, Outcome};

@@ -1,3 +1,5 @@
+//! `oapwatch explain`: the effects that a scene simulates, the reason, and the cost of each.
+
 use std::fmt::Write;
 use std::hint::black_box;
 use std::path::PathBuf;

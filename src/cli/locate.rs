@@ -1,3 +1,5 @@
+//! `oapwatch locate`: finds the emitters of every frame of a recording.
+
 use std::io::Write;
 use std::time::Instant;
 
@@ -14,7 +16,7 @@ use crate::frames::npy;
 pub struct Args {
     #[arg(long)]
     config: std::path::PathBuf,
-    /// A rung of the ladder instead of the one configured
+    /// Estimator to use instead of the configured one; `oapwatch tradeoff` compares them
     #[arg(long)]
     estimator: Option<String>,
     /// FRAMES.npy

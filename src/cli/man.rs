@@ -1,3 +1,5 @@
+//! `oapwatch man`: writes the manual pages.
+
 use std::path::PathBuf;
 
 use clap::CommandFactory;

@@ -1,8 +1,10 @@
+//! Progress bars on stderr.
+
 use std::io::IsTerminal;
 
 use indicatif::{ProgressBar, ProgressStyle};
 
-/// A bar on stderr for `len` things; hidden where that is no terminal.
+/// A bar on stderr for `len` things; hidden where stderr is not a terminal.
 pub fn bar(len: u64, things: &str) -> ProgressBar {
     styled(
         ProgressBar::new(len),
@@ -10,7 +12,7 @@ pub fn bar(len: u64, things: &str) -> ProgressBar {
     )
 }
 
-/// A count on stderr for a command whose results go to stdout as it runs; hidden where they scroll by on a terminal.
+/// A count on stderr for a command that prints results while it runs; hidden where stdout is a terminal.
 pub fn count(things: &str) -> ProgressBar {
     match std::io::stdout().is_terminal() {
         true => ProgressBar::hidden(),

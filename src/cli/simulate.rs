@@ -1,3 +1,5 @@
+//! `oapwatch simulate`: writes the frames, truth and claims of a scene.
+
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};

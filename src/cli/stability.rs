@@ -1,3 +1,5 @@
+//! `oapwatch stability`: runs the catalogue of hard cases.
+
 use std::path::PathBuf;
 
 use super::{Failure, Outcome, progress};
@@ -11,7 +13,7 @@ pub struct Args {
     frames: u32,
     #[arg(long, value_name = "S", default_value_t = 1)]
     seed: u64,
-    /// The estimator to try; the default one when left out
+    /// Estimator to test; the default one when left out
     #[arg(long, value_name = "NAME")]
     estimator: Option<String>,
     /// Only cases whose group or name contains this
@@ -52,10 +54,10 @@ pub fn run(args: Args) -> Outcome {
     let broken = rows.iter().filter(|r| !r.seen.holds).count();
     if broken > 0 {
         return Err(Failure::other(anyhow::anyhow!(
-            "{broken} of {} promises do not hold",
+            "{broken} of {} requirements do not hold",
             rows.len()
         )));
     }
-    println!("All {} promises hold.", rows.len());
+    println!("All {} requirements hold.", rows.len());
     Ok(())
 }

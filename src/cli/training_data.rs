@@ -1,3 +1,5 @@
+//! `oapwatch training-data`: streams simulated frames with their truth.
+
 use std::io::{BufWriter, IsTerminal};
 use std::path::PathBuf;
 
@@ -13,7 +15,7 @@ pub struct Args {
     /// How many samples
     #[arg(long)]
     samples: u64,
-    /// Number of the first one: a stream can be taken up where it was left
+    /// Number of the first sample, to continue a stream
     #[arg(long, default_value_t = 0)]
     first: u64,
     /// The same seed gives the same samples

@@ -18,7 +18,7 @@ use jiff::Timestamp;
 use metrics_exporter_prometheus::PrometheusHandle;
 use tokio::sync::{mpsc, watch};
 
-use crate::claims::Follower;
+use crate::claims::{Follower, Inbox};
 use crate::config::Config;
 use crate::frames::record::Recorder;
 use crate::frames::{self, Capture, FrameSource, SourceKind};
@@ -32,13 +32,13 @@ use publish::Outlet;
 use status::State;
 use supervisor::Supervisor;
 
-/// Requests that may wait for the compute thread; more are told to come back.
+/// Most requests that wait for the compute thread; further ones are answered 503.
 const COMMANDS: usize = 64;
-/// How often the journal is held to its limits.
+/// Interval of journal maintenance (age and size limits).
 const MAINTENANCE: Duration = Duration::from_secs(3600);
-/// How often measurements are added up: until then each one is kept, and nobody may ever ask for the metrics.
+/// Interval of aggregating histogram samples: until then each sample is kept, also where no server asks for the metrics.
 const UPKEEP: Duration = Duration::from_secs(5);
-/// Deliveries under way when the daemon stops have this long.
+/// Time that deliveries under way have when the daemon stops.
 const LAST_DELIVERIES: Duration = Duration::from_millis(800);
 
 /// A daemon whose config has been checked and whose files have been opened; no port is bound yet.
@@ -138,15 +138,20 @@ impl Daemon {
         );
         let is_replay = source.kind == SourceKind::Replay;
         let halt = Arc::new(AtomicBool::new(false));
+        if !is_replay {
+            self.pipeline.claims.expect_live_claims();
+        }
+        let inbox = Inbox::new(self.pipeline.claims.roster());
         let compute = Compute {
             pipeline: self.pipeline,
             capture: Capture::start(self.source)?,
             recorder: self.recorder,
-            fresh: Vec::new(),
+            inbox: inbox.clone(),
+            posts: intake::Posts::default(),
             unrecorded: Vec::new(),
             commands: orders,
             follower: log
-                .map(|l| ClaimsLog::new(Follower::new(l, &self.config.claims), is_replay, halt.clone()))
+                .map(|l| ClaimsLog::new(Follower::new(l, &self.config.claims), inbox, is_replay, halt.clone()))
                 .transpose()?,
             outlet,
             journal: self.journal.clone(),
@@ -177,7 +182,7 @@ impl Daemon {
             },
         };
 
-        // First the intake, then those who live on it; the journal, dropped last, writes what is left.
+        // The compute thread stops first, then its readers; the journal is dropped last and writes what is left.
         halt.store(true, Ordering::Relaxed);
         if !compute.is_finished() {
             compute.await?;

@@ -1,3 +1,5 @@
+//! `[source]`: which source of frames and its settings.
+
 use std::path::PathBuf;
 
 use jiff::Timestamp;

@@ -1,4 +1,4 @@
-//! Why frames cannot be had.
+//! Errors of opening a source of frames.
 
 use std::path::PathBuf;
 
@@ -43,7 +43,7 @@ pub enum Error {
 }
 
 impl Error {
-    /// Whether the config is at fault, not what it points at.
+    /// Whether the config is wrong, rather than a file that it names.
     pub fn is_config(&self) -> bool {
         !matches!(
             self,
@@ -51,7 +51,7 @@ impl Error {
         )
     }
 
-    /// Whether there was no room to write.
+    /// Whether the disk or quota is full.
     pub fn is_full_disk(&self) -> bool {
         use std::io::ErrorKind::{QuotaExceeded, StorageFull};
         match self {

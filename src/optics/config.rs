@@ -1,3 +1,5 @@
+//! `[optics]` of a config or scene.
+
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
@@ -29,7 +31,7 @@ pub struct Config {
     pub saturation_j: Option<f64>,
     /// A file written by `oapwatch calibrate`.
     pub calibration: Option<PathBuf>,
-    /// The content of that file, put here by whoever reads the config.
+    /// The content of that file, filled in by the reader of the config.
     #[serde(skip)]
     pub calibrated: Option<Calibration>,
 }

@@ -1,8 +1,10 @@
+//! `[source.v4l2]`: the settings requested from a camera.
+
 use serde::{Deserialize, Serialize};
 
 use super::image::{PixelFormat, Region};
 
-/// `[source.v4l2]`: what to ask of the camera. What is left out stays as the driver has it.
+/// `[source.v4l2]`. Settings that are left out stay as the driver has them.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Config {
@@ -23,9 +25,9 @@ pub struct Config {
     pub gain: Option<i64>,
     /// A camera pixel at or above this count is saturated; the format's largest count when left out.
     pub saturation_counts: Option<u16>,
-    /// Frames to pass over after each start, while the settings take hold.
+    /// Frames to skip after each start, until the settings take effect.
     pub settle_frames: u32,
-    /// Without a usable frame for this long, the device is opened anew.
+    /// Without a usable frame for this long the device is reopened, s.
     pub stall_s: f64,
 }
 
