@@ -1,8 +1,10 @@
 //! `oapwatch stability`: runs the catalogue of hard cases.
 
+use std::io::Write;
 use std::path::PathBuf;
 
-use super::{Failure, Outcome, progress};
+use super::progress::Steps;
+use super::{Failure, Outcome};
 use crate::estimate;
 use crate::study::stability::{Options, catalogue, markdown};
 
@@ -40,14 +42,15 @@ pub fn run(args: Args) -> Outcome {
     let mut rows = Vec::new();
     let mut cases = catalogue();
     cases.retain(|case| wanted(case.group) || wanted(&case.name));
-    let bar = progress::bar(cases.len() as u64, "cases");
+    let mut steps = Steps::new(cases.len() as u64);
     for case in cases {
         rows.push(case.run(&options));
-        bar.inc(1);
+        steps.next(&case.name);
     }
-    bar.finish_and_clear();
+    steps.finish();
     let text = markdown(&rows, &options);
-    println!("{text}");
+    let mut out = std::io::stdout().lock();
+    writeln!(out, "{text}").map_err(Failure::other)?;
     if let Some(path) = &args.out {
         std::fs::write(path, &text).map_err(|e| Failure::other(anyhow::anyhow!("{}: {e}", path.display())))?;
     }
@@ -58,6 +61,5 @@ pub fn run(args: Args) -> Outcome {
             rows.len()
         )));
     }
-    println!("All {} requirements hold.", rows.len());
-    Ok(())
+    writeln!(out, "All {} requirements hold.", rows.len()).map_err(Failure::other)
 }

@@ -59,6 +59,10 @@ impl Daemon {
     pub fn new(config: Config, path: Option<PathBuf>) -> Result<Self> {
         let camera = config.camera()?;
         let pipeline = Pipeline::new(&config, &camera)?;
+        config.journal.validate()?;
+        for warning in config.warnings(&camera) {
+            tracing::warn!("{warning}");
+        }
         let server = api::Server::new(config.api.clone())?;
         let endpoints = notify::load(&config.webhook)?;
         let source = frames::open(&config.source, &camera)?;
