@@ -4,7 +4,8 @@ use std::collections::VecDeque;
 
 use jiff::Timestamp;
 
-use super::{Claim, ClaimState, Outcome, seconds};
+use super::outcome::Outcome;
+use super::{Claim, ClaimState, seconds};
 
 /// Claims kept per user, the newest included. Sixteen reach back sixteen seconds at 1 Hz, further than a beam's trail (6 s).
 pub(super) const HISTORY: usize = 16;

@@ -6,6 +6,8 @@ use std::path::PathBuf;
 use indicatif::{ProgressBar, ProgressStyle};
 
 use super::{Failure, Outcome, progress};
+use crate::estimate::Rules;
+use crate::study::ablation;
 use crate::study::tradeoff::{Oracle, Plan, Trained, run as study};
 
 #[derive(Debug, clap::Args)]
@@ -25,6 +27,9 @@ pub struct Args {
     /// Only these estimators, as "pencil,ml"
     #[arg(long, value_delimiter = ',')]
     rungs: Vec<String>,
+    /// What each of these rules of `ml` and `map` gains and costs, measured with and without it; `all` takes each in turn
+    #[arg(long, value_name = "RULE", value_delimiter = ',')]
+    without: Vec<String>,
     /// Folder of trained networks with their cards: `network` and `hybrid` are measured with each where it was trained
     #[arg(long)]
     networks: Option<PathBuf>,
@@ -65,6 +70,9 @@ pub fn run(args: Args) -> Outcome {
         return Err(Failure::input(anyhow::anyhow!(
             "nothing to measure: no such cell or estimator; a run without --cells and --rungs names them all"
         )));
+    }
+    if !args.without.is_empty() {
+        return ablate(&plan, &args);
     }
     let style =
         ProgressStyle::with_template("{bar:40} {pos}/{len} {elapsed} (left {eta}) {msg}").map_err(Failure::other)?;
@@ -111,5 +119,32 @@ fn oracle(args: &Args) -> Outcome {
         bar.inc(1);
     }
     bar.finish_and_clear();
+    Ok(())
+}
+
+/// Estimators with rules to leave out.
+const RULED: [&str; 2] = ["ml", "map"];
+
+fn ablate(plan: &Plan, args: &Args) -> Outcome {
+    let is_wanted = |rule: &&&str| args.without.iter().any(|name| name == "all" || name == **rule);
+    let without: Vec<&'static str> = Rules::NAMES.iter().filter(is_wanted).copied().collect();
+    let known = |name: &&String| *name == "all" || Rules::NAMES.contains(&name.as_str());
+    if let Some(unknown) = args.without.iter().find(|name| !known(name)) {
+        return Err(Failure::input(anyhow::anyhow!(
+            "--without: expected all or one of {}, found {unknown:?}",
+            Rules::NAMES.join(", ")
+        )));
+    }
+    let plan = ablation::Plan {
+        cells: plan.cells.clone(),
+        estimators: plan.rungs.iter().copied().filter(|name| RULED.contains(name)).collect(),
+        without,
+        frames: plan.frames,
+        seed: plan.seed,
+    };
+    let bar = progress::bar(plan.cells.len() as u64, "cells");
+    let effects = ablation::run(&plan, &mut || bar.inc(1)).map_err(Failure::other)?;
+    bar.finish_and_clear();
+    print!("{}", ablation::markdown(&effects, &plan));
     Ok(())
 }

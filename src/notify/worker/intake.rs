@@ -5,6 +5,7 @@ use std::time::Duration;
 use metrics::counter;
 
 use super::Worker;
+use super::found::{Delivery, Found};
 use crate::journal::{self, Attempt, EndpointRecord, Journal, Outcome, Recorded, Waiting};
 use crate::metric;
 use crate::notify::cooling::Ruling;
@@ -12,17 +13,6 @@ use crate::notify::schedule;
 
 /// How soon a journal that could not be read is read again.
 const REREAD: Duration = Duration::from_secs(1);
-
-/// A delivery and, where a cool-down has to judge it, its event.
-type Delivery = (Option<Recorded>, Waiting);
-
-/// What the disk answered.
-pub(super) struct Found {
-    lane: usize,
-    /// The last event when it was asked.
-    last: u64,
-    answer: Result<(EndpointRecord, Vec<Delivery>), journal::Error>,
-}
 
 impl Worker {
     /// Takes the deliveries of new events into the queue: what memory holds at once, the rest when the disk has

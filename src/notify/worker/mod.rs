@@ -1,5 +1,6 @@
 //! The delivery loop: takes due deliveries from every endpoint's queue, sends them and notes the outcome.
 
+mod found;
 mod intake;
 
 use std::collections::{BTreeSet, HashMap};
@@ -20,7 +21,7 @@ use super::status::{EndpointState, EndpointStatus};
 use super::{Clock, Endpoint};
 use crate::journal::{self, Attempt, Journal, Outcome};
 use crate::metric;
-use intake::Found;
+use found::Found;
 
 /// How long requests that are under way may still take when the daemon stops.
 const GRACE: Duration = Duration::from_secs(3);
