@@ -21,9 +21,10 @@ pub const USERS_UNSEEN: &str = "oapwatch_users_unseen";
 pub const ALERTS_RAISED: &str = "oapwatch_alerts_raised_total";
 /// Label `kind`.
 pub const ALERTS_OPEN: &str = "oapwatch_alerts_open";
-/// Label `outcome`: accepted, late (kept as history), duplicate, refused (contradicts, too old, store full), malformed.
+/// Label `outcome`: accepted, late (kept as history), duplicate, refused (contradicts, too old, store full), malformed, shed (more than there is time for).
 pub const CLAIMS: &str = "oapwatch_claims_total";
 pub const CLAIMS_LAST: &str = "oapwatch_claims_last_timestamp_seconds";
+pub const CLAIMS_SKIPPED: &str = "oapwatch_claims_log_skipped_bytes_total";
 /// Labels `endpoint` and `outcome`.
 pub const WEBHOOK_ATTEMPTS: &str = "oapwatch_webhook_attempts_total";
 /// Label `endpoint`, as of the three.
@@ -69,7 +70,7 @@ pub const BUILD_INFO: &str = "oapwatch_build_info";
 pub const STAGES: [&str; 4] = ["estimate", "monitor", "journal", "publish"];
 
 /// Values of the label `outcome` of [`CLAIMS`].
-const CLAIM_OUTCOMES: [&str; 5] = ["accepted", "late", "duplicate", "refused", "malformed"];
+const CLAIM_OUTCOMES: [&str; 6] = ["accepted", "late", "duplicate", "refused", "malformed", "shed"];
 
 const LATENCY_BUCKETS: [f64; 14] = [
     50e-6, 100e-6, 250e-6, 500e-6, 1e-3, 2.5e-3, 5e-3, 10e-3, 25e-3, 50e-3, 100e-3, 250e-3, 1.0, 5.0,
@@ -115,6 +116,11 @@ pub fn describe() {
     c!(ALERTS_RAISED, "Alerts raised, by kind.");
     g!(ALERTS_OPEN, "Alerts that are not cleared, by kind.");
     c!(CLAIMS, "Claims received, by outcome.");
+    c!(
+        CLAIMS_SKIPPED,
+        Unit::Bytes,
+        "Bytes of the claims log that were not read: its beginning at the start, or more than could be read."
+    );
     g!(
         CLAIMS_LAST,
         Unit::Seconds,
@@ -177,6 +183,7 @@ pub fn describe() {
         FRAMES_DROPPED,
         FRAMES_UNUSABLE,
         FRAMES_CUT_SHORT,
+        CLAIMS_SKIPPED,
         STREAM_POSITIONS_MISSED,
         JOURNAL_FAILURES,
         JOURNAL_LOST,

@@ -5,6 +5,8 @@ use std::path::PathBuf;
 
 use super::progress::Steps;
 use super::{Failure, Outcome};
+use crate::estimate::Rules;
+use crate::study::ablation;
 use crate::study::tradeoff::{Oracle, Plan, Trained, run as study};
 
 #[derive(Debug, clap::Args)]
@@ -27,6 +29,9 @@ pub struct Args {
     /// Only these estimators, as "pencil,ml"
     #[arg(long, value_delimiter = ',')]
     rungs: Vec<String>,
+    /// What each of these rules of `ml` and `map` gains and costs, measured with and without it; `all` takes each in turn
+    #[arg(long, value_name = "RULE", value_delimiter = ',')]
+    without: Vec<String>,
     /// Folder of trained networks with their cards: `network` and `hybrid` are measured with each where it was trained
     #[arg(long)]
     networks: Option<PathBuf>,
@@ -67,6 +72,9 @@ pub fn run(args: Args) -> Outcome {
         return Err(Failure::input(anyhow::anyhow!(
             "nothing to measure: no such cell or estimator; a run without --cells and --rungs names them all"
         )));
+    }
+    if !args.without.is_empty() {
+        return ablate(&plan, &args);
     }
     let mut steps = Steps::new(plan.len() as u64);
     study(&plan, &args.out, &mut |row| {
@@ -109,4 +117,31 @@ fn oracle(args: &Args) -> Outcome {
     }
     steps.finish();
     Ok(())
+}
+
+/// Estimators with rules to leave out.
+const RULED: [&str; 2] = ["ml", "map"];
+
+fn ablate(plan: &Plan, args: &Args) -> Outcome {
+    let is_wanted = |rule: &&&str| args.without.iter().any(|name| name == "all" || name == **rule);
+    let without: Vec<&'static str> = Rules::NAMES.iter().filter(is_wanted).copied().collect();
+    let known = |name: &&String| *name == "all" || Rules::NAMES.contains(&name.as_str());
+    if let Some(unknown) = args.without.iter().find(|name| !known(name)) {
+        return Err(Failure::input(anyhow::anyhow!(
+            "--without: expected all or one of {}, found {unknown:?}",
+            Rules::NAMES.join(", ")
+        )));
+    }
+    let plan = ablation::Plan {
+        cells: plan.cells.clone(),
+        estimators: plan.rungs.iter().copied().filter(|name| RULED.contains(name)).collect(),
+        without,
+        frames: plan.frames,
+        seed: plan.seed,
+    };
+    let mut steps = Steps::new(plan.cells.len() as u64);
+    let effects = ablation::run(&plan, &mut || steps.next("cells")).map_err(Failure::other)?;
+    steps.finish();
+    let table = ablation::markdown(&effects, &plan);
+    std::io::stdout().write_all(table.as_bytes()).map_err(Failure::other)
 }

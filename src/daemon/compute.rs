@@ -9,11 +9,12 @@ use jiff::{SignedDuration, Timestamp};
 use tokio::sync::mpsc;
 
 use super::claims_log::ClaimsLog;
+use super::intake::Posts;
 use super::publish::Outlet;
 use super::status::State;
 use super::supervisor::Supervisor;
 use crate::api::{ClaimsStatus, Command, FrameCounts, JournalStatus, Snapshot, SourceState, SourceStatus, Status};
-use crate::claims::{Claim, ClaimState};
+use crate::claims::{Claim, ClaimState, Inbox};
 use crate::frame::Frame;
 use crate::frames::record::{Recorder, Taken};
 use crate::frames::{Capture, Next};
@@ -26,6 +27,8 @@ use crate::pipeline::{Pipeline, Step};
 
 /// Longest wait of a command while no frame comes.
 const PATIENCE: Duration = Duration::from_millis(50);
+/// The same while posted claims wait to be placed.
+const POSTING: Duration = Duration::from_millis(1);
 /// Most claims kept for a recorder that accepts nothing.
 const MOST_UNRECORDED: usize = 100_000;
 /// A source that gives neither a frame nor a failure for this long is reported as failed.
@@ -37,7 +40,8 @@ pub struct Compute {
     pub capture: Capture,
     pub recorder: Option<Recorder>,
     /// Claims of the log that take effect with the next frame, so that a recording reproduces them.
-    pub fresh: Vec<Claim>,
+    pub inbox: Inbox,
+    pub posts: Posts,
     /// Claims that the recorder does not have yet.
     pub unrecorded: Vec<Claim>,
     pub commands: mpsc::Receiver<Command>,
@@ -63,7 +67,8 @@ impl Compute {
         while !self.stop.load(Ordering::Relaxed) {
             self.follow_log();
             self.handle_commands();
-            let captured = self.capture.next(PATIENCE);
+            let patience = if self.posts.is_empty() { PATIENCE } else { POSTING };
+            let captured = self.capture.next(patience);
             let arrived = Instant::now();
             match captured.next {
                 Next::Frame(frame, claims) => {
@@ -98,9 +103,12 @@ impl Compute {
         self.outlet.close();
     }
 
-    /// Takes the claims that came with a frame and those of the log since the last frame.
+    /// Takes the claims that came with a frame and those of the log that it has time for.
     fn take_claims(&mut self, claims: Vec<Claim>, now: Timestamp) {
-        let claims = claims.into_iter().chain(self.fresh.drain(..));
+        let batch = self.inbox.take();
+        metrics::counter!(metric::CLAIMS, "outcome" => "shed").increment(batch.shed.shed_new + batch.shed.shed_known);
+        self.pipeline.claims.note_shed(batch.shed, now);
+        let claims = claims.into_iter().chain(batch.claims);
         if self.recorder.is_none() {
             return self.pipeline.claim(claims, now);
         }

@@ -1,40 +1,63 @@
 //! What reaches the compute thread beside the frames: claims of the log and by POST, acknowledgements.
 
+use std::collections::VecDeque;
 use std::time::{Duration, Instant};
+
+use tokio::sync::oneshot;
 
 use super::compute::Compute;
 use crate::api::{Acknowledged, Command};
 use crate::claim::escape_undisplayable;
-use crate::claims::{Outcome, Refused};
+use crate::claims::{Claim, Refused};
 use crate::metric;
 use crate::monitor::{Acknowledgement, AlertEvent, AlertState, Withdrawal};
 
 /// How often lines of the claims log that are no claims are logged.
 const COMPLAIN_EVERY: Duration = Duration::from_secs(10);
+/// Posted claims that are placed between two looks for a frame. Each costs about a microsecond, by which a frame may be late.
+const POSTED_A_TURN: usize = 256;
+/// Of these, claims of one request before the next one has its turn.
+const POSTED_AT_ONCE: usize = 64;
+/// Posted claims that wait here; further requests wait in their channel, which is bounded.
+const MOST_POSTED: usize = 20_000;
+
+/// Claims by POST of which some have yet to be placed.
+pub(super) struct Posted {
+    claims: std::iter::Enumerate<std::vec::IntoIter<Claim>>,
+    refused: Vec<(usize, String)>,
+    reply: oneshot::Sender<Vec<(usize, String)>>,
+}
+
+/// Requests that wait to be placed, a little of each at a time.
+#[derive(Default)]
+pub(super) struct Posts {
+    waiting: VecDeque<Posted>,
+    claims: usize,
+}
+
+impl Posts {
+    pub fn is_empty(&self) -> bool {
+        self.waiting.is_empty()
+    }
+
+    fn add(&mut self, claims: Vec<Claim>, reply: oneshot::Sender<Vec<(usize, String)>>) {
+        self.claims += claims.len();
+        self.waiting.push_back(Posted {
+            claims: claims.into_iter().enumerate(),
+            refused: Vec::new(),
+            reply,
+        });
+    }
+}
 
 impl Compute {
-    /// Claims by POST and acknowledgements.
+    /// Acknowledgements, and some of the claims by POST.
     pub(super) fn handle_commands(&mut self) {
-        while let Ok(command) = self.commands.try_recv() {
+        while self.posts.claims < MOST_POSTED
+            && let Ok(command) = self.commands.try_recv()
+        {
             match command {
-                Command::Claims { claims, reply } => {
-                    let now = self.now();
-                    let mut refused = Vec::new();
-                    for (index, claim) in claims.into_iter().enumerate() {
-                        if self.recorder.is_some() {
-                            self.unrecorded.push(claim.clone());
-                        }
-                        let reason = match self.pipeline.claims.insert(claim, now) {
-                            Outcome::Full => "the store of claims is full",
-                            Outcome::Conflicting => "another position was claimed for this user and time",
-                            Outcome::TooLate => "older than all that is kept of this user",
-                            Outcome::Accepted | Outcome::Ahead | Outcome::Late | Outcome::Duplicate => continue,
-                        };
-                        refused.push((index, reason.to_owned()));
-                    }
-                    // A client that has gone away needs no answer.
-                    let _ = reply.send(refused);
-                }
+                Command::Claims { claims, reply } => self.posts.add(claims, reply),
                 Command::Acknowledge { id, by, note, reply } => {
                     let acknowledgement = Acknowledgement {
                         at: self.now(),
@@ -54,6 +77,35 @@ impl Compute {
                 }
             }
         }
+        let mut left = POSTED_A_TURN;
+        while left > 0
+            && let Some(post) = self.posts.waiting.pop_front()
+        {
+            left -= self.place(post, left.min(POSTED_AT_ONCE));
+        }
+    }
+
+    /// Places up to `most` claims of a request and answers it when it has no more; gives how much work that was.
+    fn place(&mut self, mut post: Posted, most: usize) -> usize {
+        let now = self.now();
+        let mut placed = 0;
+        while placed < most {
+            let Some((index, claim)) = post.claims.next() else {
+                // A client that has gone away needs no answer.
+                let _ = post.reply.send(post.refused);
+                return placed.max(1);
+            };
+            placed += 1;
+            self.posts.claims -= 1;
+            if self.recorder.is_some() {
+                self.unrecorded.push(claim.clone());
+            }
+            if let Some(reason) = self.pipeline.claims.insert(claim, now).refusal() {
+                post.refused.push((index, reason.to_owned()));
+            }
+        }
+        self.posts.waiting.push_back(post);
+        placed
     }
 
     /// Publishes what an operator changed; without a change the answer is what the journal has.
@@ -89,6 +141,13 @@ impl Compute {
             if poll.restarted {
                 tracing::info!("the claims log was replaced; reading it from its start");
             }
+            if poll.skipped_at_start_bytes > 0 {
+                tracing::warn!(
+                    bytes = poll.skipped_at_start_bytes,
+                    "the claims log is longer than claims.tail_bytes; its beginning is not read"
+                );
+            }
+            metrics::counter!(metric::CLAIMS_SKIPPED).increment(poll.skipped_at_start_bytes + poll.skipped_bytes);
             if let Some(first) = poll.refused.first() {
                 let count = poll.refused_count;
                 self.state.malformed += count;
@@ -97,8 +156,6 @@ impl Compute {
             }
             if self.is_replay {
                 self.pipeline.claim(poll.claims, self.state.clock);
-            } else {
-                self.fresh.extend(poll.claims);
             }
             // A recording's first frame waits until the whole log has been read, so that no claim comes late.
             again = self.is_replay && self.state.counts.captured == 0;

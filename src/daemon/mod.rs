@@ -19,7 +19,7 @@ use jiff::Timestamp;
 use metrics_exporter_prometheus::PrometheusHandle;
 use tokio::sync::{mpsc, watch};
 
-use crate::claims::Follower;
+use crate::claims::{Follower, Inbox};
 use crate::config::Config;
 use crate::frames::record::Recorder;
 use crate::frames::{self, Capture, FrameSource, SourceKind};
@@ -146,15 +146,20 @@ impl Daemon {
         );
         let is_replay = source.kind == SourceKind::Replay;
         let halt = Arc::new(AtomicBool::new(false));
+        if !is_replay {
+            self.pipeline.claims.expect_live_claims();
+        }
+        let inbox = Inbox::new(self.pipeline.claims.roster());
         let compute = Compute {
             pipeline: self.pipeline,
             capture: Capture::start(self.source)?,
             recorder: self.recorder,
-            fresh: Vec::new(),
+            inbox: inbox.clone(),
+            posts: intake::Posts::default(),
             unrecorded: Vec::new(),
             commands: orders,
             follower: log
-                .map(|l| ClaimsLog::new(Follower::new(l, &self.config.claims), is_replay, halt.clone()))
+                .map(|l| ClaimsLog::new(Follower::new(l, &self.config.claims), inbox, is_replay, halt.clone()))
                 .transpose()?,
             outlet,
             journal: self.journal.clone(),

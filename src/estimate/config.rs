@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use serde::{Deserialize, Serialize};
 
 use crate::estimate::detect::heatmap_network::NetworkError;
+use crate::estimate::rules::Rules;
 
 /// `[estimator]`.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
@@ -18,6 +19,9 @@ pub struct Config {
     pub budget_ms: Option<f64>,
     /// What the `map` estimator may assume of users' power; without it `map` is `ml`.
     pub known_power: Option<KnownPower>,
+    /// The rules in force; all, but where a study measures what one of them gains.
+    #[serde(skip)]
+    pub rules: Rules,
 }
 
 /// `[estimator.known_power]`.

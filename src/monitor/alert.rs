@@ -20,16 +20,19 @@ pub enum AlertKind {
     ClaimsStale,
     /// All users are shifted alike: our own pose is off.
     PoseInconsistent,
+    /// More is claimed than there is room or time for: claims are refused or shed.
+    ClaimsFlooded,
 }
 
 impl AlertKind {
-    pub const ALL: [Self; 6] = [
+    pub const ALL: [Self; 7] = [
         Self::UnclaimedEmitter,
         Self::PositionMismatch,
         Self::UserUnseen,
         Self::SensorLost,
         Self::ClaimsStale,
         Self::PoseInconsistent,
+        Self::ClaimsFlooded,
     ];
 }
 

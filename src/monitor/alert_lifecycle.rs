@@ -84,6 +84,14 @@ impl Cause {
         }
     }
 
+    /// The user that the cause is about, if it is about one.
+    pub fn names(&self) -> Option<&str> {
+        match self {
+            Self::User(_, user) | Self::Spot(user) => Some(user),
+            Self::Track(..) | Self::Whole(_) => None,
+        }
+    }
+
     fn user(&self) -> Option<&str> {
         match self {
             Self::User(_, user) => Some(user),

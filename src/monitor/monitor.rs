@@ -5,11 +5,12 @@ use std::collections::BTreeMap;
 use jiff::Timestamp;
 use nalgebra::{Matrix2, Vector2};
 
-use crate::claims::{Store, seconds};
+use crate::claims::{Beam, ClaimState, Standing, Store, seconds};
 use crate::monitor::alert::{Acknowledgement, Alert, AlertEvent, AlertKind, Withdrawal};
 use crate::monitor::alert_lifecycle::{AlertLifecycle, Cause, Finding};
 use crate::monitor::config::{Config, Source};
-use crate::monitor::input::claim_state::{ActiveClaim, CLAIM_LIFE_S, User};
+use crate::monitor::input::claim_state::{ActiveClaim, CLAIM_LIFE_S, Reach, User};
+use crate::monitor::input::crowding::Crowding;
 use crate::monitor::input::sensor_health::SensorHealth;
 use crate::monitor::pose::consensus::PoseConsensus;
 use crate::monitor::report::{Observation, Report};
@@ -54,6 +55,8 @@ pub struct Monitor {
     /// Since when each track has had no claim, by track.
     pub(super) unassociated_since: BTreeMap<u64, Timestamp>,
     pub(super) level_unclaimed: f64,
+    /// Names without beams in the frame.
+    pub(super) crowding: Crowding,
     /// Users of the frame who share the alert of those never seen.
     pub(super) never_seen: Vec<String>,
 }
@@ -80,6 +83,7 @@ impl Monitor {
             frame: 0,
             unassociated_since: BTreeMap::new(),
             level_unclaimed,
+            crowding: Crowding::default(),
             never_seen: Vec::new(),
             budget,
             config: config.clone(),
@@ -104,9 +108,10 @@ impl Monitor {
         let lit = active
             .iter()
             .filter(|a| !a.ended)
-            .filter_map(|a| self.users.get(&a.claim.user)?.last_answered)
+            .filter_map(|a| a.last_answered)
             .filter(|t| seconds(*t, now) < 2.0 + self.sensor.blind_s(now))
             .count();
+        self.crowding = self.crowding_of(&active, claims, now);
         self.learn_timing(&active, claims, now);
         self.alerts.catch_up(self.has_caught_up(now));
         self.learn_clock();
@@ -115,13 +120,14 @@ impl Monitor {
             let detections = Detection::of(estimate, &self.camera);
             self.tracks.step(now, &detections, dt);
             self.find_pose(&mut active, dt);
-            let mut association = self.answer(&active);
+            let mut association = self.answer(&active, claims);
             self.mark_unresolvable(&mut active, &association);
             self.weigh(&active, &association, now);
             self.note_unassociated(&association, now);
             self.decide_unclaimed(&active, &mut association, now);
             self.decide_users(&active, &association, now);
             self.decide_co_located(&active, &association, now);
+            self.note_answered(&active, &association, claims, now);
         }
         self.watch_inputs(&active, claims, now);
         self.report(&active, seen.frame, now)
@@ -214,28 +220,53 @@ impl Monitor {
         }
     }
 
-    /// The claims that bear on a frame at `now`.
-    fn assert(&self, claims: &Store, now: Timestamp) -> Vec<ActiveClaim> {
+    /// The claims that bear on a frame at `now`, by name.
+    fn assert(&self, claims: &mut Store, now: Timestamp) -> Vec<ActiveClaim> {
         let tolerated = self.config.tolerated_distance_m;
-        claims
-            .standing()
-            .map(|s| ActiveClaim::new(&s, now, self.default_sigma_m, tolerated, self.ahead_s))
-            .filter(|a| self.bears(a))
-            .map(|mut a| {
-                a.expected = !a.ended && self.must_be_seen(&a);
-                a
+        let reach = |s: &Standing| Reach::of(s, now, self.default_sigma_m, tolerated, self.ahead_s);
+        let beams: Vec<Beam> = self.tracks.all.iter().map(|t| self.beam(t)).collect();
+        claims.choose(&beams, |s| self.is_in_reach(s, &reach(s)));
+        let mut active: Vec<ActiveClaim> = claims
+            .chosen()
+            .filter_map(|s| {
+                let (user, reach) = (self.users.get(&s.claim.user), reach(&s));
+                let bears = self.is_held(&s, user) || self.is_in_reach(&s, &reach);
+                bears.then(|| ActiveClaim::new(&s, reach, user))
             })
-            .collect()
+            .collect();
+        for a in &mut active {
+            a.expected = !a.ended && self.must_be_seen(a);
+        }
+        for name in self.alerts.open().filter_map(|(cause, _)| cause.names()) {
+            if let Ok(i) = active.binary_search_by(|a| a.claim.user.as_str().cmp(name)) {
+                active[i].has_alert = true;
+            }
+        }
+        active
     }
 
-    fn bears(&self, a: &ActiveClaim) -> bool {
-        let tracked = self.users.get(&a.claim.user).and_then(|u| u.track);
-        let held = tracked.is_some_and(|id| self.tracks.get(id).is_some());
-        if a.ended {
-            return a.age_s <= self.config.ended_grace_s;
+    fn beam(&self, track: &Track) -> Beam {
+        let p = track.motion.position();
+        Beam {
+            position: [p.x, p.y],
+            is_answered: !self.unassociated_since.contains_key(&track.id),
         }
-        let reach = self.config.tolerated_distance_m + a.slack_m + 5.0 * a.variance.sqrt();
-        held || (a.age_s <= CLAIM_LIFE_S && self.is_near_view(a.position, reach + self.spot_m() * 3.0))
+    }
+
+    /// The beam that answered the user's claim is still followed.
+    fn is_held(&self, standing: &Standing, user: Option<&User>) -> bool {
+        let tracked = user.and_then(|u| u.track);
+        standing.claim.state == ClaimState::Active && tracked.is_some_and(|id| self.tracks.get(id).is_some())
+    }
+
+    fn is_in_reach(&self, standing: &Standing, reach: &Reach) -> bool {
+        let claim = standing.claim;
+        if claim.state == ClaimState::Ended {
+            return reach.age_s <= self.config.ended_grace_s;
+        }
+        let reach_m = self.config.tolerated_distance_m + reach.slack_m + 5.0 * reach.variance.sqrt();
+        let place = Vector2::new(claim.x_m, claim.y_m);
+        reach.age_s <= CLAIM_LIFE_S && self.is_near_view(place, reach_m + self.spot_m() * 3.0)
     }
 
     /// Whether even a user as far off as is tolerated would show at least part of a spot.
@@ -260,17 +291,14 @@ impl Monitor {
             .collect();
         // Claims that no beam ever answered say nothing of our pose, unless there are no others.
         let (known, invented): (Vec<&ActiveClaim>, Vec<&ActiveClaim>) =
-            active.iter().filter(|a| a.expected).partition(|a| {
-                let user = self.users.get(&a.claim.user);
-                user.is_some_and(|u| u.last_answered.is_some())
-            });
+            active.iter().filter(|a| a.expected).partition(|a| a.was_seen());
         let heard = if known.len() >= KNOWN_WITNESSES {
             known
         } else {
             [known, invented].concat()
         };
         let moved = |a: &ActiveClaim| {
-            let track = self.tracks.get(self.users.get(&a.claim.user)?.track?)?;
+            let track = self.tracks.get(a.before?)?;
             Some(track.motion.position() - track.at(a.made)?)
         };
         let witnesses: Vec<_> = heard.into_iter().map(|a| a.witness(moved(a))).collect();

@@ -1,3 +1,5 @@
+use std::collections::BTreeMap;
+
 use jiff::Timestamp;
 
 use crate::estimate::Flags;
@@ -10,20 +12,20 @@ use crate::monitor::report::{PositionStatus, Report, TrackedPosition};
 impl Monitor {
     pub fn report(&mut self, active: &[ActiveClaim], frame: u64, now: Timestamp) -> Report {
         let events = self.alerts.take_events();
-        let owner = |id: u64| {
-            active.iter().find(|a| {
-                self.users
-                    .get(&a.claim.user)
-                    .is_some_and(|u| u.track == Some(id) && u.unanswered_since.is_none())
-            })
-        };
+        let mut owners: BTreeMap<u64, &str> = BTreeMap::new();
+        for a in active {
+            let answered = self.users.get(&a.claim.user).filter(|u| u.unanswered_since.is_none());
+            if let Some(id) = answered.and_then(|u| u.track) {
+                owners.entry(id).or_insert(&a.claim.user);
+            }
+        }
         let emitters = self
             .tracks
             .all
             .iter()
             .filter(|t| t.is_seen())
             .map(|t| {
-                let user = owner(t.id).map(|a| a.claim.user.clone());
+                let user = owners.get(&t.id).map(|user| (*user).to_owned());
                 let is_open = |kind: AlertKind| match (&user, kind) {
                     (Some(user), kind) => self.alerts.is_open(&Cause::User(kind, user.clone())),
                     (None, kind) => self.alerts.is_open(&Cause::Track(kind, t.id)),
@@ -50,13 +52,14 @@ impl Monitor {
                 }
             })
             .collect();
-        let unseen = active
-            .iter()
-            .filter(|a| {
-                self.alerts
-                    .is_open(&Cause::User(AlertKind::UserUnseen, a.claim.user.clone()))
+        let is_present = |user: &str| active.binary_search_by(|a| a.claim.user.as_str().cmp(user)).is_ok();
+        let unseen = self
+            .alerts
+            .open()
+            .filter_map(|(cause, _)| match cause {
+                Cause::User(AlertKind::UserUnseen, user) if is_present(user) => Some(user.clone()),
+                _ => None,
             })
-            .map(|a| a.claim.user.clone())
             .chain(self.never_seen.iter().cloned())
             .collect();
         Report {

@@ -140,13 +140,23 @@ fn what_the_daemon_records_is_reviewed_to_the_same_alert() {
     daemon.wait_for("/v1/positions", "frames after the alert", |v| {
         v["frame"].as_u64() > raised["source"]["frame"].as_u64().map(|k| k + 10)
     });
+    let id = raised["id"].as_str().unwrap();
+    let told = daemon.wait_for(&format!("/v1/alerts/{id}/evidence.json"), "evidence", |v| {
+        v["position"].is_u64()
+    });
+    let position = told["position"].as_u64().unwrap() as usize;
+    assert_eq!(told["frames"][position]["index"], raised["source"]["frame"]);
     daemon.signal("-TERM");
     assert_eq!(daemon.end().0, Some(0));
 
     let file = Path::new(raised["source"]["file"].as_str().unwrap());
     assert!(file.is_file(), "the alert names {}", file.display());
-    let id = raised["id"].as_str().unwrap();
-    assert!(dir.path().join(format!("recordings/evidence/{id}.npy")).is_file());
+    let evidence = format!("recordings/evidence/{id}.npy");
+    assert!(
+        file.ends_with(&evidence),
+        "the ring's own segment is deleted in time, {evidence} is not: {}",
+        file.display()
+    );
     let config = dir.path().join("review.toml");
     for recording in ["recordings".to_owned(), format!("recordings/evidence/{id}.npy")] {
         std::fs::write(

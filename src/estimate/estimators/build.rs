@@ -29,12 +29,18 @@ pub fn build(config: &Config, camera: &Camera) -> Result<Box<dyn Estimator>, Con
     }
     let budget = config.budget_ms.map(|ms| Duration::from_secs_f64(ms * 1e-3));
     let estimator: Box<dyn Estimator> = match Learned::ALL.into_iter().find(|l| l.name() == name) {
-        Some(learned) => Box::new(NetworkEstimator::new(learned, config.network.as_deref(), camera)?),
+        Some(learned) => Box::new(NetworkEstimator::new(
+            learned,
+            config.network.as_deref(),
+            camera,
+            config.rules,
+        )?),
         None => Box::new(AnalyticEstimator::new(
             find(name)?,
             camera,
             budget,
             config.known_power.as_ref(),
+            config.rules,
         )),
     };
     Ok(match &camera.pixels {

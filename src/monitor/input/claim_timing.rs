@@ -22,10 +22,13 @@ impl Monitor {
         if self.first_claim.is_none() && claims.quiet_s(now).is_some() {
             self.first_claim = Some(now);
         }
-        if let Some(period) = median(active.iter().filter_map(|a| a.period_s)) {
+        // Names without a beam say nothing of the log while they are many.
+        let crowded = self.crowding.is_crowded();
+        let telling = || active.iter().filter(|a| !crowded || a.is_established);
+        if let Some(period) = median(telling().filter_map(|a| a.period_s)) {
             self.period_s = Some(period);
         }
-        let delay = median(active.iter().map(|a| seconds(a.claim.time, a.came)));
+        let delay = median(telling().map(|a| seconds(a.claim.time, a.came)));
         self.delay_s = delay.unwrap_or(0.0).clamp(0.0, LONGEST_DELAY_S);
     }
 

@@ -145,6 +145,7 @@ impl Monitor {
         self.confusion_m(track, association) > 0.0
             || (0..active.len())
                 .filter(|&j| j != i && association[j].is_none())
+                .filter(|&j| !self.crowding.is_crowded() || active[j].is_established)
                 .any(|j| {
                     let a = &active[j];
                     let away = (a.position - here).norm() - a.slack_m - 2.0 * a.variance.sqrt();

@@ -2,11 +2,11 @@ use jiff::Timestamp;
 use nalgebra::Vector2;
 use serde_json::json;
 
-use crate::claims::{Store, seconds};
+use crate::claims::{Store, WINDOW_S, seconds};
 use crate::monitor::alert::{AlertKind, Severity};
 use crate::monitor::alert_lifecycle::{Cause, Finding};
 use crate::monitor::input::claim_state::ActiveClaim;
-use crate::monitor::monitor::Monitor;
+use crate::monitor::monitor::{ESCALATE_S, Monitor};
 use crate::monitor::rules::mismatch::claimed;
 use crate::monitor::stats::claim_consistency::neg_log_p;
 use crate::monitor::stats::error_budget::TestFamily;
@@ -27,6 +27,7 @@ impl Monitor {
             self.alerts.absent(&lost, now);
         }
         self.watch_pose(now);
+        self.watch_flood(claims, now);
         let stale = Cause::Whole(AlertKind::ClaimsStale);
         let period = self.period_s.unwrap_or(0.0);
         let limit = self.config.claims_stale_s.max(5.0 * period);
@@ -58,9 +59,12 @@ impl Monitor {
     fn watch_users_claims(&mut self, active: &[ActiveClaim], log_is_stale: bool, now: Timestamp) {
         let period = self.period_s.unwrap_or(0.0);
         for a in active {
-            let cause = Cause::User(AlertKind::ClaimsStale, a.claim.user.clone());
             let periods = MOST_LOST * a.period_s.unwrap_or(0.0).clamp(period, 10.0 * period.max(0.1));
             let limit = periods.max(USER_PATIENCE * self.config.claims_stale_s);
+            if a.age_s <= limit && !a.has_alert {
+                continue;
+            }
+            let cause = Cause::User(AlertKind::ClaimsStale, a.claim.user.clone());
             let user = self.users.get(&a.claim.user);
             let is_lit = user.is_some_and(|u| u.last_answered.is_some_and(|t| seconds(t, now) < 1.0));
             // The whole log's silence is one cause and not one a user.
@@ -77,6 +81,37 @@ impl Monitor {
             finding.claimed = claimed(a);
             self.alerts.report(&cause, finding, now, self.frame);
         }
+    }
+
+    /// Claims that are refused or shed for want of room or time, or are more than a frame is held against.
+    fn watch_flood(&mut self, claims: &Store, now: Timestamp) {
+        let cause = Cause::Whole(AlertKind::ClaimsFlooded);
+        let squeezed = claims.squeezed(now);
+        if squeezed.total() == 0 && claims.left_out() == 0 {
+            self.alerts.absent(&cause, now);
+            return;
+        }
+        let lasted_s = self.alerts.raised_at(&cause).map_or(0.0, |since| seconds(since, now));
+        let severity = if squeezed.shed_known > 0 || lasted_s >= ESCALATE_S {
+            Severity::Critical
+        } else {
+            Severity::Warning
+        };
+        let claims_lost = squeezed.refused + squeezed.shed_new + squeezed.shed_known;
+        let evidence = json!({
+            "window_s": WINDOW_S,
+            "claims_refused": squeezed.refused,
+            "claims_shed": squeezed.shed_new,
+            "claims_of_known_users_shed": squeezed.shed_known,
+            "claims_lost_per_s": claims_lost as f64 / WINDOW_S as f64,
+            "users_forgotten_early": squeezed.forgotten_early,
+            "log_bytes_skipped": squeezed.skipped_bytes,
+            "users": claims.len(),
+            "max_users": claims.max_users(),
+            "claims_in_view_not_considered": claims.left_out(),
+        });
+        self.alerts
+            .report(&cause, Finding::new(severity, evidence), now, self.frame);
     }
 
     fn watch_pose(&mut self, now: Timestamp) {

@@ -1,5 +1,3 @@
-use std::collections::BTreeSet;
-
 use jiff::Timestamp;
 use nalgebra::{Matrix2, Vector2};
 use serde_json::{Value, json};
@@ -40,7 +38,10 @@ impl Monitor {
         for (a, answer) in active.iter().zip(association) {
             let track = answer.and_then(|id| self.tracks.get(id));
             let confusion_m = track.map_or(0.0, |t| self.confusion_m(t, association));
-            let user = self.users.entry(a.claim.user.clone()).or_default();
+            let user = match self.users.get_mut(&a.claim.user) {
+                Some(user) => user,
+                None => self.users.entry(a.claim.user.clone()).or_default(),
+            };
             let Some(track) = track else {
                 user.outside = 0;
                 if !a.expected || a.is_unresolvable {
@@ -56,6 +57,7 @@ impl Monitor {
             user.track = Some(track.id);
             user.unanswered_since = None;
             user.absence = 0.0;
+            user.first_answered.get_or_insert(now);
             user.last_answered = Some(now);
             if a.ended {
                 continue;
@@ -83,10 +85,9 @@ impl Monitor {
             let is_outside = track.hit && track.confirmed && neg_log_p(offset, &cov, reach) > gate;
             user.outside = if is_outside { user.outside + 1 } else { 0 };
         }
-        let present: BTreeSet<&str> = active.iter().map(|a| a.claim.user.as_str()).collect();
         let alerts = &self.alerts;
         self.users.retain(|name, _| {
-            present.contains(name.as_str())
+            is_present(active, name)
                 || [
                     AlertKind::PositionMismatch,
                     AlertKind::UserUnseen,
@@ -97,6 +98,7 @@ impl Monitor {
                 || alerts.is_open(&Cause::Spot(name.clone()))
         });
     }
+
     pub fn decide_users(&mut self, active: &[ActiveClaim], association: &[Option<u64>], now: Timestamp) {
         let each = (active.len() * WINDOWS.len()) as f64;
         let level = self
@@ -109,11 +111,10 @@ impl Monitor {
             self.decide_unseen(a, level_unseen, &mut never_seen, now);
         }
         self.decide_never_seen(never_seen, now);
-        let present: BTreeSet<&str> = active.iter().map(|a| a.claim.user.as_str()).collect();
         let orphans: Vec<Cause> = self
             .alerts
             .open()
-            .filter(|(c, _)| matches!(c, Cause::User(_, user) if !present.contains(user.as_str())))
+            .filter(|(c, _)| matches!(c, Cause::User(_, user) if !is_present(active, user)))
             .map(|(c, _)| c.clone())
             .collect();
         for cause in orphans {
@@ -130,6 +131,9 @@ impl Monitor {
         now: Timestamp,
     ) {
         let a = &active[i];
+        if association[i].is_none() && !a.was_seen() && !a.has_alert {
+            return;
+        }
         let tolerated = self.config.tolerated_distance_m;
         let floor = self.floor(a.position);
         let cause = Cause::User(AlertKind::PositionMismatch, a.claim.user.clone());
@@ -178,7 +182,6 @@ impl Monitor {
     }
 
     fn decide_unseen(&mut self, a: &ActiveClaim, level: f64, never_seen: &mut NeverSeen, now: Timestamp) {
-        let cause = Cause::User(AlertKind::UserUnseen, a.claim.user.clone());
         let Some(user) = self.users.get(&a.claim.user) else {
             return;
         };
@@ -192,6 +195,10 @@ impl Monitor {
             && claimed_since
             && self.claims_settled(now)
             && !self.awaits_unassociated(user, gone_s);
+        if !is_unseen && !a.has_alert {
+            return;
+        }
+        let cause = Cause::User(AlertKind::UserUnseen, a.claim.user.clone());
         let goes_on = self.alerts.is_open(&cause) && a.expected && user.absence > 0.0;
         if !is_unseen && !goes_on {
             self.alerts.absent(&cause, now);
@@ -250,6 +257,11 @@ impl Monitor {
                 coincides && !self.alerts.is_open(&Cause::Track(AlertKind::UnclaimedEmitter, *id))
             })
     }
+}
+
+/// Whether the user has a claim in the frame; claims come by name.
+fn is_present(active: &[ActiveClaim], user: &str) -> bool {
+    active.binary_search_by(|a| a.claim.user.as_str().cmp(user)).is_ok()
 }
 
 fn severity_after(gone_s: f64) -> Severity {

@@ -185,6 +185,7 @@ impl Monitor {
         });
         let vanished: Vec<Value> = active
             .iter()
+            .filter(|a| !self.crowding.is_crowded() || a.was_seen())
             .filter_map(|a| {
                 let gone = self.users.get(&a.claim.user)?.unanswered_since?;
                 let gap = seconds(gone, since).abs();

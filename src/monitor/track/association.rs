@@ -1,6 +1,7 @@
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
 use crate::assign::assign;
+use crate::claims::Store;
 use crate::monitor::alert::AlertKind;
 use crate::monitor::alert_lifecycle::Cause;
 use crate::monitor::input::claim_state::{ActiveClaim, CLAIM_LIFE_S};
@@ -15,7 +16,9 @@ const INCUMBENCY: f64 = 4.0;
 
 impl Monitor {
     /// Which track answers which claim: near pairs by optimal assignment, then the beam that answered before.
-    pub fn answer(&self, active: &[ActiveClaim]) -> Vec<Option<u64>> {
+    pub fn answer(&self, active: &[ActiveClaim], claims: &Store) -> Vec<Option<u64>> {
+        // Whose claim each track answered in the frame before.
+        let owners: BTreeMap<u64, &ActiveClaim> = active.iter().filter_map(|a| Some((a.owns?, a))).collect();
         let seen: Vec<&Track> = self.tracks.all.iter().filter(|t| t.hit).collect();
         let merged_into: Vec<&Track> = self.tracks.all.iter().filter(|t| t.merged_into.is_some()).collect();
         let mut association = vec![None; active.len()];
@@ -23,8 +26,7 @@ impl Monitor {
         let held: Vec<bool> = active
             .iter()
             .map(|a| {
-                let before = self.users.get(&a.claim.user).and_then(|u| u.track);
-                before
+                a.before
                     .and_then(|id| self.tracks.get(id))
                     .is_some_and(Track::is_just_missed)
             })
@@ -37,8 +39,12 @@ impl Monitor {
                 let (a, t) = (&active[open[i]], tracks[j]);
                 let r = t.motion.position() - a.position;
                 let d2 = mahalanobis2(r, t.motion.position_cov() + a.spread(self.config.tolerated_distance_m));
-                let incumbent = self.users.get(&a.claim.user).and_then(|u| u.track) == Some(t.id);
-                if d2 > ANSWER_GATE || (!incumbent && a.age_s > self.fresh_s(a)) {
+                if d2 > ANSWER_GATE {
+                    return f64::INFINITY;
+                }
+                let incumbent = a.before == Some(t.id);
+                let owner = owners.get(&t.id).copied();
+                if (!incumbent && a.age_s > self.fresh_s(a)) || !self.may_answer(a, t, owner, claims) {
                     f64::INFINITY
                 } else if incumbent {
                     d2
@@ -52,11 +58,10 @@ impl Monitor {
         }
         let mut taken: BTreeSet<u64> = association.iter().flatten().copied().collect();
         for (a, answer) in active.iter().zip(&mut association) {
-            if answer.is_some() {
+            if answer.is_some() || (self.crowding.is_crowded() && !a.is_established) {
                 continue;
             }
-            let before = self.users.get(&a.claim.user).and_then(|u| u.track);
-            if let Some(id) = before
+            if let Some(id) = a.before
                 && seen.iter().any(|t| t.id == id)
                 && taken.insert(id)
             {
@@ -65,6 +70,7 @@ impl Monitor {
         }
         association
     }
+
     /// Age up to which a claim answers for a beam that was not its user's before, s: the longer a user is silent, the
     /// wider the ground that a stranger could appear on under their name.
     fn fresh_s(&self, a: &ActiveClaim) -> f64 {

@@ -13,6 +13,8 @@ use std::path::Path;
 
 use crate::estimate::{ESTIMATORS, Learned};
 pub(in crate::study) use networks::Candidate;
+pub(in crate::study) use scene::Scene;
+pub(in crate::study) use score::CUTOFF_M;
 
 pub use condition::Condition;
 pub use error::{Error, PictureError};

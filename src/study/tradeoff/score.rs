@@ -11,7 +11,7 @@ use crate::assign::ospa;
 use crate::estimate;
 
 /// OSPA's cutoff, m.
-pub(super) const CUTOFF_M: f64 = 25.0;
+pub(in crate::study) const CUTOFF_M: f64 = 25.0;
 /// An emitter is resolvable where its bound's root is below this share of the distance to the next and below 10 m.
 const RESOLVABLE_SHARE: f64 = 0.1;
 const RESOLVABLE_M: f64 = 10.0;

@@ -2,6 +2,7 @@
 //! `make siege`. `OAPWATCH_SIEGE_SECONDS` is how long each storm lasts, a minute unless set.
 
 mod flood;
+pub mod names;
 mod slow;
 
 use std::net::SocketAddr;
