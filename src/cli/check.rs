@@ -23,6 +23,7 @@ const OF_SCENES: [&str; 7] = [
 ];
 
 #[derive(Debug, clap::Args)]
+#[command(after_help = "Examples:\n  oapwatch check oapwatch.toml\n  oapwatch check --json config/scenes/paper.toml")]
 pub struct Args {
     /// A config or scene
     file: PathBuf,

@@ -9,6 +9,7 @@ use crate::estimate;
 use crate::study::stability::{Options, catalogue, markdown};
 
 #[derive(Debug, clap::Args)]
+#[command(after_help = "Examples:\n  oapwatch stability --only NaN")]
 pub struct Args {
     /// Frames of each kind
     #[arg(long, value_name = "N", default_value_t = 20, value_parser = clap::value_parser!(u32).range(1..))]

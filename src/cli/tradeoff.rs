@@ -10,6 +10,9 @@ use crate::study::ablation;
 use crate::study::tradeoff::{Oracle, Plan, Trained, run as study};
 
 #[derive(Debug, clap::Args)]
+#[command(
+    after_help = "Examples:\n  oapwatch tradeoff --quick --out out\n  oapwatch tradeoff --cells P8/60,E1/64 --rungs ml,map --frames 1000 --out out\n  oapwatch tradeoff --oracle --quick"
+)]
 pub struct Args {
     /// Folder for tradeoff.md, tradeoff.json and the pictures; measurements already there are kept
     #[arg(long, default_value = "tradeoff")]

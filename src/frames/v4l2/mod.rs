@@ -77,6 +77,7 @@ impl V4l2 {
         if let Some(exposure) = config.exposure_us {
             positive("v4l2.exposure_us", exposure)?;
         }
+        metrics::gauge!(metric::SOURCE_CONNECTED).set(0.0);
         let now = Instant::now();
         Ok(Self {
             faults: Faults::new(device.display().to_string()),
