@@ -15,7 +15,7 @@ use crate::monitor::{Acknowledgement, AlertEvent, AlertState, Withdrawal};
 /// How often lines of the claims log that are no claims are logged.
 const COMPLAIN_EVERY: Duration = Duration::from_secs(10);
 /// Posted claims that are placed between two looks for a frame. Each costs about a microsecond, by which a frame may be late.
-const POSTED_A_TURN: usize = 256;
+const POSTED_A_TURN: usize = 128;
 /// Of these, claims of one request before the next one has its turn.
 const POSTED_AT_ONCE: usize = 64;
 /// Posted claims that wait here; further requests wait in their channel, which is bounded.
