@@ -228,5 +228,8 @@ fn a_flood_of_invented_names_hides_no_eavesdropper() {
     let flooded: Value = serde_json::from_str(&flooded).unwrap();
     assert_eq!(alerts(&flooded).len(), 1, "{flooded}");
     let evidence = &alerts(&flooded)[0]["evidence"];
-    assert!(evidence["users"].as_u64() <= evidence["max_users"].as_u64(), "{evidence}");
+    assert!(
+        evidence["users"].as_u64() <= evidence["max_users"].as_u64(),
+        "{evidence}"
+    );
 }
