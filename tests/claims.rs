@@ -5,7 +5,10 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use jiff::{SignedDuration, Timestamp};
-use oapwatch::claims::{Claim, ClaimState, Config, Follower, LONGEST_LINE, Outcome, Poll, Store, parse_line, read_log};
+use oapwatch::claims::{
+    Beam, Claim, ClaimState, Config, Follower, LONGEST_LINE, MOST_UNANSWERED, Outcome, Poll, Store, parse_line,
+    read_log,
+};
 
 fn at(s: f64) -> Timestamp {
     let start: Timestamp = "2026-11-21T08:00:00Z".parse().unwrap();
@@ -234,6 +237,167 @@ fn a_flood_of_users_pushes_nobody_out() {
     store.insert(claim("b", 1000.0, 0.0), at(1000.0));
     assert_eq!(store.insert(claim("new", 1000.0, 0.0), at(1000.0)), Outcome::Accepted);
     assert!(store.user("b").is_some() && store.len() == 3);
+}
+
+fn names(store: &mut Store, range: std::ops::Range<u32>, s: f64) -> usize {
+    range
+        .filter(|k| store.insert(claim(&format!("!{k}"), s, 0.0), at(s)) == Outcome::Accepted)
+        .count()
+}
+
+/// Today's cost of one refusal is what a frame can bear, not what a store of 20,000 takes to look through.
+#[test]
+fn a_full_store_refuses_at_once() {
+    let mut store = Store::new(&Config::default());
+    assert_eq!(names(&mut store, 0..20_000, 0.0), 20_000);
+    let began = std::time::Instant::now();
+    assert_eq!(names(&mut store, 20_000..220_000, 1.0), 0);
+    let each = began.elapsed() / 200_000;
+    assert!(each < std::time::Duration::from_micros(20), "{each:?} a refused claim");
+    assert_eq!(store.squeezed(at(1.0)).refused, 200_000);
+    assert_eq!(store.squeezed(at(12.0)).refused, 0);
+}
+
+#[test]
+fn a_flood_displaces_its_own_kind_and_a_newcomer_who_goes_on_claiming_stays() {
+    let config = Config {
+        max_users: 1000,
+        ..Config::default()
+    };
+    let mut store = Store::new(&config);
+    // One user whom a beam answers, and one whom none does, claimed once a second for a minute.
+    for s in 0..60 {
+        let s = f64::from(s);
+        for user in ["seen", "elsewhere"] {
+            store.insert(claim(user, s, 0.0), at(s));
+        }
+        store.answered("seen", at(s));
+        store.advance(at(s));
+    }
+    let roster = store.roster();
+    assert_eq!(
+        roster.knows(["seen", "elsewhere", "!0"].into_iter()),
+        [true, true, false]
+    );
+    // A hundred new names every .1 s fill the store within a second; a newcomer claims once a second from then on.
+    let mut is_in_since = None;
+    for k in 0..600u32 {
+        let s = 60.0 + 0.1 * f64::from(k);
+        if k >= 20 && k % 10 == 0 {
+            store.insert(claim("newcomer", s, 0.0), at(s));
+        }
+        names(&mut store, 100 * k..100 * (k + 1), s);
+        match store.user("newcomer") {
+            Some(_) => is_in_since = is_in_since.or(Some(s)),
+            None => assert_eq!(is_in_since, None, "forgotten again"),
+        }
+        assert!(store.len() <= 1000);
+    }
+    assert!(is_in_since.is_some_and(|s| s < 75.0), "{is_in_since:?}");
+    assert!(store.user("seen").is_some() && store.user("elsewhere").is_some());
+    assert!(store.squeezed(at(120.0)).forgotten_early > 0);
+}
+
+#[test]
+fn who_is_claimed_beside_a_beam_that_is_nobodys_is_let_in_first() {
+    let config = Config {
+        max_users: 100,
+        ..Config::default()
+    };
+    let mut store = Store::new(&config);
+    names(&mut store, 0..100, 0.0);
+    let beam = Beam {
+        position: [40.0, 3.0],
+        is_answered: false,
+    };
+    store.choose(&[beam], |_| true);
+    assert_eq!(store.insert(claim("far", 1.0, 70.0), at(1.0)), Outcome::Full);
+    assert_eq!(store.insert(claim("beside", 1.0, 38.0), at(1.0)), Outcome::Accepted);
+}
+
+/// However many are claimed, a frame is held against a bounded number: of those whom a beam answered all, of the others those at beams.
+#[test]
+fn a_frame_is_held_against_a_bounded_number_of_claims() {
+    let mut store = Store::new(&Config::default());
+    for k in 0..15_000u32 {
+        let place = [f64::from(k % 150), f64::from(k / 150)];
+        let mut claim = claim(&format!("!{k}"), 0.0, place[0]);
+        claim.y_m = place[1];
+        store.insert(claim, at(0.0));
+    }
+    store.answered("!9", at(0.0));
+    let beam = Beam {
+        position: [77.0, 55.2],
+        is_answered: false,
+    };
+    store.choose(&[beam], |_| true);
+    let chosen: Vec<String> = store.chosen().map(|s| s.claim.user.clone()).collect();
+    assert_eq!(chosen.len(), MOST_UNANSWERED + 1);
+    assert_eq!(store.left_out(), 15_000 - chosen.len());
+    let nearest = format!("!{}", 55 * 150 + 77);
+    assert!(
+        chosen.contains(&"!9".to_owned()) && chosen.contains(&nearest),
+        "{chosen:?}"
+    );
+    assert!(chosen.is_sorted(), "by name");
+    // Those that bear no more leave.
+    for _ in 0..100 {
+        store.choose(&[], |s| s.claim.x_m < 1.0);
+    }
+    assert_eq!((store.chosen().count(), store.left_out()), (101, 0));
+}
+
+/// Claims for years to come keep out none of the next second.
+#[test]
+fn claims_far_ahead_of_their_time_make_way() {
+    let mut store = Store::new(&Config::default());
+    store.expect_live_claims();
+    for k in 0..5000u32 {
+        store.insert(claim(&format!("!{k}"), 1e6 + f64::from(k), 0.0), at(0.0));
+    }
+    assert_eq!(store.insert(claim("ahead", 0.5, 1.0), at(0.0)), Outcome::Ahead);
+    assert_eq!(store.insert(claim("beyond", 1e8, 1.0), at(0.0)), Outcome::Full);
+    store.advance(at(1.0));
+    assert!(store.user("ahead").is_some());
+}
+
+#[test]
+fn a_long_log_is_read_from_near_its_end() {
+    let log = log();
+    let config = Config {
+        tail_bytes: 65_536,
+        ..Config::default()
+    };
+    let mut follower = Follower::new(&log.path, &config).live();
+    append(&log.path, &line("old", 0).repeat(5000));
+    append(&log.path, &line("new", 1));
+    let whole = fs::metadata(&log.path).unwrap().len();
+    let poll = follower.poll().unwrap();
+    assert_eq!(poll.skipped_at_start_bytes, whole - config.tail_bytes);
+    assert_eq!(
+        (poll.refused_count, poll.skipped_bytes),
+        (0, 0),
+        "the line that was cut is no error"
+    );
+    assert_eq!(users(&poll).last(), Some(&"new"));
+    assert!(
+        poll.claims.len() > 900 && poll.claims.len() < 1100,
+        "{}",
+        poll.claims.len()
+    );
+    // It grows by more than is read: what is too far behind is passed over, and a rewrite is still noticed.
+    append(&log.path, &line("flood", 2).repeat(5000));
+    append(&log.path, &line("last", 3));
+    let poll = follower.poll().unwrap();
+    assert!(
+        poll.skipped_bytes > 200_000 && poll.skipped_at_start_bytes == 0,
+        "{}",
+        poll.skipped_bytes
+    );
+    assert_eq!(users(&poll).last(), Some(&"last"));
+    let other = line("new", 4).replace("08:00", "09:00");
+    fs::write(&log.path, other.repeat(15_000)).unwrap();
+    assert!(follower.poll().unwrap().restarted);
 }
 
 #[test]

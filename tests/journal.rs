@@ -1,6 +1,7 @@
 //! The journal from outside: what was recorded is there after a restart, in order, and nothing else is.
 
 use std::path::Path;
+use std::time::{Duration, Instant};
 
 use jiff::{SignedDuration, Timestamp};
 use oapwatch::journal::{Config, Cursor, Error, Filter, Journal, Subscription};
@@ -29,12 +30,13 @@ fn alert(id: &str, kind: AlertKind, raised_s: i64) -> Alert {
             frame: raised_s.unsigned_abs(),
             file: None,
         },
+        acknowledgement: None,
     }
 }
 
 fn event(event: AlertEventKind, mut alert: Alert) -> AlertEvent {
     alert.state = match event {
-        AlertEventKind::Raised | AlertEventKind::Updated => AlertState::Open,
+        AlertEventKind::Raised | AlertEventKind::Updated | AlertEventKind::Unacknowledged => AlertState::Open,
         AlertEventKind::Acknowledged => AlertState::Acknowledged,
         AlertEventKind::Cleared => AlertState::Cleared,
     };
@@ -49,6 +51,15 @@ fn at(path: &Path) -> Config {
     Config {
         path: Some(path.to_owned()),
         ..Config::default()
+    }
+}
+
+/// Waits for a condition that another thread brings about.
+async fn until(condition: impl Fn() -> bool) {
+    let deadline = Instant::now() + Duration::from_secs(20);
+    while !condition() {
+        assert!(Instant::now() < deadline, "the condition did not come true within 20 s");
+        tokio::time::sleep(Duration::from_millis(10)).await;
     }
 }
 
@@ -216,9 +227,7 @@ async fn a_disk_that_refuses_writes_stops_nothing() {
     assert!(!health.writable);
     assert_eq!((health.unwritten, health.lost), (2, 0));
     // It took too long at first, and was refused in the end.
-    while !journal.health().last_error.unwrap_or_default().contains("locked") {
-        tokio::time::sleep(std::time::Duration::from_millis(20)).await;
-    }
+    until(|| journal.health().last_error.unwrap_or_default().contains("locked")).await;
     assert_eq!(ids(&journal.open_alerts().unwrap()), ["b", "c"]);
     assert_eq!(
         ids(&journal.alerts(&Filter::default(), 9).unwrap().alerts),
@@ -231,9 +240,7 @@ async fn a_disk_that_refuses_writes_stops_nothing() {
     other.execute_batch("ROLLBACK").unwrap();
     // The next write, or the writer's own retry, takes along what waited.
     journal.record(&[raised("d", 3)], start(), start()).unwrap();
-    while !journal.health().writable {
-        tokio::time::sleep(std::time::Duration::from_millis(20)).await;
-    }
+    until(|| journal.health().writable).await;
     assert_eq!(journal.health().unwritten, 0);
     let on_disk: Vec<u64> = other
         .prepare("SELECT seq FROM event ORDER BY seq")
@@ -259,20 +266,14 @@ async fn an_alarm_does_not_wait_for_a_disk_that_hangs() {
     let other = rusqlite::Connection::open(&path).unwrap();
     other.execute_batch("BEGIN IMMEDIATE").unwrap();
     // The writer waits a second for the lock; it is given back before that, so the write succeeds, but late.
-    let locked = std::time::Instant::now();
+    let locked = Instant::now();
     journal.record(&[raised("b", 1)], start(), start()).unwrap();
     assert_eq!(journal.follow(1).next().await.unwrap().len(), 1);
-    assert!(
-        locked.elapsed() < std::time::Duration::from_millis(900),
-        "{:?}",
-        locked.elapsed()
-    );
+    assert!(locked.elapsed() < Duration::from_millis(900), "{:?}", locked.elapsed());
     assert_eq!(journal.health().last_error.as_deref(), Some("the disk takes too long"));
     other.execute_batch("ROLLBACK").unwrap();
     journal.record(&[raised("c", 2)], start(), start()).unwrap();
-    while !journal.health().writable {
-        tokio::time::sleep(std::time::Duration::from_millis(10)).await;
-    }
+    until(|| journal.health().writable).await;
     drop(journal);
     let journal = Journal::open(&at(&path), vec![]).unwrap();
     let seqs: Vec<u64> = journal.events_after(0, 9).unwrap().iter().map(|e| e.seq).collect();

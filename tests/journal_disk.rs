@@ -28,6 +28,7 @@ fn raised(k: u64) -> AlertEvent {
             frame: k,
             file: None,
         },
+        acknowledgement: None,
     };
     AlertEvent {
         event: AlertEventKind::Raised,

@@ -51,6 +51,7 @@ fn event(kind: AlertEventKind, id: &str) -> AlertEvent {
             frame: 1,
             file: None,
         },
+        acknowledgement: None,
     };
     AlertEvent { event: kind, alert }
 }

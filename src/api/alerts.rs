@@ -1,13 +1,14 @@
+//! `/v1/alerts`: the list of alerts and one alert.
+
 use axum::extract::State as Shared;
 use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
 use axum::response::Response;
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
-use tokio::sync::oneshot;
 
 use super::extract::{Path, Query, within};
 use super::problem::Problem;
-use super::state::{Acknowledged, Command, State};
+use super::state::State;
 use super::{conditional, respond};
 use crate::journal::{self, Cursor, Filter, Journal};
 use crate::monitor::{Alert, AlertKind, AlertState};
@@ -136,29 +137,6 @@ pub async fn get(
     Ok(conditional::answer(&headers, version, || respond::json(&alert)))
 }
 
-fn unknown(id: &str) -> Problem {
+pub(super) fn unknown(id: &str) -> Problem {
     Problem::not_found(format!("there is no alert {id:?}"))
-}
-
-/// Says that somebody has taken note of an alert
-#[utoipa::path(post, path = "/v1/alerts/{id}/acknowledge", tag = "alerts",
-    params(("id" = String, Path, description = "The alert's id")),
-    responses(
-        (status = 200, description = "The alert, acknowledged now or before", body = Alert),
-        (status = 400, description = "The path cannot be read", body = Problem, content_type = "application/problem+json"),
-        (status = 404, description = "There is no such alert", body = Problem, content_type = "application/problem+json"),
-        (status = 409, description = "The alert has cleared", body = Problem, content_type = "application/problem+json"),
-        (status = 503, description = "The monitor is too busy; come back", body = Problem, content_type = "application/problem+json"),
-    ))]
-pub async fn acknowledge(Shared(state): Shared<State>, Path(id): Path<String>) -> Result<Response, Problem> {
-    let (reply, answer) = oneshot::channel();
-    super::claims::send(&state, Command::Acknowledge { id: id.clone(), reply })?;
-    match answer.await.map_err(|_| super::claims::busy())? {
-        Acknowledged::Done(alert) => Ok(respond::json(&*alert)),
-        Acknowledged::Unknown => Err(unknown(&id)),
-        Acknowledged::AlreadyCleared => Err(Problem::new(
-            StatusCode::CONFLICT,
-            format!("alert {id:?} has cleared; only an alert that stands can be acknowledged"),
-        )),
-    }
 }

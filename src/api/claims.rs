@@ -1,11 +1,14 @@
+//! `POST /v1/claims`: parses a body of claims and hands them to the compute thread.
+
 use axum::body::Bytes;
 use axum::extract::State as Shared;
 use axum::extract::rejection::BytesRejection;
 use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::Response;
-use serde::Serialize;
 use tokio::sync::{mpsc, oneshot};
 
+use super::client::Caller;
+use super::intake::Intake;
 use super::problem::Problem;
 use super::respond;
 use super::state::{Command, State};
@@ -14,34 +17,8 @@ use crate::{claims, metric};
 
 /// Claims taken from one body.
 const MAX_CLAIMS: usize = 20_000;
-/// Reasons listed in one answer; the count is exact beyond it.
-const MAX_REASONS: usize = 100;
-
-/// What became of the claims in a body.
-#[derive(Clone, Debug, Default, Serialize, utoipa::ToSchema)]
-pub struct Intake {
-    pub accepted: usize,
-    pub refused: usize,
-    /// Why claims were refused, the first hundred.
-    pub reasons: Vec<Refusal>,
-}
-
-/// One claim that was not taken.
-#[derive(Clone, Debug, Serialize, utoipa::ToSchema)]
-pub struct Refusal {
-    /// Line in the body, from 1.
-    pub line: usize,
-    pub reason: String,
-}
-
-impl Intake {
-    fn refuse(&mut self, line: usize, reason: String) {
-        self.refused += 1;
-        if self.reasons.len() < MAX_REASONS {
-            self.reasons.push(Refusal { line, reason });
-        }
-    }
-}
+/// A request with so many claims takes up as much of the queue to the monitor as one that has few.
+const CLAIMS_A_PLACE: usize = 500;
 
 pub(super) fn busy() -> Problem {
     Problem::later(
@@ -122,10 +99,11 @@ fn check_media_type(headers: &HeaderMap) -> Result<(), Problem> {
         (status = 413, description = "The body is too large", body = Problem, content_type = "application/problem+json"),
         (status = 415, description = "Neither JSON nor NDJSON", body = Problem, content_type = "application/problem+json"),
         (status = 422, description = "No claim was taken; `reasons` says why", body = Problem, content_type = "application/problem+json"),
-        (status = 503, description = "The monitor is too busy; come back", body = Problem, content_type = "application/problem+json"),
+        (status = 503, description = "The monitor is too busy, or has no room for another user; come back", body = Problem, content_type = "application/problem+json"),
     ))]
 pub async fn post(
     Shared(state): Shared<State>,
+    caller: Caller,
     headers: HeaderMap,
     body: Result<Bytes, BytesRejection>,
 ) -> Result<Response, Problem> {
@@ -136,6 +114,10 @@ pub async fn post(
     let sent = claims.len();
     metrics::counter!(metric::CLAIMS, "outcome" => "malformed").increment(intake.refused as u64);
     if sent > 0 {
+        // What waits is bounded in claims too: large requests are told to come back while others wait.
+        if state.commands.capacity() <= sent / CLAIMS_A_PLACE {
+            return Err(busy());
+        }
         let (reply, answer) = oneshot::channel();
         send(&state, Command::Claims { claims, reply })?;
         let refused = answer.await.map_err(|_| busy())?;
@@ -145,6 +127,7 @@ pub async fn post(
         }
         intake.reasons.sort_by_key(|r| r.line);
     }
+    state.audit.claims(&caller, intake.accepted, intake.refused);
     if intake.accepted > 0 {
         return Ok(respond::json(&intake));
     }
@@ -153,10 +136,11 @@ pub async fn post(
         None => "the body holds no claim".to_owned(),
     };
     // Claims that could be read are refused for what is known already: another request may well be taken.
-    let status = if sent > 0 {
-        StatusCode::CONFLICT
-    } else {
-        StatusCode::UNPROCESSABLE_ENTITY
+    let is_full = sent > 0 && intake.reasons.iter().any(|r| r.reason == claims::NO_ROOM);
+    let status = match sent {
+        0 => StatusCode::UNPROCESSABLE_ENTITY,
+        _ if is_full => StatusCode::SERVICE_UNAVAILABLE,
+        _ => StatusCode::CONFLICT,
     };
     Err(Problem::refused(status, intake, detail))
 }

@@ -1,17 +1,22 @@
+//! `[api]`: its keys, their defaults and what is refused before a port is bound.
+
 use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
+use super::client::{NoNetwork, TrustedProxies};
+use super::listener::Listen;
+
 /// `[api]`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Config {
-    pub listen: SocketAddr,
-    /// Bearer tokens with full access, one a line; without any only loopback addresses may be listened on.
+    pub listen: Listen,
+    /// Bearer tokens with full access, one a line, each after a name and a colon or alone; without any only loopback addresses may be listened on.
     pub token_file: Option<PathBuf>,
-    /// Bearer tokens that may look but not change anything, one a line.
+    /// Bearer tokens that may look but not change anything, likewise.
     pub read_token_file: Option<PathBuf>,
     /// PEM certificate chain; with `tls_key_file` the API speaks TLS only.
     pub tls_cert_file: Option<PathBuf>,
@@ -21,6 +26,10 @@ pub struct Config {
     pub allowed_origins: Vec<String>,
     /// Names, beside localhost and plain addresses, that this host is called by when no token is asked for.
     pub allowed_hosts: Vec<String>,
+    /// Proxies whose `X-Forwarded-For` names the client: networks, addresses, or `unix` for the socket.
+    pub trusted_proxies: Vec<String>,
+    /// `max-age` of `Strict-Transport-Security`, s: for this long browsers use TLS only. 0 sends no such header. Needs TLS here.
+    pub hsts_max_age_s: u64,
     /// Connections open at a time, streams included; one client holds at most three times as many as are still free.
     pub max_connections: usize,
     /// Requests a client address may make per second, on average.
@@ -36,7 +45,15 @@ pub enum ConfigError {
         "api.listen: {listen} can be reached from other machines, so api.token_file is needed; \
          expected a token or a loopback address such as 127.0.0.1:8787"
     )]
-    OpenToAll { listen: SocketAddr },
+    OpenToAll { listen: Listen },
+    #[error("api.listen: a Unix socket speaks no TLS; expected no api.tls_cert_file beside {listen}")]
+    TlsOnSocket { listen: Listen },
+    #[error(
+        "api.hsts_max_age_s: expected 0 without api.tls_cert_file, since browsers take it over TLS only, found {found}"
+    )]
+    HstsWithoutTls { found: u64 },
+    #[error(transparent)]
+    NoNetwork(#[from] NoNetwork),
     #[error("api.{missing}: expected a file, since api.{given} is set; found nothing")]
     HalfTls { given: &'static str, missing: &'static str },
     #[error("api.{field}: expected {expected}, found {found}")]
@@ -52,13 +69,15 @@ pub enum ConfigError {
 impl Default for Config {
     fn default() -> Self {
         Self {
-            listen: SocketAddr::from(([127, 0, 0, 1], 8787)),
+            listen: Listen::Tcp(SocketAddr::from(([127, 0, 0, 1], 8787))),
             token_file: None,
             read_token_file: None,
             tls_cert_file: None,
             tls_key_file: None,
             allowed_origins: Vec::new(),
             allowed_hosts: Vec::new(),
+            trusted_proxies: Vec::new(),
+            hsts_max_age_s: 0,
             max_connections: 2048,
             requests_per_second: 200,
             client_timeout_s: 15.0,
@@ -67,17 +86,27 @@ impl Default for Config {
 }
 
 impl Config {
-    /// Patience with a client that is slow.
-    pub(super) fn patience(&self) -> Duration {
+    /// Time limit for a slow client.
+    pub(super) fn client_timeout(&self) -> Duration {
         Duration::from_secs_f64(self.client_timeout_s)
     }
 
     /// Checks what can be checked without opening a file or a port.
     pub fn validate(&self) -> Result<(), ConfigError> {
-        let loopback = self.listen.ip().to_canonical().is_loopback();
-        if !loopback && self.token_file.is_none() && self.read_token_file.is_none() {
-            return Err(ConfigError::OpenToAll { listen: self.listen });
+        let listen = || self.listen.clone();
+        if !self.listen.is_local() && self.token_file.is_none() && self.read_token_file.is_none() {
+            return Err(ConfigError::OpenToAll { listen: listen() });
         }
+        let has_tls = self.tls_cert_file.is_some();
+        if has_tls && matches!(self.listen, Listen::Unix(_)) {
+            return Err(ConfigError::TlsOnSocket { listen: listen() });
+        }
+        if !has_tls && self.hsts_max_age_s > 0 {
+            return Err(ConfigError::HstsWithoutTls {
+                found: self.hsts_max_age_s,
+            });
+        }
+        TrustedProxies::new(&self.trusted_proxies)?;
         match (&self.tls_cert_file, &self.tls_key_file) {
             (Some(_), None) => {
                 return Err(ConfigError::HalfTls {
@@ -93,18 +122,18 @@ impl Config {
             }
             _ => {}
         }
-        if self.max_connections == 0 {
+        if !(1..=100_000).contains(&self.max_connections) {
             return Err(ConfigError::OutOfRange {
                 field: "max_connections",
-                expected: "at least 1",
-                found: 0.0,
+                expected: "1 to 100000 (a host has no more ports for one client)",
+                found: self.max_connections as f64,
             });
         }
-        if self.requests_per_second == 0 {
+        if !(1..=1_000_000).contains(&self.requests_per_second) {
             return Err(ConfigError::OutOfRange {
                 field: "requests_per_second",
-                expected: "at least 1",
-                found: 0.0,
+                expected: "1 to 1000000 (more than the API can answer)",
+                found: self.requests_per_second.into(),
             });
         }
         if !(0.1..=3600.0).contains(&self.client_timeout_s) {
@@ -147,6 +176,23 @@ mod tests {
         for closed in ["127.0.0.1:1", "127.9.9.9:1", "[::1]:1", "[::ffff:127.0.0.1]:1"] {
             listening(closed).validate().expect(closed);
         }
+    }
+
+    #[test]
+    fn a_socket_needs_no_token_and_takes_no_tls_and_hsts_needs_it() {
+        let mut config = listening("unix:/run/oapwatch/api.sock");
+        config.validate().expect("only this machine reaches a socket");
+        config.tls_cert_file = Some("cert.pem".into());
+        config.tls_key_file = Some("key.pem".into());
+        let message = config.validate().expect_err("TLS on a socket").to_string();
+        assert!(message.contains("api.tls_cert_file"), "{message}");
+        config.listen = Config::default().listen;
+        config.hsts_max_age_s = 31_536_000;
+        config.validate().expect("HSTS with TLS");
+        config.tls_cert_file = None;
+        config.tls_key_file = None;
+        let message = config.validate().expect_err("HSTS without TLS").to_string();
+        assert!(message.contains("api.hsts_max_age_s"), "{message}");
     }
 
     #[test]

@@ -1,26 +1,33 @@
-//! What the compute thread publishes and every reader takes at its own pace.
+//! The latest snapshots and alert events, shared by the compute thread and all readers.
 //!
-//! Readers pull: each has a cursor, and nothing is queued for it. A reader that falls behind loses positions
-//! (it gets the newest and a count of what it missed). Alert events it never loses: those that have left the
-//! ring are read back from the journal.
+//! Readers pull: each has a cursor, and nothing is queued for it. A reader that falls behind loses positions (it gets the
+//! newest and the number it missed), never alert events: those that have left the ring are read back from the journal.
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock};
 
+use axum::body::Bytes;
 use jiff::Timestamp;
 use serde::Serialize;
 use tokio::sync::watch;
 
 use super::history::History;
+use super::picture;
 use super::snapshot::Snapshot;
 use crate::claim::Claim;
 use crate::journal::Recorded;
-use crate::monitor::{AlertEvent, Report};
+use crate::monitor::{Alert, AlertEvent, Report};
 
 /// Positions kept for readers that are a moment late.
 const POSITIONS_KEPT: usize = 16;
 /// Alert events kept in memory; older ones come from the journal.
 const EVENTS_KEPT: usize = 1024;
+/// Pictures of alerts kept in memory: at some 20 kB each, 2.5 MB.
+const PICTURES_KEPT: usize = 128;
+/// Pictures drawn for one step.
+const PICTURES_AT_ONCE: usize = 8;
+/// Longer side of such a picture, in its pixels, at least.
+const PICTURE_SIDE: usize = 256;
 /// Claims drawn on the map at most; a log may hold 10,000 users elsewhere.
 const CLAIMS_SHOWN: usize = 500;
 
@@ -28,7 +35,7 @@ const CLAIMS_SHOWN: usize = 500;
 #[derive(Debug)]
 pub struct Published {
     pub seq: u64,
-    /// Counts snapshots, so that a reader can be told how many it missed.
+    /// Counts snapshots, from which the number that a reader missed follows.
     ordinal: u64,
     pub snapshot: Snapshot,
     body: OnceLock<String>,
@@ -77,6 +84,8 @@ struct Ring {
     positions: VecDeque<Arc<Published>>,
     events: VecDeque<Arc<Recorded>>,
     history: History,
+    /// Pictures of the frames at which alerts were raised, by the alerts' ids, oldest first.
+    pictures: VecDeque<(String, Bytes)>,
 }
 
 #[derive(Serialize)]
@@ -119,6 +128,7 @@ impl Feed {
                 positions: VecDeque::with_capacity(POSITIONS_KEPT),
                 events: VecDeque::new(),
                 history: History::new(),
+                pictures: VecDeque::new(),
             }),
             head: watch::Sender::new(last_seq),
         }
@@ -181,6 +191,31 @@ impl Feed {
         ring.published = seq;
         drop(ring);
         self.head.send_replace(seq);
+    }
+
+    /// Keeps a picture of the frame at which each alert was raised, for those that nothing is recorded of. Draws, which
+    /// takes milliseconds: to be called where that delays no frame.
+    pub fn illustrate(&self, raised: &[Alert], snapshot: &Snapshot) {
+        let Some(frame) = &snapshot.frame else { return };
+        let scale = picture::scale_for(frame, PICTURE_SIDE);
+        for alert in raised.iter().take(PICTURES_AT_ONCE) {
+            let marks = picture::marks_of_alert(alert, &snapshot.camera);
+            let Ok(png) = picture::png(frame, &snapshot.camera, &marks, scale) else {
+                continue;
+            };
+            let mut ring = self.ring();
+            if ring.pictures.len() == PICTURES_KEPT {
+                ring.pictures.pop_front();
+            }
+            ring.pictures.push_back((alert.id.clone(), png.into()));
+        }
+    }
+
+    /// The picture that [`Feed::illustrate`] kept for an alert.
+    pub(super) fn picture(&self, alert: &str) -> Option<Bytes> {
+        let ring = self.ring();
+        let found = ring.pictures.iter().find(|(id, _)| id == alert);
+        found.map(|(_, png)| png.clone())
     }
 
     /// Wakes when anything is published.

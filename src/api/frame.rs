@@ -1,5 +1,4 @@
-use std::sync::Mutex;
-use std::time::{Duration, Instant};
+//! `/v1/frame.png`: the latest frame, drawn once for all viewers.
 
 use axum::body::Bytes;
 use axum::extract::State as Shared;
@@ -8,16 +7,13 @@ use axum::response::{IntoResponse, Response};
 use serde::Deserialize;
 
 use super::extract::{Query, within};
-use super::feed::Published;
 use super::problem::Problem;
 use super::state::State;
 use super::{conditional, picture, positions};
 
-/// A picture is drawn anew at most this often, however many viewers ask.
-const REDRAW: Duration = Duration::from_millis(100);
 /// Side of the picture when no scale is asked for, at least.
 const DEFAULT_SIDE: usize = 512;
-const MAX_SIDE: usize = 2048;
+pub(super) const MAX_SIDE: usize = 2048;
 
 #[derive(Debug, Deserialize, utoipa::IntoParams)]
 #[into_params(parameter_in = Query)]
@@ -29,42 +25,6 @@ pub struct PictureQuery {
     scale: Option<usize>,
     /// Whether detections are drawn; true when left out
     detections: Option<bool>,
-}
-
-type Look = (usize, bool);
-
-/// Pictures of the latest frame, drawn once for all viewers.
-#[derive(Default)]
-pub struct Pictures(Mutex<Drawn>);
-
-#[derive(Default)]
-struct Drawn {
-    seq: u64,
-    at: Option<Instant>,
-    looks: Vec<(Look, Bytes)>,
-}
-
-impl Pictures {
-    fn get(&self, published: &Published, look: Look) -> Option<(u64, Bytes)> {
-        let drawn = self.0.lock().unwrap_or_else(|p| p.into_inner());
-        let fresh = drawn.seq == published.seq || drawn.at.is_some_and(|at| at.elapsed() < REDRAW);
-        let found = drawn.looks.iter().find(|(l, _)| *l == look).filter(|_| fresh)?;
-        Some((drawn.seq, found.1.clone()))
-    }
-
-    fn put(&self, seq: u64, look: Look, png: Bytes) {
-        let mut drawn = self.0.lock().unwrap_or_else(|p| p.into_inner());
-        if drawn.seq != seq {
-            *drawn = Drawn {
-                seq,
-                at: Some(Instant::now()),
-                looks: Vec::new(),
-            };
-        }
-        if drawn.looks.len() < 8 {
-            drawn.looks.push((look, png));
-        }
-    }
 }
 
 /// The latest frame as a picture, +x to the right and +y up, with its detections drawn
@@ -93,14 +53,22 @@ pub async fn frame_png(
     let side = nx.max(ny).max(1);
     let scale = match query.scale {
         Some(scale) => within("scale", scale, 1, 64)?.min((MAX_SIDE / side).max(1)),
-        None => DEFAULT_SIDE.div_ceil(side).clamp(1, 64),
+        None => picture::scale_for(&frame, DEFAULT_SIDE),
     };
     let look = (scale, query.detections.unwrap_or(true));
     let (seq, png) = match state.pictures.get(&latest, look) {
         Some(drawn) => drawn,
         None => {
             let published = latest.clone();
-            let draw = move || picture::png(&frame, &published.snapshot, look.0, look.1);
+            let draw = move || {
+                let snapshot = &published.snapshot;
+                let marks = if look.1 {
+                    picture::marks_of(snapshot)
+                } else {
+                    Vec::new()
+                };
+                picture::png(&frame, &snapshot.camera, &marks, look.0)
+            };
             let drawn = tokio::task::spawn_blocking(draw).await.expect("drawing does not panic");
             let png = drawn.map_err(|e| Problem::new(StatusCode::INTERNAL_SERVER_ERROR, e.to_string()))?;
             let png = Bytes::from(png);

@@ -1,3 +1,5 @@
+//! Positions of the last hour, one moment a second, for `/v1/history`.
+
 use std::collections::VecDeque;
 use std::sync::Arc;
 

@@ -1,27 +1,35 @@
-//! Floor 4: what people and programs see: REST, WebSocket, server-sent events, metrics and the dashboard.
+//! Layer 4: REST, WebSocket, server-sent events, metrics and the dashboard.
 //!
-//! The daemon builds a [`State`], publishes to its [`Feed`], answers [`Command`]s, and runs a [`Server`]. Nothing in
-//! here can make the compute thread wait.
+//! The daemon builds a [`State`], publishes to its [`Feed`], handles [`Command`]s and runs a [`Server`]. No handler can
+//! make the compute thread wait.
 
+mod acknowledge;
 mod alerts;
+mod audit;
+mod audit_log;
 mod auth;
 mod claims;
+mod client;
 mod conditional;
 mod config;
+mod connection_quota;
+mod evidence;
 mod extract;
 mod feed;
 mod frame;
 mod guard;
 mod history;
+mod intake;
+mod listener;
 mod openapi;
 mod page;
 mod picture;
+mod picture_cache;
 mod positions;
 mod probes;
 mod problem;
 mod respond;
 mod server;
-mod shares;
 mod snapshot;
 mod sse;
 mod state;
@@ -32,6 +40,7 @@ mod websocket;
 pub use auth::TokenError;
 pub use config::{Config, ConfigError};
 pub use feed::Feed;
+pub use listener::{Listen, ListenError, Listener};
 pub use server::{Error, Server};
 pub use snapshot::{ClaimsStatus, FrameCounts, JournalStatus, Latency, Snapshot, SourceState, SourceStatus, Status};
 pub use state::{Acknowledged, Command, State};
@@ -58,25 +67,29 @@ use crate::metric;
 const MAX_BODY_BYTES: usize = 4 << 20;
 
 /// All routes under all guards, the outermost last.
-fn router(state: State, config: &Config, tokens: Arc<auth::Tokens>) -> Router {
+fn router(state: State, config: &Config, tokens: Arc<auth::Tokens>, proxies: Arc<client::TrustedProxies>) -> Router {
     let (routes, description) = openapi::router();
-    let origins = Arc::new(guard::Origins::new(config, tokens.required()));
+    let required = tokens.required();
+    let audit = state.audit.clone();
+    let origins = Arc::new(guard::Origins::new(config, required, audit.clone()));
     let per_second = NonZeroU32::new(config.requests_per_second).unwrap_or(NonZeroU32::MIN);
-    let rates = Arc::new(guard::Rates::new(per_second));
-    routes
-        .merge(openapi::serve(description, tokens.required()))
+    let rates = Arc::new(guard::Rates::new(per_second, audit.clone()));
+    let gate = Arc::new(auth::Gate { tokens, audit });
+    let routes = routes
+        .merge(openapi::serve(description, required))
         .route("/", get(page::index))
         .route("/page/{*path}", get(page::asset))
         .fallback(|| async { StatusCode::NOT_FOUND })
         .layer(DefaultBodyLimit::max(MAX_BODY_BYTES))
         .layer(CompressionLayer::new().gzip(true))
-        .layer(from_fn_with_state(tokens, auth::check))
+        .layer(from_fn_with_state(gate, auth::check))
         .layer(from_fn_with_state(origins, guard::origin))
         .layer(cors(config))
         .layer(from_fn_with_state(rates, guard::rate))
+        .layer(from_fn_with_state(proxies, client::identify))
         .layer(TimeoutLayer::with_status_code(
             StatusCode::REQUEST_TIMEOUT,
-            config.patience(),
+            config.client_timeout(),
         ))
         .layer(CatchPanicLayer::new())
         .layer(from_fn(problem::for_every_error))
@@ -86,9 +99,18 @@ fn router(state: State, config: &Config, tokens: Arc<auth::Tokens>) -> Router {
         .layer(fixed(
             HeaderName::from_static("cross-origin-opener-policy"),
             "same-origin",
-        ))
-        .layer(from_fn(measure))
-        .with_state(state)
+        ));
+    let routes = match config.hsts_max_age_s {
+        0 => routes,
+        max_age => routes.layer(strict_transport(max_age)),
+    };
+    routes.layer(from_fn(measure)).with_state(state)
+}
+
+/// Makes browsers use TLS only (RFC 6797).
+fn strict_transport(max_age_s: u64) -> SetResponseHeaderLayer<HeaderValue> {
+    let value = HeaderValue::from_str(&format!("max-age={max_age_s}")).expect("digits");
+    SetResponseHeaderLayer::overriding(header::STRICT_TRANSPORT_SECURITY, value)
 }
 
 fn fixed(name: HeaderName, value: &'static str) -> SetResponseHeaderLayer<HeaderValue> {
@@ -103,7 +125,7 @@ fn cors(config: &Config) -> CorsLayer {
     }
     CorsLayer::new()
         .allow_origin(AllowOrigin::list(origins))
-        .allow_methods([Method::GET, Method::POST])
+        .allow_methods([Method::GET, Method::POST, Method::DELETE])
         .allow_headers([header::AUTHORIZATION, header::CONTENT_TYPE, header::IF_NONE_MATCH])
         .expose_headers([header::ETAG, header::LINK, header::RETRY_AFTER])
         .max_age(Duration::from_secs(600))
@@ -118,6 +140,7 @@ async fn measure(request: Request, next: Next) -> Response {
         Method::GET => "GET",
         Method::POST => "POST",
         Method::HEAD => "HEAD",
+        Method::DELETE => "DELETE",
         _ => "other",
     };
     let response = next.run(request).await;

@@ -1,3 +1,5 @@
+//! All described routes and the OpenAPI document generated from the same code.
+
 use axum::Json;
 use axum::Router;
 use axum::routing::get;
@@ -7,7 +9,7 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::state::State;
-use super::{alerts, claims, frame, positions, probes, sse, webhooks, websocket};
+use super::{acknowledge, alerts, audit_log, claims, evidence, frame, positions, probes, sse, webhooks, websocket};
 
 #[derive(OpenApi)]
 #[openapi(
@@ -41,7 +43,10 @@ pub fn router() -> (Router<State>, utoipa::openapi::OpenApi) {
         .routes(routes!(positions::status))
         .routes(routes!(alerts::list))
         .routes(routes!(alerts::get))
-        .routes(routes!(alerts::acknowledge))
+        .routes(routes!(acknowledge::acknowledge, acknowledge::unacknowledge))
+        .routes(routes!(evidence::npy))
+        .routes(routes!(evidence::png))
+        .routes(routes!(evidence::json))
         .routes(routes!(claims::post))
         .routes(routes!(frame::frame_png))
         .routes(routes!(websocket::websocket))
@@ -50,6 +55,7 @@ pub fn router() -> (Router<State>, utoipa::openapi::OpenApi) {
         .routes(routes!(webhooks::dead_letters))
         .routes(routes!(webhooks::replay))
         .routes(routes!(webhooks::enable))
+        .routes(routes!(audit_log::list))
         .routes(routes!(probes::healthz))
         .routes(routes!(probes::readyz))
         .routes(routes!(probes::metrics))

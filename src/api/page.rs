@@ -1,3 +1,5 @@
+//! The dashboard's files, embedded in the binary, with their content security policy.
+
 use axum::extract::Path;
 use axum::http::{HeaderMap, HeaderValue, header};
 use axum::response::{IntoResponse, Response};

@@ -5,7 +5,8 @@ use image::{ImageEncoder, Rgb, RgbImage};
 
 use super::snapshot::Snapshot;
 use crate::frame::Frame;
-use crate::monitor::PositionStatus;
+use crate::monitor::{Alert, AlertKind, PositionStatus};
+use crate::optics::Camera;
 
 /// Dark blue through magenta to light yellow, evenly spaced; lightness rises evenly.
 const COLOURS: [[f64; 3]; 6] = [
@@ -18,8 +19,52 @@ const COLOURS: [[f64; 3]; 6] = [
 ];
 const UNUSABLE: Rgb<u8> = Rgb([0, 110, 110]);
 
+/// A place to be marked in a picture.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Mark {
+    /// On the sensor, m.
+    at: [f64; 2],
+    status: PositionStatus,
+}
+
+/// Marks of everything that a snapshot's report holds.
+pub fn marks_of(snapshot: &Snapshot) -> Vec<Mark> {
+    let emitters = snapshot.report.emitters.iter();
+    let mark = |e: &crate::monitor::TrackedPosition| Mark {
+        at: snapshot.camera.to_sensor([e.x_m, e.y_m]),
+        status: e.status,
+    };
+    emitters.map(mark).collect()
+}
+
+/// Marks of one alert: the place that was claimed, and where the light came from.
+pub fn marks_of_alert(alert: &Alert, camera: &Camera) -> Vec<Mark> {
+    let claimed = alert
+        .claimed
+        .as_ref()
+        .and_then(|c| Some([c["x_m"].as_f64()?, c["y_m"].as_f64()?]));
+    let seen = alert.x_m.zip(alert.y_m).map(|(x, y)| [x, y]);
+    let status = match alert.kind {
+        AlertKind::UnclaimedEmitter => PositionStatus::Unclaimed,
+        _ => PositionStatus::Mismatch,
+    };
+    let claimed = claimed.map(|place| (place, PositionStatus::Pending));
+    let seen = seen.map(|place| (place, status));
+    let mark = |(place, status)| Mark {
+        at: camera.to_sensor(place),
+        status,
+    };
+    claimed.into_iter().chain(seen).map(mark).collect()
+}
+
+/// Picture pixels a sensor pixel at which a frame's longer side is at least `side` picture pixels.
+pub fn scale_for(frame: &Frame, side: usize) -> usize {
+    let (ny, nx) = frame.pixels.dim();
+    side.div_ceil(nx.max(ny).max(1)).clamp(1, 64)
+}
+
 /// PNG of a frame, `scale` picture pixels a sensor pixel; row 0 (y_min) is at the bottom.
-pub fn png(frame: &Frame, snapshot: &Snapshot, scale: usize, detections: bool) -> Result<Vec<u8>, image::ImageError> {
+pub fn png(frame: &Frame, camera: &Camera, marks: &[Mark], scale: usize) -> Result<Vec<u8>, image::ImageError> {
     let (ny, nx) = frame.pixels.dim();
     let (low, high) = range(frame);
     let mut picture = RgbImage::from_fn((nx * scale) as u32, (ny * scale) as u32, |px, py| {
@@ -33,14 +78,10 @@ pub fn png(frame: &Frame, snapshot: &Snapshot, scale: usize, detections: bool) -
             colour((value - low) / (high - low))
         }
     });
-    if detections {
-        let camera = &snapshot.camera;
-        for emitter in &snapshot.report.emitters {
-            let [x, y] = camera.to_sensor([emitter.x_m, emitter.y_m]);
-            let px = (x - camera.x.min_m) / camera.x.pitch_m * scale as f64;
-            let py = (ny as f64 - (y - camera.y.min_m) / camera.y.pitch_m) * scale as f64;
-            mark(&mut picture, [px, py], emitter.status);
-        }
+    for Mark { at: [x, y], status } in marks {
+        let px = (x - camera.x.min_m) / camera.x.pitch_m * scale as f64;
+        let py = (ny as f64 - (y - camera.y.min_m) / camera.y.pitch_m) * scale as f64;
+        mark(&mut picture, [px, py], *status);
     }
     let mut out = Vec::new();
     let encoder = image::codecs::png::PngEncoder::new(&mut out);

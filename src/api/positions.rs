@@ -1,3 +1,5 @@
+//! `/v1/positions`, `/v1/users/{user}/position`, `/v1/status` and `/v1/history`.
+
 use axum::extract::State as Shared;
 use axum::http::{HeaderMap, StatusCode};
 use axum::response::Response;

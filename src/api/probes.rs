@@ -1,3 +1,5 @@
+//! `/healthz`, `/readyz` and `/metrics`, for supervisors and Prometheus.
+
 use std::sync::atomic::Ordering;
 
 use axum::extract::State as Shared;

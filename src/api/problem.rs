@@ -1,3 +1,5 @@
+//! RFC 9457 problem details: the form of every error that the API answers with.
+
 use axum::Json;
 use axum::body::Body;
 use axum::extract::Request;
@@ -7,7 +9,7 @@ use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
 use serde::Serialize;
 
-use super::claims::Intake;
+use super::intake::Intake;
 
 const MEDIA_TYPE: HeaderValue = HeaderValue::from_static("application/problem+json");
 
@@ -27,6 +29,9 @@ pub struct Problem {
     #[serde(skip)]
     retry_after_s: Option<u64>,
 }
+
+/// When there may be room for another user: newcomers make way for each other after ten silent seconds.
+const COME_BACK_S: u64 = 10;
 
 impl Problem {
     pub fn new(status: StatusCode, detail: impl Into<String>) -> Self {
@@ -48,6 +53,7 @@ impl Problem {
     pub fn refused(status: StatusCode, intake: Intake, detail: String) -> Self {
         Self {
             intake: Some(Box::new(intake)),
+            retry_after_s: (status == StatusCode::SERVICE_UNAVAILABLE).then_some(COME_BACK_S),
             ..Self::new(status, detail)
         }
     }

@@ -1,3 +1,5 @@
+//! JSON responses with the cache headers that all of them share.
+
 use axum::http::{HeaderValue, header};
 use axum::response::{IntoResponse, Response};
 use serde::Serialize;

@@ -1,3 +1,5 @@
+//! What the daemon publishes after each step: the report, the frame and the monitor's own status.
+
 use std::collections::BTreeMap;
 use std::sync::Arc;
 

@@ -1,6 +1,9 @@
+//! `/v1/events`: the stream as server-sent events.
+
 use std::convert::Infallible;
 use std::time::Duration;
 
+use axum::Extension;
 use axum::extract::State as Shared;
 use axum::http::HeaderMap;
 use axum::response::IntoResponse;
@@ -8,6 +11,7 @@ use axum::response::Response;
 use axum::response::sse::{Event, KeepAlive, Sse};
 use futures_util::stream;
 
+use super::auth::Session;
 use super::extract::Query;
 use super::problem::Problem;
 use super::state::State;
@@ -23,7 +27,12 @@ use super::websocket::{StreamQuery, stopped};
         (status = 200, description = "An endless stream", body = feed::Message, content_type = "text/event-stream"),
         (status = 400, description = "A parameter cannot be read", body = Problem, content_type = "application/problem+json"),
     ))]
-pub async fn events(Shared(state): Shared<State>, Query(query): Query<StreamQuery>, headers: HeaderMap) -> Response {
+pub async fn events(
+    Shared(state): Shared<State>,
+    Query(query): Query<StreamQuery>,
+    Extension(session): Extension<Session>,
+    headers: HeaderMap,
+) -> Response {
     let last_seen = headers
         .get("last-event-id")
         .and_then(|v| v.to_str().ok())
@@ -39,8 +48,13 @@ pub async fn events(Shared(state): Shared<State>, Query(query): Query<StreamQuer
             .data(message.text);
         Some((Ok::<_, Infallible>(event), (reader, counted)))
     });
-    let until_stop = async move { stopped(&mut stopping).await };
-    let messages = futures_util::StreamExt::take_until(messages, Box::pin(until_stop));
+    let until_end = async move {
+        tokio::select! {
+            () = stopped(&mut stopping) => {}
+            () = session.revoked() => {}
+        }
+    };
+    let messages = futures_util::StreamExt::take_until(messages, Box::pin(until_end));
     let keep_alive = KeepAlive::new().interval(Duration::from_secs(15));
     Sse::new(Box::pin(messages)).keep_alive(keep_alive).into_response()
 }

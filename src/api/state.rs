@@ -1,12 +1,17 @@
+//! What the handlers work with, and the commands they send to the compute thread.
+
+use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 use metrics_exporter_prometheus::PrometheusHandle;
 use tokio::sync::{mpsc, oneshot, watch};
 
+use super::audit::Audit;
 use super::feed::Feed;
-use super::frame::Pictures;
+use super::picture_cache::PictureCache;
 use crate::claim::Claim;
+use crate::frames::record;
 use crate::journal::Journal;
 use crate::monitor::Alert;
 use crate::notify::Notifier;
@@ -15,16 +20,19 @@ use crate::notify::Notifier;
 #[derive(Clone)]
 pub struct State {
     pub feed: Arc<Feed>,
-    /// To the compute thread. Full means overload: the client is told to come back.
+    /// To the compute thread. A full queue means overload: the client gets 503 with `Retry-After`.
     pub commands: mpsc::Sender<Command>,
     pub journal: Journal,
     pub metrics: PrometheusHandle,
     /// The model is loaded and the pipeline runs; `/readyz` asks for good frames besides.
     pub ready: Arc<AtomicBool>,
-    /// Webhook status and replay; none where no webhook is spoken of.
+    /// Webhook status and replay; none where no webhook is configured.
     pub(super) notifier: Option<Notifier>,
-    pub(super) pictures: Arc<Pictures>,
-    /// Turns true when the server stops, for streams to say goodbye.
+    pub(super) pictures: Arc<PictureCache>,
+    pub(super) audit: Audit,
+    /// The recorder's folder for evidence, where frames are recorded.
+    pub(super) evidence: Option<Arc<Path>>,
+    /// Turns true when the server stops: streams then close.
     pub(super) stopping: watch::Sender<bool>,
 }
 
@@ -39,6 +47,8 @@ impl State {
         Self {
             feed,
             commands,
+            audit: Audit::new(journal.clone()),
+            evidence: None,
             journal,
             metrics,
             ready,
@@ -46,6 +56,12 @@ impl State {
             pictures: Arc::default(),
             stopping: watch::Sender::new(false),
         }
+    }
+
+    /// `folder` is the recorder's.
+    pub fn with_evidence(mut self, folder: &Path) -> Self {
+        self.evidence = Some(folder.join(record::EVIDENCE).into());
+        self
     }
 
     pub fn with_webhooks(mut self, notifier: Notifier) -> Self {
@@ -64,11 +80,19 @@ pub enum Command {
     },
     Acknowledge {
         id: String,
+        /// Name of the operator's token.
+        by: Option<String>,
+        note: Option<String>,
+        reply: oneshot::Sender<Acknowledged>,
+    },
+    Unacknowledge {
+        id: String,
+        by: Option<String>,
         reply: oneshot::Sender<Acknowledged>,
     },
 }
 
-/// Outcome of an acknowledgement. Acknowledging twice is no error.
+/// Outcome of an acknowledgement or its withdrawal. Asking twice is no error.
 #[derive(Debug)]
 pub enum Acknowledged {
     Done(Box<Alert>),

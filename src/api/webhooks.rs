@@ -1,13 +1,16 @@
+//! `/v1/webhooks`: delivery status, dead letters, replay and re-enabling.
+
 use axum::extract::State as Shared;
 use axum::http::StatusCode;
 use axum::response::Response;
 use serde::{Deserialize, Serialize};
 
+use super::client::Caller;
 use super::extract::{Path, Query};
 use super::problem::Problem;
 use super::respond;
 use super::state::State;
-use crate::journal::DeadLetter;
+use crate::journal::{AuditAction, DeadLetter};
 use crate::notify::{AskError, EndpointStatus, Notifier};
 
 /// Dead letters listed at most.
@@ -90,6 +93,7 @@ pub async fn dead_letters(Shared(state): Shared<State>, Path(name): Path<String>
     ))]
 pub async fn replay(
     Shared(state): Shared<State>,
+    caller: Caller,
     Path(name): Path<String>,
     Query(query): Query<ReplayQuery>,
 ) -> Result<Response, Problem> {
@@ -100,6 +104,8 @@ pub async fn replay(
         ));
     }
     let queued = notifier(&state, &name)?.replay(&name, query.seq).await?;
+    let detail = Some(format!("{queued} queued"));
+    state.audit.change(AuditAction::ReplayWebhook, &caller, &name, detail);
     Ok(respond::json(&Replayed { queued }))
 }
 
@@ -112,7 +118,12 @@ pub async fn replay(
         (status = 404, description = "There is no such webhook", body = Problem, content_type = "application/problem+json"),
         (status = 503, description = "The daemon is stopping", body = Problem, content_type = "application/problem+json"),
     ))]
-pub async fn enable(Shared(state): Shared<State>, Path(name): Path<String>) -> Result<StatusCode, Problem> {
+pub async fn enable(
+    Shared(state): Shared<State>,
+    caller: Caller,
+    Path(name): Path<String>,
+) -> Result<StatusCode, Problem> {
     notifier(&state, &name)?.enable(&name).await?;
+    state.audit.change(AuditAction::EnableWebhook, &caller, &name, None);
     Ok(StatusCode::NO_CONTENT)
 }

@@ -1,5 +1,9 @@
+//! `/v1/stream`: the stream as a WebSocket, with pings and timeouts.
+
+use std::pin::pin;
 use std::time::Duration;
 
+use axum::Extension;
 use axum::body::Bytes;
 use axum::extract::State as Shared;
 use axum::extract::ws::{CloseFrame, Message, WebSocket, WebSocketUpgrade, close_code};
@@ -8,6 +12,7 @@ use serde::Deserialize;
 use tokio::sync::watch;
 use tokio::time::{Instant, interval, timeout};
 
+use super::auth::Session;
 use super::extract::Query;
 use super::problem::Problem;
 use super::state::State;
@@ -15,10 +20,12 @@ use super::stream::{self, Reader};
 
 /// A ping is sent this often.
 const PING_EVERY: Duration = Duration::from_secs(15);
-/// A client that has not been heard of for this long is gone.
+/// A client from which nothing came for this long is disconnected.
 const SILENCE: Duration = Duration::from_secs(40);
 /// One message must have left within this time.
 const SEND_WITHIN: Duration = Duration::from_secs(20);
+/// A close frame must have left within this time.
+const CLOSE_WITHIN: Duration = Duration::from_millis(300);
 /// Clients have nothing to say here but pongs.
 const MAX_INCOMING: usize = 4096;
 /// A message and the pings behind it; more is never waiting.
@@ -48,6 +55,7 @@ pub struct StreamQuery {
 pub async fn websocket(
     Shared(state): Shared<State>,
     Query(query): Query<StreamQuery>,
+    Extension(session): Extension<Session>,
     upgrade: WebSocketUpgrade,
 ) -> Response {
     upgrade
@@ -58,7 +66,7 @@ pub async fn websocket(
         .max_write_buffer_size(MAX_WRITE_BUFFER)
         .on_upgrade(move |socket| async move {
             let _counted = super::server::Counted::stream("websocket");
-            converse(socket, state, query.after).await;
+            converse(socket, state, query.after, session).await;
         })
 }
 
@@ -67,8 +75,9 @@ pub(super) async fn stopped(stopping: &mut watch::Receiver<bool>) {
     let _ = stopping.wait_for(|s| *s).await;
 }
 
-async fn converse(mut socket: WebSocket, state: State, after: Option<u64>) {
+async fn converse(mut socket: WebSocket, state: State, after: Option<u64>, session: Session) {
     let mut stopping = state.stopping.subscribe();
+    let mut revoked = pin!(session.revoked());
     let mut reader = Reader::join(state, after).await;
     let mut ping = interval(PING_EVERY);
     ping.reset();
@@ -82,11 +91,8 @@ async fn converse(mut socket: WebSocket, state: State, after: Option<u64>) {
                     continue;
                 }
             },
-            _ = stopped(&mut stopping) => {
-                let away = CloseFrame { code: close_code::AWAY, reason: "the daemon is stopping".into() };
-                let _ = timeout(Duration::from_secs(1), socket.send(Message::Close(Some(away)))).await;
-                return;
-            },
+            _ = stopped(&mut stopping) => return close(socket, close_code::AWAY, "the daemon is stopping").await,
+            () = &mut revoked => return close(socket, close_code::POLICY, "the token was revoked").await,
             _ = ping.tick() => {
                 if heard.elapsed() > SILENCE {
                     tracing::debug!("a stream client has not answered pings for {SILENCE:?}");
@@ -96,7 +102,12 @@ async fn converse(mut socket: WebSocket, state: State, after: Option<u64>) {
             },
             message = reader.next() => Message::Text(message.text.into()),
         };
-        match timeout(SEND_WITHIN, socket.send(outgoing)).await {
+        let sent = tokio::select! {
+            sent = timeout(SEND_WITHIN, socket.send(outgoing)) => sent,
+            // A client that takes nothing would otherwise keep a revoked stream for the whole time limit.
+            () = &mut revoked => return,
+        };
+        match sent {
             Ok(Ok(())) => {}
             Ok(Err(_)) => return,
             Err(_) => {
@@ -105,4 +116,13 @@ async fn converse(mut socket: WebSocket, state: State, after: Option<u64>) {
             }
         }
     }
+}
+
+async fn close(mut socket: WebSocket, code: u16, reason: &'static str) {
+    let frame = CloseFrame {
+        code,
+        reason: reason.into(),
+    };
+    // A client that does not read it is cut off all the same.
+    let _ = timeout(CLOSE_WITHIN, socket.send(Message::Close(Some(frame)))).await;
 }

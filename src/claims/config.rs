@@ -18,6 +18,8 @@ pub struct Config {
     pub clock_offset_s: f64,
     /// Users remembered at once.
     pub max_users: usize,
+    /// At most so much of the log's end is read at the start of a live run, or when the log grows faster than it is read.
+    pub tail_bytes: u64,
 }
 
 /// Field names of a claim line. A name that starts with `/` is a JSON pointer (RFC 6901).
@@ -68,6 +70,7 @@ impl Default for Config {
             default_sigma_m: 1.0,
             clock_offset_s: 0.0,
             max_users: 20_000,
+            tail_bytes: 4 << 20,
         }
     }
 }
@@ -97,9 +100,9 @@ impl Config {
         };
         let sigma = self.default_sigma_m;
         check(
-            sigma.is_finite() && sigma > 0.0,
+            (1e-4..=1e5).contains(&sigma),
             "default_sigma_m",
-            "a positive finite number",
+            "0.0001 to 100000 (metres; a wider claim says nothing)",
             sigma,
         )?;
         let offset = self.clock_offset_s;
@@ -114,6 +117,12 @@ impl Config {
             "max_users",
             "1 to 1000000",
             self.max_users as f64,
+        )?;
+        check(
+            (1 << 16..=1 << 30).contains(&self.tail_bytes),
+            "tail_bytes",
+            "65536 to 1073741824",
+            self.tail_bytes as f64,
         )?;
         if let Some(origin) = &self.origin {
             let latitude = origin.latitude_deg;

@@ -8,7 +8,7 @@ use super::{Claim, Config, LineError, parse_line};
 /// Longest line accepted; a longer one is refused as a whole.
 pub const LONGEST_LINE: usize = 64 * 1024;
 /// Bytes read in one poll, so that a huge log cannot hold up the caller.
-const POLL_BYTES: u64 = 4 << 20;
+const POLL_BYTES: u64 = 1 << 20;
 /// The start of the file that tells a rewritten log from a grown one.
 const HEAD_BYTES: usize = 256;
 /// Lines that are no claims that a poll names.
@@ -21,6 +21,8 @@ pub struct Follower {
     path: PathBuf,
     config: Config,
     open: Option<Open>,
+    /// How far behind the log's end reading may be before what lies between is passed over.
+    most_behind: Option<u64>,
 }
 
 #[derive(Debug)]
@@ -45,12 +47,16 @@ pub struct Poll {
     pub restarted: bool,
     /// There is more to read at once.
     pub more: bool,
+    /// Bytes of a log longer than is read at its opening that were passed over.
+    pub skipped_at_start_bytes: u64,
+    /// Bytes passed over because the log grew faster than it is read.
+    pub skipped_bytes: u64,
 }
 
 /// A line that is no claim.
 #[derive(Debug)]
 pub struct Refused {
-    /// Counted from 1 in the file as it is now.
+    /// Counted from 1 in the file as it is now; from where reading went on, where bytes were passed over.
     pub line: u64,
     pub error: LineError,
 }
@@ -61,6 +67,8 @@ struct Lines {
     number: u64,
     partial: Vec<u8>,
     overlong: bool,
+    /// The line at hand lost its beginning.
+    is_cut: bool,
 }
 
 impl Lines {
@@ -84,6 +92,11 @@ impl Lines {
 
     /// Ends the line at hand: at its newline, or where the file it was in ends for good.
     fn finish(&mut self, config: &Config, poll: &mut Poll) {
+        if std::mem::take(&mut self.is_cut) {
+            self.partial.clear();
+            self.overlong = false;
+            return;
+        }
         self.number += 1;
         let read = if self.overlong {
             Err(LineError::TooLong { limit: LONGEST_LINE })
@@ -107,6 +120,14 @@ impl Lines {
         }
     }
 
+    /// Starts somewhere in a line, whose end is no claim's and no error.
+    fn skip(&mut self) {
+        *self = Self {
+            is_cut: true,
+            ..Self::default()
+        };
+    }
+
     fn is_midline(&self) -> bool {
         self.overlong || !self.partial.is_empty()
     }
@@ -118,7 +139,14 @@ impl Follower {
             path: path.to_owned(),
             config: config.clone(),
             open: None,
+            most_behind: None,
         }
+    }
+
+    /// Follows a live log: reading that is more than `[claims] tail_bytes` behind the log's end, at the start or later, goes on from there.
+    pub fn live(self) -> Self {
+        let most_behind = Some(self.config.tail_bytes);
+        Self { most_behind, ..self }
     }
 
     /// Reads what has been written since the last poll. A log that does not exist (yet) gives nothing. An error says
@@ -134,7 +162,7 @@ impl Follower {
                 open.restart()?;
                 poll.restarted = true;
             }
-            open.read(&self.config, &mut poll)?;
+            open.read(&self.config, self.most_behind, &mut poll)?;
             let replaced = match &on_disk {
                 None => false,
                 Some(Ok(meta)) => (meta.dev(), meta.ino()) != open.identity,
@@ -170,7 +198,7 @@ impl Follower {
         }
         match Open::new(&self.path) {
             Ok(mut open) => {
-                open.read(&self.config, poll)?;
+                open.read(&self.config, self.most_behind, poll)?;
                 self.open = Some(open);
                 Ok(())
             }
@@ -213,7 +241,13 @@ impl Open {
         Ok(())
     }
 
-    fn read(&mut self, config: &Config, poll: &mut Poll) -> io::Result<()> {
+    fn read(&mut self, config: &Config, most_behind: Option<u64>, poll: &mut Poll) -> io::Result<()> {
+        if let Some(most_behind) = most_behind {
+            let end = self.file.metadata()?.len();
+            if end.saturating_sub(self.offset) > most_behind {
+                self.skip_to(end - most_behind, poll)?;
+            }
+        }
         self.file.seek(SeekFrom::Start(self.offset))?;
         let mut bytes = Vec::new();
         let read = (&self.file).take(POLL_BYTES).read_to_end(&mut bytes)?;
@@ -222,6 +256,20 @@ impl Open {
         self.head.extend_from_slice(&bytes[..missing]);
         self.lines.feed(&bytes, config, poll);
         poll.more |= read as u64 == POLL_BYTES;
+        Ok(())
+    }
+
+    /// Passes over what lies before `offset`, but for the head that tells a rewritten log.
+    fn skip_to(&mut self, offset: u64, poll: &mut Poll) -> io::Result<()> {
+        let missing = HEAD_BYTES.saturating_sub(self.head.len());
+        self.file.seek(SeekFrom::Start(self.head.len() as u64))?;
+        (&self.file).take(missing as u64).read_to_end(&mut self.head)?;
+        match self.offset {
+            0 => poll.skipped_at_start_bytes += offset,
+            read => poll.skipped_bytes += offset - read,
+        }
+        self.offset = offset;
+        self.lines.skip();
         Ok(())
     }
 }
@@ -233,7 +281,7 @@ pub fn read_log(path: &Path, config: &Config) -> io::Result<Poll> {
     let mut poll = Poll::default();
     loop {
         poll.more = false;
-        open.read(config, &mut poll)?;
+        open.read(config, None, &mut poll)?;
         if !poll.more {
             break;
         }

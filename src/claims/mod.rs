@@ -1,16 +1,29 @@
-//! Floor 2: positions that the access network asserts. An attacker may write them; nothing below the
+//! Positions that the access network asserts. An attacker may write them; nothing below the
 //! monitor ever sees one.
 
+mod ahead;
+mod candidates;
 mod config;
 mod follower;
+mod history;
+mod inbox;
 mod line;
+mod outcome;
+mod pressure;
+mod roster;
 mod store;
 
+pub use candidates::MOST_UNANSWERED;
 pub use config::{Config, ConfigError, Fields, Origin};
 pub use follower::{Follower, LONGEST_LINE, Poll, Refused, read_log};
+pub use history::Standing;
+pub use inbox::{Batch, Inbox, MOST_NEW};
 pub use line::{LineError, parse_line};
-pub use store::{Counts, Outcome, Standing, Store};
+pub use outcome::{NO_ROOM, Outcome};
+pub use pressure::{Squeeze, WINDOW_S};
+pub use roster::Roster;
+pub use store::{Beam, Counts, Store};
 
-pub(crate) use store::seconds;
+pub(crate) use crate::claim::seconds;
 
 pub use crate::claim::{Claim, ClaimState};

@@ -4,52 +4,68 @@ use std::time::{Duration, Instant};
 
 use super::compute::Compute;
 use crate::api::{Acknowledged, Command};
-use crate::claims::{Outcome, Refused};
+use crate::claim::escape_undisplayable;
+use crate::claims::Refused;
 use crate::metric;
-use crate::monitor::AlertState;
+use crate::monitor::{Acknowledgement, AlertEvent, AlertState, Withdrawal};
 
 /// How often lines of the claims log that are no claims are logged.
 const COMPLAIN_EVERY: Duration = Duration::from_secs(10);
-
 impl Compute {
-    /// Claims by POST and acknowledgements.
-    pub(super) fn obey(&mut self) {
-        while let Ok(command) = self.commands.try_recv() {
+    /// Acknowledgements, and some of the claims by POST.
+    pub(super) fn handle_commands(&mut self) {
+        while self.posts.has_room()
+            && let Ok(command) = self.commands.try_recv()
+        {
             match command {
-                Command::Claims { claims, reply } => {
-                    let now = self.now();
-                    let mut refused = Vec::new();
-                    for (index, claim) in claims.into_iter().enumerate() {
-                        if self.recorder.is_some() {
-                            self.unrecorded.push(claim.clone());
-                        }
-                        let reason = match self.pipeline.claims.insert(claim, now) {
-                            Outcome::Full => "the store of claims is full",
-                            Outcome::Conflicting => "another position was claimed for this user and time",
-                            Outcome::TooLate => "older than all that is kept of this user",
-                            Outcome::Accepted | Outcome::Ahead | Outcome::Late | Outcome::Duplicate => continue,
-                        };
-                        refused.push((index, reason.to_owned()));
-                    }
-                    // A client that has gone away needs no answer.
-                    let _ = reply.send(refused);
-                }
-                Command::Acknowledge { id, reply } => {
-                    let outcome = match self.pipeline.monitor.acknowledge(&id, self.now()) {
-                        Some(event) => {
-                            let alert = event.alert.clone();
-                            self.outlet.events(vec![event], self.now());
-                            Acknowledged::Done(Box::new(alert))
-                        }
-                        None => match self.journal.alert(&id) {
-                            Ok(Some(alert)) if alert.state == AlertState::Cleared => Acknowledged::AlreadyCleared,
-                            Ok(Some(alert)) => Acknowledged::Done(Box::new(alert)),
-                            Ok(None) | Err(_) => Acknowledged::Unknown,
-                        },
+                Command::Claims { claims, reply } => self.posts.add(claims, reply),
+                Command::Acknowledge { id, by, note, reply } => {
+                    let acknowledgement = Acknowledgement {
+                        at: self.now(),
+                        by,
+                        note,
+                        withdrawn: None,
                     };
+                    let event = self.pipeline.monitor.acknowledge(&id, acknowledgement);
+                    let outcome = self.acknowledged(&id, event);
+                    self.outlet.acknowledged(reply, outcome);
+                }
+                Command::Unacknowledge { id, by, reply } => {
+                    let withdrawal = Withdrawal { at: self.now(), by };
+                    let event = self.pipeline.monitor.unacknowledge(&id, withdrawal);
+                    let outcome = self.acknowledged(&id, event);
                     self.outlet.acknowledged(reply, outcome);
                 }
             }
+        }
+        let now = self.now();
+        let Self {
+            posts,
+            pipeline,
+            recorder,
+            unrecorded,
+            ..
+        } = self;
+        posts.place(|claim| {
+            if recorder.is_some() {
+                unrecorded.push(claim.clone());
+            }
+            pipeline.claims.insert(claim, now).refusal()
+        });
+    }
+
+    /// Publishes what an operator changed; without a change the answer is what the journal has.
+    fn acknowledged(&mut self, id: &str, event: Option<AlertEvent>) -> Acknowledged {
+        if let Some(mut event) = event {
+            self.state.name_evidence(&mut event.alert);
+            let alert = event.alert.clone();
+            self.outlet.events(vec![event], self.now());
+            return Acknowledged::Done(Box::new(alert));
+        }
+        match self.journal.alert(id) {
+            Ok(Some(alert)) if alert.state == AlertState::Cleared => Acknowledged::AlreadyCleared,
+            Ok(Some(alert)) => Acknowledged::Done(Box::new(alert)),
+            Ok(None) | Err(_) => Acknowledged::Unknown,
         }
     }
 
@@ -71,6 +87,13 @@ impl Compute {
             if poll.restarted {
                 tracing::info!("the claims log was replaced; reading it from its start");
             }
+            if poll.skipped_at_start_bytes > 0 {
+                tracing::warn!(
+                    bytes = poll.skipped_at_start_bytes,
+                    "the claims log is longer than claims.tail_bytes; its beginning is not read"
+                );
+            }
+            metrics::counter!(metric::CLAIMS_SKIPPED).increment(poll.skipped_at_start_bytes + poll.skipped_bytes);
             if let Some(first) = poll.refused.first() {
                 let count = poll.refused_count;
                 self.state.malformed += count;
@@ -79,8 +102,6 @@ impl Compute {
             }
             if self.is_replay {
                 self.pipeline.claim(poll.claims, self.state.clock);
-            } else {
-                self.fresh.extend(poll.claims);
             }
             // A recording's first frame waits until the whole log has been read, so that no claim comes late.
             again = self.is_replay && self.state.counts.captured == 0;
@@ -98,6 +119,8 @@ impl Compute {
         }
         let count = std::mem::take(&mut self.state.unnamed);
         self.state.complained = Some(Instant::now());
-        tracing::warn!(line = first.line, error = %first.error, count, "lines of the claims log are no claims");
+        let error = first.error.to_string();
+        let error = escape_undisplayable(&error);
+        tracing::warn!(line = first.line, %error, count, "lines of the claims log are no claims");
     }
 }

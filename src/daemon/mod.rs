@@ -3,12 +3,13 @@
 mod claims_log;
 mod compute;
 mod intake;
+mod posts;
+mod process;
 mod publish;
 mod reload;
 mod status;
 mod supervisor;
 
-use std::net::TcpListener;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -19,7 +20,7 @@ use jiff::Timestamp;
 use metrics_exporter_prometheus::PrometheusHandle;
 use tokio::sync::{mpsc, watch};
 
-use crate::claims::Follower;
+use crate::claims::{Follower, Inbox};
 use crate::config::Config;
 use crate::frames::record::Recorder;
 use crate::frames::{self, Capture, FrameSource, SourceKind};
@@ -33,13 +34,13 @@ use publish::Outlet;
 use status::State;
 use supervisor::Supervisor;
 
-/// Requests that may wait for the compute thread; more are told to come back.
+/// Most requests that wait for the compute thread; further ones are answered 503.
 const COMMANDS: usize = 64;
-/// How often the journal is held to its limits.
+/// Interval of journal maintenance (age and size limits).
 const MAINTENANCE: Duration = Duration::from_secs(3600);
-/// How often measurements are added up: until then each one is kept, and nobody may ever ask for the metrics.
+/// Interval of aggregating histogram samples: until then each sample is kept, also where no server asks for the metrics.
 const UPKEEP: Duration = Duration::from_secs(5);
-/// Deliveries under way when the daemon stops have this long.
+/// Time that deliveries under way have when the daemon stops.
 const LAST_DELIVERIES: Duration = Duration::from_millis(800);
 
 /// A daemon whose config has been checked and whose files have been opened; no port is bound yet.
@@ -53,6 +54,7 @@ pub struct Daemon {
     server: api::Server,
     endpoints: Vec<notify::Endpoint>,
     journal: Journal,
+    metrics: PrometheusHandle,
 }
 
 impl Daemon {
@@ -60,6 +62,16 @@ impl Daemon {
     pub fn new(config: Config, path: Option<PathBuf>) -> Result<Self> {
         let camera = config.camera()?;
         let pipeline = Pipeline::new(&config, &camera)?;
+        config.journal.validate()?;
+        // Before anything is opened, so that what is counted while opening is not lost.
+        let recorder = metric::recorder()?;
+        let metrics = recorder.handle();
+        // A second daemon in one process (a test) counts into the first one's recorder.
+        let _ = metrics::set_global_recorder(recorder);
+        metric::describe();
+        for warning in config.warnings(&camera) {
+            tracing::warn!("{warning}");
+        }
         let server = api::Server::new(config.api.clone())?;
         let endpoints = notify::load(&config.webhook)?;
         let source = frames::open(&config.source, &camera)?;
@@ -76,19 +88,15 @@ impl Daemon {
             server,
             endpoints,
             journal,
+            metrics,
         })
     }
 
     /// Runs until SIGTERM or SIGINT.
     pub async fn run(mut self, logging: logging::Handle) -> Result<()> {
-        let listen = self.config.api.listen;
-        let listener = TcpListener::bind(listen).with_context(|| format!("api.listen: cannot listen on {listen}"))?;
-        let recorder = metric::recorder()?;
-        let metrics = recorder.handle();
-        // A second daemon in one process (a test) counts into the first one's recorder.
-        let _ = metrics::set_global_recorder(recorder);
-        metric::describe();
-
+        let listen = &self.config.api.listen;
+        let listener = api::Listener::bind(listen).with_context(|| format!("api.listen: cannot listen on {listen}"))?;
+        let metrics = self.metrics.clone();
         let started_at = Timestamp::now();
         let open = self.journal.open_alerts()?;
         let known: Vec<_> = open.iter().map(|a| (a.id.clone(), a.kind)).collect();
@@ -116,7 +124,10 @@ impl Daemon {
         let (commands, orders) = mpsc::channel(COMMANDS);
         let ready = Arc::new(AtomicBool::new(false));
         let state = api::State::new(feed, commands, self.journal.clone(), metrics.clone(), ready.clone());
-        let state = state.with_webhooks(notifier.clone());
+        let mut state = state.with_webhooks(notifier.clone());
+        if let Some(folder) = &self.config.record.folder {
+            state = state.with_evidence(folder);
+        }
 
         let source = &self.config.source;
         let log = self.config.claims.log.as_deref();
@@ -131,21 +142,25 @@ impl Daemon {
                 .path
                 .as_ref()
                 .map_or("memory".to_owned(), |p| p.display().to_string()),
-            "watching; API and page on {}://{}",
-            self.server.scheme(),
-            listener.local_addr()?,
+            "watching; API and page on {}",
+            listener.url(self.server.scheme())?,
         );
         let is_replay = source.kind == SourceKind::Replay;
         let halt = Arc::new(AtomicBool::new(false));
+        if !is_replay {
+            self.pipeline.claims.expect_live_claims();
+        }
+        let inbox = Inbox::new(self.pipeline.claims.roster());
         let compute = Compute {
             pipeline: self.pipeline,
             capture: Capture::start(self.source)?,
             recorder: self.recorder,
-            fresh: Vec::new(),
+            inbox: inbox.clone(),
+            posts: posts::Posts::default(),
             unrecorded: Vec::new(),
             commands: orders,
             follower: log
-                .map(|l| ClaimsLog::new(Follower::new(l, &self.config.claims), is_replay, halt.clone()))
+                .map(|l| ClaimsLog::new(Follower::new(l, &self.config.claims), inbox, is_replay, halt.clone()))
                 .transpose()?,
             outlet,
             journal: self.journal.clone(),
@@ -161,7 +176,7 @@ impl Daemon {
         };
         let mut compute = tokio::task::spawn_blocking(move || compute.run());
         let mut serving = tokio::spawn(self.server.serve(listener, state, stops()));
-        let upkeep = tokio::spawn(maintain(self.journal.clone(), metrics));
+        let upkeep = tokio::spawn(maintain(self.journal.clone(), metrics, started_at));
 
         let outcome = tokio::select! {
             signal = reload::until_stopped(&self.config, self.path.as_deref(), &logging) => signal,
@@ -176,7 +191,7 @@ impl Daemon {
             },
         };
 
-        // First the intake, then those who live on it; the journal, dropped last, writes what is left.
+        // The compute thread stops first, then its readers; the journal is dropped last and writes what is left.
         halt.store(true, Ordering::Relaxed);
         if !compute.is_finished() {
             compute.await?;
@@ -195,13 +210,16 @@ impl Daemon {
     }
 }
 
-async fn maintain(journal: Journal, metrics: PrometheusHandle) {
+async fn maintain(journal: Journal, metrics: PrometheusHandle, started_at: Timestamp) {
     let mut maintenance = tokio::time::interval(MAINTENANCE);
     let mut upkeep = tokio::time::interval(UPKEEP);
     loop {
         tokio::select! {
             _ = maintenance.tick() => journal.maintain(Timestamp::now()),
-            _ = upkeep.tick() => metrics.run_upkeep(),
+            _ = upkeep.tick() => {
+                metrics.run_upkeep();
+                process::measure(started_at);
+            }
         }
     }
 }

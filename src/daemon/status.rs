@@ -1,21 +1,24 @@
-//! What the compute thread remembers from frame to frame, and what it tells of it.
+//! Counters and windows that the compute thread keeps from frame to frame, and the gauges that follow from them.
 
 use std::collections::{BTreeMap, VecDeque};
+use std::path::Path;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use jiff::Timestamp;
 use metrics::{counter, gauge};
 
 use crate::api::{FrameCounts, Latency, Snapshot, SourceState};
+use crate::claim::escape_undisplayable;
 use crate::metric;
-use crate::monitor::{AlertEvent, AlertEventKind, AlertKind, AlertState, PositionStatus, Report};
+use crate::monitor::{Alert, AlertEvent, AlertEventKind, AlertKind, AlertState, PositionStatus, Report};
 
-/// Frames over which rate and latency are told.
+/// Frames over which rate and latency are computed.
 const WINDOW: usize = 128;
-/// Without a frame for this long the rate is nought.
+/// Without a frame for this long the rate is 0.
 const STALE: Duration = Duration::from_secs(2);
 
-/// What the thread remembers from frame to frame for the status.
+/// State of the compute thread that the status shows.
 pub(super) struct State {
     pub started_at: Timestamp,
     pub clock: Timestamp,
@@ -32,10 +35,15 @@ pub(super) struct State {
     pub complained: Option<Instant>,
     pub unnamed: u64,
     pub last: Option<Snapshot>,
+    /// Files that hold the evidence of the alerts that are not cleared, by id.
+    pub evidence: BTreeMap<String, Arc<Path>>,
 }
 
 impl State {
     pub fn new(started_at: Timestamp, clock: Timestamp, open: impl IntoIterator<Item = (String, AlertKind)>) -> Self {
+        for kind in AlertKind::ALL {
+            counter!(metric::ALERTS_RAISED, "kind" => word(kind)).increment(0);
+        }
         Self {
             started_at,
             clock,
@@ -51,6 +59,7 @@ impl State {
             complained: None,
             unnamed: 0,
             last: None,
+            evidence: BTreeMap::new(),
         }
     }
 
@@ -62,11 +71,19 @@ impl State {
         push(&mut self.latencies, time);
     }
 
+    /// Makes an alert name the file of its evidence, in place of the ring's segment, which is deleted in time.
+    pub fn name_evidence(&self, alert: &mut Alert) {
+        if let Some(file) = self.evidence.get(&alert.id) {
+            alert.source.file = Some(file.display().to_string());
+        }
+    }
+
     /// Keeps count of what is open, and logs it.
     pub fn note(&mut self, event: &AlertEvent) {
         let alert = &event.alert;
         if alert.state == AlertState::Cleared {
             self.open.remove(&alert.id);
+            self.evidence.remove(&alert.id);
         } else {
             self.open.insert(alert.id.clone(), alert.kind);
         }
@@ -78,7 +95,7 @@ impl State {
             kind = word(alert.kind),
             severity = word(alert.severity),
             id = alert.id,
-            user = alert.user,
+            user = alert.user.as_deref().map(escape_undisplayable).as_deref(),
             x_m = alert.x_m,
             y_m = alert.y_m,
             "alert"
@@ -137,7 +154,7 @@ fn push<T>(window: &mut VecDeque<T>, value: T) {
     window.push_back(value);
 }
 
-/// The word that JSON uses for a value, for labels.
+/// The JSON string of a unit variant, used as a label.
 fn word(value: impl serde::Serialize) -> String {
     match serde_json::to_value(value) {
         Ok(serde_json::Value::String(word)) => word,

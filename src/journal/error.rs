@@ -1,3 +1,5 @@
+//! Why the journal cannot be opened, written or read.
+
 use std::path::PathBuf;
 
 /// Why the journal cannot be opened, written or read.

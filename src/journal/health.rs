@@ -1,3 +1,5 @@
+//! The journal's state for `/readyz`, metrics and the dashboard.
+
 use std::path::{Path, PathBuf};
 
 use crate::metric;

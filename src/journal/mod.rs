@@ -1,10 +1,11 @@
-//! Floor 4: alerts and webhook deliveries on disk, before anyone hears of them.
+//! Layer 4: alerts and webhook deliveries on disk before they are published.
 //!
 //! One thread writes ([`Journal::record`] hands over the events and returns at once, so that a slow disk never
 //! delays a frame); any thread reads, over its own read-only connection. SQLite in WAL mode with
 //! `synchronous=FULL`: what [`Follower`] gives out survives a kill -9 and a power cut. While the disk refuses
-//! writes or hangs, events wait in memory, in order, are heard of all the same, and [`Health`] says so.
+//! writes or hangs, events wait in memory, in order, are published all the same, and [`Health`] reports it.
 
+mod audit;
 mod config;
 mod disk;
 mod error;
@@ -19,6 +20,7 @@ mod store;
 mod writer;
 
 use std::fs::{File, OpenOptions, TryLockError};
+use std::os::unix::fs::OpenOptionsExt;
 use std::path::Path;
 use std::sync::{Arc, Mutex, mpsc};
 use std::thread::JoinHandle;
@@ -32,7 +34,8 @@ use retention::Retention;
 use store::{Store, Write};
 use writer::{Link, Shared, Writer, lock};
 
-pub use config::Config;
+pub use audit::{AuditAction, AuditEntry, AuditRecord};
+pub use config::{Config, ConfigError};
 pub use error::Error;
 pub use follow::Follower;
 pub use health::Health;
@@ -56,7 +59,7 @@ pub struct Journal {
     _thread: Arc<Thread>,
 }
 
-/// Ends the writer thread with the last handle, then gives the file free.
+/// Ends the writer thread with the last handle, then releases the lock.
 struct Thread {
     shared: Arc<Shared>,
     join: Option<JoinHandle<()>>,
@@ -173,11 +176,6 @@ impl Journal {
         })
     }
 
-    /// Numbers the next events above `seq`, for readers who number other things in between.
-    pub fn number_above(&self, seq: u64) {
-        self.shared.number_above(seq);
-    }
-
     /// Waits until all that was handed over so far is on disk or, where the disk refuses it, in memory.
     pub async fn settled(&self) {
         self.until(self.shared.accepted()).await;
@@ -189,12 +187,7 @@ impl Journal {
         let _ = watch.wait_for(|&n| n >= done).await;
     }
 
-    /// Alert events from `after` on, as they become durable; none is left out however slowly they are taken.
-    pub fn follow(&self, after: u64) -> Follower {
-        Follower::new(self.clone(), self.shared.heard.subscribe(), after)
-    }
-
-    /// Sequence number of the last event that may be heard of.
+    /// Sequence number of the last event that is published.
     pub fn last_seq(&self) -> u64 {
         *self.shared.heard.borrow()
     }
@@ -239,6 +232,12 @@ impl Journal {
         self.until(done).await;
     }
 
+    /// Adds a row to the audit log; `now` is the wall clock. Never waits for the disk. Gives whether there was room: while the
+    /// disk refuses writes, only 2,000 rows wait for it in memory.
+    pub fn audit(&self, entry: AuditEntry, now: Timestamp) -> bool {
+        self.shared.push_audit(entry, now)
+    }
+
     /// Removes what is older than `keep_days` or beyond `max_mb`. Where the last event or round is more than a day
     /// before `now`, only the next call does: the clock may be wrong.
     pub fn maintain(&self, now: Timestamp) {
@@ -254,11 +253,13 @@ fn thread(name: &str, config: &Config, run: impl FnOnce() + Send + 'static) -> R
     })
 }
 
-/// Claims the journal for this process. On a disk where no lock file can be made, nobody else can write either.
+/// Locks the journal for this process. On a disk where no lock file can be made, no other process can write either.
 fn claim_file(path: &Path) -> Result<Option<File>, Error> {
     let mut name = path.as_os_str().to_owned();
     name.push(".lock");
-    let Ok(file) = OpenOptions::new().create(true).truncate(false).write(true).open(&name) else {
+    let mut options = OpenOptions::new();
+    options.create(true).truncate(false).write(true).mode(schema::PRIVATE);
+    let Ok(file) = options.open(&name) else {
         return Ok(None);
     };
     match file.try_lock() {

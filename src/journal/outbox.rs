@@ -1,8 +1,10 @@
+//! Rows of the webhook outbox and what the journal remembers of each endpoint.
+
 use jiff::Timestamp;
 
-use crate::monitor::{AlertEvent, AlertEventKind, AlertKind};
+use crate::monitor::{AlertEvent, AlertKind};
 
-/// What one webhook endpoint wants to hear; the outbox gets a row for each event that matches.
+/// Which events one webhook endpoint receives; the outbox gets a row for each event that matches.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Subscription {
     /// The endpoint's name in the journal; stable over restarts.
@@ -77,9 +79,9 @@ pub struct EndpointRecord {
 }
 
 impl Subscription {
-    /// Acknowledging is the operator's own act and no news to a receiver.
+    /// An operator's own act is no news to a receiver.
     pub fn wants(&self, event: &AlertEvent) -> bool {
-        event.event != AlertEventKind::Acknowledged
+        !event.event.is_by_operator()
             && self
                 .kinds
                 .as_ref()

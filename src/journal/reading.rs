@@ -4,7 +4,9 @@ use std::collections::{BTreeMap, HashSet};
 
 use super::store::Store;
 use super::writer::lock;
-use super::{DeadLetter, EndpointRecord, Error, Filter, HISTORY, Journal, Page, READERS, Recorded, Waiting};
+use super::{
+    AuditRecord, DeadLetter, EndpointRecord, Error, Filter, HISTORY, Journal, Page, READERS, Recorded, Waiting,
+};
 use crate::monitor::Alert;
 
 impl Journal {
@@ -83,6 +85,18 @@ impl Journal {
         Ok(disk.into_iter().chain(held).flatten().collect())
     }
 
+    /// The audit log, newest first; `before` is the id of the last row of the page before.
+    pub fn audit_log(&self, before: Option<u64>, limit: usize) -> Result<Vec<AuditRecord>, Error> {
+        let (held, disk) = self.read(|store| store.audit(before, limit))?;
+        let by_id: BTreeMap<u64, AuditRecord> = disk
+            .into_iter()
+            .chain(held)
+            .flatten()
+            .map(|record| (record.id, record))
+            .collect();
+        Ok(by_id.into_values().rev().take(limit).collect())
+    }
+
     pub fn endpoint(&self, id: &str) -> Result<EndpointRecord, Error> {
         self.endpoint_until(id, i64::MAX as u64)
     }
@@ -118,8 +132,8 @@ impl Journal {
         }
     }
 
-    /// As [`Journal::read`], for what came after an event. Memory answers alone where it holds all of that: a disk that
-    /// hangs keeps nobody from hearing of it. Elsewhere a disk that cannot be read is an error, not a gap.
+    /// As [`Journal::read`], for what came after an event. Memory answers alone where it holds all of that, so that a disk that
+    /// hangs delays no reader. Elsewhere a disk that cannot be read is an error, not a gap.
     fn read_after<T>(
         &self,
         seq: u64,

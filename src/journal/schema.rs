@@ -1,3 +1,7 @@
+//! Opening a journal file: permissions, ownership check, migrations and pragmas.
+
+use std::fs::{OpenOptions, Permissions};
+use std::os::unix::fs::{OpenOptionsExt, PermissionsExt};
 use std::path::Path;
 use std::time::Duration;
 
@@ -5,7 +9,7 @@ use rusqlite::{Connection, OpenFlags, TransactionBehavior};
 
 use super::Error;
 
-/// "OAPW", so that `file` and we ourselves can tell a journal from any other SQLite file.
+/// "OAPW": distinguishes a journal from any other SQLite file, here and for `file`.
 const APPLICATION_ID: i64 = 0x4F41_5057;
 
 /// Longest wait for another process (a backup, a shell) that holds the file.
@@ -15,8 +19,12 @@ const BUSY: Duration = Duration::from_millis(1000);
 /// stands behind them.
 const CACHE_KIB: i64 = 512;
 
+/// Mode of the journal's files: alerts and users' positions are for its owner only.
+pub(super) const PRIVATE: u32 = 0o600;
+
 /// Step k takes a journal from `user_version` k to k + 1. Never edit a step that was released: add one.
-const MIGRATIONS: &[&str] = &["
+const MIGRATIONS: &[&str] = &[
+    "
     CREATE TABLE journal (
         id       TEXT NOT NULL,
         last_seq INTEGER NOT NULL
@@ -66,7 +74,20 @@ const MIGRATIONS: &[&str] = &["
         last_error      TEXT,
         disabled_us     INTEGER
     );
-"];
+",
+    "
+    CREATE TABLE audit (
+        id     INTEGER PRIMARY KEY,
+        at_us  INTEGER NOT NULL,
+        action TEXT NOT NULL,
+        actor  TEXT,
+        client TEXT NOT NULL,
+        target TEXT,
+        detail TEXT,
+        count  INTEGER NOT NULL
+    );
+",
+];
 
 /// Opens a journal for writing, creating or migrating it where needed. `None` is a journal in memory.
 pub(super) fn open_writable(path: Option<&Path>) -> Result<Connection, Error> {
@@ -79,12 +100,37 @@ pub(super) fn open_writable(path: Option<&Path>) -> Result<Connection, Error> {
             source,
         },
     };
+    if let Some(path) = path {
+        create_private(path);
+    }
     let mut db = Connection::open_with_flags(name, flags).map_err(unusable)?;
     db.busy_timeout(BUSY).map_err(unusable)?;
     db.pragma_update(None, "cache_size", -CACHE_KIB).map_err(unusable)?;
     check(&db, name, unusable)?;
     prepare(&mut db).map_err(unusable)?;
+    if let Some(path) = path {
+        make_private(path);
+    }
     Ok(db)
+}
+
+/// Creates the file for its owner only, whatever the umask. SQLite gives the files beside it the same mode. A failure is
+/// not reported here: opening the file reports it.
+fn create_private(path: &Path) {
+    let _ = OpenOptions::new().write(true).create_new(true).mode(PRIVATE).open(path);
+}
+
+/// Removes permissions that an earlier version, or a copy, gave to other users.
+fn make_private(path: &Path) {
+    for suffix in ["", "-wal", "-shm", ".lock"] {
+        let mut name = path.as_os_str().to_owned();
+        name.push(suffix);
+        let file = Path::new(&name);
+        let is_open = std::fs::metadata(file).is_ok_and(|meta| meta.permissions().mode() & 0o077 != 0);
+        if is_open && let Err(error) = std::fs::set_permissions(file, Permissions::from_mode(PRIVATE)) {
+            tracing::warn!(path = %file.display(), %error, "other users of this machine can read the journal");
+        }
+    }
 }
 
 /// Opens a journal that exists for reading beside its writer.

@@ -1,10 +1,12 @@
+//! SQL writes of one store: a batch of changes in one transaction.
+
 use std::path::Path;
 use std::sync::Arc;
 
 use jiff::Timestamp;
 use rusqlite::{Connection, TransactionBehavior, params};
 
-use super::{Attempt, Error, Outcome, Subscription, schema};
+use super::{Attempt, AuditRecord, Error, Outcome, Subscription, schema};
 use crate::monitor::{AlertEvent, AlertEventKind};
 
 /// One change of the journal. Applying it must never fail for what it holds, only for the disk: a write
@@ -35,6 +37,7 @@ pub(super) enum Write {
     Maintain {
         now: Timestamp,
     },
+    Audit(Arc<AuditRecord>),
 }
 
 impl Write {
@@ -43,6 +46,7 @@ impl Write {
         match self {
             Self::Event { now, .. } | Self::Maintain { now } => Some(*now),
             Self::Attempt(Attempt { at, .. }) | Self::Disable { at, .. } | Self::Replay { at, .. } => Some(*at),
+            Self::Audit(record) => Some(record.at),
             Self::Enable { .. } => None,
         }
     }
@@ -110,6 +114,7 @@ impl Store {
                         params![endpoint, seq, at.as_microsecond()],
                     )?;
                 }
+                Write::Audit(record) => put_audit(&tx, record)?,
                 Write::Maintain { .. } => {}
             }
         }
@@ -150,6 +155,23 @@ fn put_event(
         ])?;
     tx.prepare_cached("UPDATE journal SET last_seq = max(last_seq, ?1)")?
         .execute([seq])?;
+    Ok(())
+}
+
+fn put_audit(tx: &Connection, record: &AuditRecord) -> Result<(), rusqlite::Error> {
+    // A write that is repeated after a failure finds its row in place.
+    let entry = &record.entry;
+    tx.prepare_cached("INSERT OR IGNORE INTO audit VALUES (?1, ?2, ?3, ?4, ?5, ?6, ?7, ?8)")?
+        .execute(params![
+            record.id,
+            record.at.as_microsecond(),
+            word(&entry.action),
+            entry.actor,
+            entry.client,
+            entry.target,
+            entry.detail,
+            entry.count,
+        ])?;
     Ok(())
 }
 

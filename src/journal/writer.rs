@@ -1,3 +1,5 @@
+//! The writer thread: decides whether events are held on disk or in memory, and publishes them to readers.
+
 use std::collections::VecDeque;
 use std::path::PathBuf;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender};
@@ -5,23 +7,28 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 use std::time::Duration;
 
+use jiff::Timestamp;
 use tokio::sync::watch;
 
 use super::retention::Retention;
 use super::store::{Store, Write};
-use super::{Attempt, Error, Health, Outcome, Subscription, disk};
+use super::{Attempt, AuditEntry, AuditRecord, Error, Health, Outcome, Subscription, disk};
 use crate::metric;
 
 /// Alert events that may wait for a disk that refuses them.
 pub(super) const BACKLOG: usize = 20_000;
 
+/// Rows of the audit log that may wait for a disk that refuses them: a flood of requests must not fill the memory.
+pub(super) const MOST_AUDIT_ROWS: usize = 2_000;
+
 /// Writes in one transaction: bounds how long it takes.
 const BATCH: usize = 2_000;
 
-/// How long an alarm waits for the disk before it is heard without it.
-const PATIENCE: Duration = Duration::from_millis(500);
+/// How long an event waits for the disk before it is published without it: half a second is short beside the time that a
+/// person takes to react, and longer than a healthy disk takes to sync.
+const DISK_TIMEOUT: Duration = Duration::from_millis(500);
 
-/// How soon a disk that refused a write is tried again.
+/// Time after which a disk that refused a write is tried again.
 const RETRY: Duration = Duration::from_secs(1);
 
 /// What the writer thread, the readers and those who record share.
@@ -33,7 +40,7 @@ pub(super) struct Shared {
     wake: Condvar,
     /// The journal itself when there is no path; otherwise what the disk has not taken yet.
     pub(super) overlay: Mutex<Overlay>,
-    /// Sequence number of the last event that may be heard of.
+    /// Sequence number of the last event that is published.
     pub(super) heard: watch::Sender<u64>,
     /// How many writes are done with, on disk or in the overlay.
     pub(super) done: watch::Sender<u64>,
@@ -52,6 +59,9 @@ struct Queue {
     accepted: u64,
     /// Alert events here and in the writer's hands.
     events: usize,
+    /// Rows of the audit log, likewise.
+    audit_rows: usize,
+    last_audit: u64,
     closing: bool,
 }
 
@@ -82,6 +92,8 @@ impl Shared {
                 last_seq,
                 accepted: 0,
                 events: 0,
+                audit_rows: 0,
+                last_audit: 0,
                 closing: false,
             }),
             wake: Condvar::new(),
@@ -124,11 +136,6 @@ impl Shared {
         Ok(queue.last_seq)
     }
 
-    pub(super) fn number_above(&self, seq: u64) {
-        let mut queue = lock(&self.queue);
-        queue.last_seq = queue.last_seq.max(seq);
-    }
-
     /// Hands over any other write; gives the count of `done` at which it is through.
     pub(super) fn push(&self, write: Write) -> u64 {
         let mut queue = lock(&self.queue);
@@ -136,6 +143,26 @@ impl Shared {
         queue.accepted += 1;
         self.wake.notify_one();
         queue.accepted
+    }
+
+    /// Hands over a row of the audit log, numbered by its time.
+    pub(super) fn push_audit(&self, entry: AuditEntry, now: Timestamp) -> bool {
+        let mut queue = lock(&self.queue);
+        if queue.audit_rows >= MOST_AUDIT_ROWS {
+            return false;
+        }
+        let micros = u64::try_from(now.as_microsecond()).unwrap_or(0);
+        queue.last_audit = micros.max(queue.last_audit + 1);
+        let record = AuditRecord {
+            id: queue.last_audit,
+            at: now,
+            entry,
+        };
+        queue.writes.push_back(Write::Audit(Arc::new(record)));
+        queue.audit_rows += 1;
+        queue.accepted += 1;
+        self.wake.notify_one();
+        true
     }
 
     pub(super) fn accepted(&self) -> u64 {
@@ -147,10 +174,10 @@ impl Shared {
         self.wake.notify_one();
     }
 
-    fn take(&self, patience: Option<Duration>) -> (Vec<Write>, bool) {
+    fn take(&self, timeout: Option<Duration>) -> (Vec<Write>, bool) {
         let queue = lock(&self.queue);
         let idle = |queue: &mut Queue| queue.writes.is_empty() && !queue.closing;
-        let mut queue = match patience {
+        let mut queue = match timeout {
             None => self
                 .wake
                 .wait_while(queue, idle)
@@ -165,14 +192,16 @@ impl Shared {
         (writes, queue.closing && queue.writes.is_empty())
     }
 
-    fn settled(&self, events: usize) {
-        lock(&self.queue).events -= events;
+    /// The writes are on disk, or in memory where there is no disk.
+    fn settled(&self, writes: &[Write]) {
+        let mut queue = lock(&self.queue);
+        queue.events -= events_in(writes);
+        queue.audit_rows -= writes.iter().filter(|w| matches!(w, Write::Audit(_))).count();
     }
 }
 
-/// Decides what is heard when. Events are heard of once they are on disk; where the disk refuses them or takes
-/// too long they are held in memory and heard of all the same, because a full or hung disk must not silence an
-/// alarm.
+/// State of the writer thread. Events are published once they are on disk; where the disk refuses them or takes too long they
+/// are held in memory and published all the same, because a full or hung disk must not suppress an alert.
 pub(super) struct Writer {
     shared: Arc<Shared>,
     /// `None` for a journal in memory.
@@ -206,12 +235,12 @@ impl Writer {
     pub(super) fn run(mut self) {
         let mut behind = false;
         loop {
-            let patience = match (behind, self.deferred.is_empty()) {
+            let timeout = match (behind, self.deferred.is_empty()) {
                 (true, _) => Some(Duration::ZERO),
                 (false, false) => Some(RETRY),
                 (false, true) => None,
             };
-            let (writes, closing) = self.shared.take(patience);
+            let (writes, closing) = self.shared.take(timeout);
             behind = self.write(&writes);
             self.publish(&writes);
             if closing && !behind {
@@ -221,7 +250,7 @@ impl Writer {
         self.end();
     }
 
-    /// Gives a disk that has not answered a last chance, then lets go of it.
+    /// Waits once more for a disk that has not answered, then gives up on it.
     fn end(mut self) {
         if self.disk.as_ref().is_some_and(|link| link.pending > 0) {
             self.try_disk();
@@ -246,7 +275,7 @@ impl Writer {
     fn write(&mut self, writes: &[Write]) -> bool {
         if self.disk.is_none() {
             self.hold(writes);
-            self.shared.settled(events_in(writes));
+            self.shared.settled(writes);
             return false;
         }
         for write in writes {
@@ -275,12 +304,12 @@ impl Writer {
                 link.pending = 0;
             }
         }
-        match link.answers.recv_timeout(PATIENCE) {
+        match link.answers.recv_timeout(DISK_TIMEOUT) {
             Ok(Ok(size)) => {
                 let written: Vec<Write> = self.deferred.drain(..link.pending).collect();
                 link.pending = 0;
                 self.failing = false;
-                self.shared.settled(events_in(&written));
+                self.shared.settled(&written);
                 lock(&self.shared.health).working(size, events_in(&self.deferred));
                 true
             }

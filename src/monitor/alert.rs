@@ -1,8 +1,16 @@
+//! Alerts and the events of their life, as the journal, the API and webhooks carry them.
+
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 
-/// Beams without a claim this near to each other, one after the other, are one cause, m.
+/// Distance within which beams without a claim, one after the other, are one cause, m. Wider joins two strangers into one
+/// alert; narrower raises an alert for each reappearance of one who walks on while off. Not tuned; `a_beam_that_blinks` in
+/// `tests/monitor` checks it.
 pub(super) const SAME_PLACE_M: f64 = 10.0;
+/// The key of an alert's evidence that names the user in whose spot a second beam is.
+pub(super) const SHARED_SPOT: &str = "shares_the_spot_of";
+/// Age from which an alert is critical, s. Longer delays the escalation, shorter makes every alert critical. Not tuned.
+const ESCALATE_S: f64 = 10.0;
 
 /// What an alert is about.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize, utoipa::ToSchema)]
@@ -20,16 +28,19 @@ pub enum AlertKind {
     ClaimsStale,
     /// All users are shifted alike: our own pose is off.
     PoseInconsistent,
+    /// More is claimed than there is room or time for: claims are refused or shed.
+    ClaimsFlooded,
 }
 
 impl AlertKind {
-    pub const ALL: [Self; 6] = [
+    pub const ALL: [Self; 7] = [
         Self::UnclaimedEmitter,
         Self::PositionMismatch,
         Self::UserUnseen,
         Self::SensorLost,
         Self::ClaimsStale,
         Self::PoseInconsistent,
+        Self::ClaimsFlooded,
     ];
 }
 
@@ -39,6 +50,17 @@ pub enum Severity {
     Info,
     Warning,
     Critical,
+}
+
+impl Severity {
+    /// Of a cause that has lasted `lasted_s`: a warning at first, then critical.
+    pub(super) fn of_duration(lasted_s: f64) -> Self {
+        if lasted_s >= ESCALATE_S {
+            Self::Critical
+        } else {
+            Self::Warning
+        }
+    }
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, utoipa::ToSchema)]
@@ -76,22 +98,55 @@ pub struct Alert {
     pub x_m: Option<f64>,
     pub y_m: Option<f64>,
     pub cov_m2: Option<[[f64; 2]; 2]>,
-    /// The claim the position was held against, where there is one.
+    /// The claim that the position was compared with, where there is one.
     pub claimed: Option<serde_json::Value>,
     pub evidence: serde_json::Value,
     pub source: AlertSource,
+    /// The latest acknowledgement; it stays, marked as withdrawn, when it is undone.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub acknowledgement: Option<Acknowledgement>,
+}
+
+/// That an operator took note of an alert.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+pub struct Acknowledgement {
+    #[schema(value_type = String, format = DateTime)]
+    pub at: Timestamp,
+    /// Name of the operator's token; null where the token has none, or none is asked for.
+    pub by: Option<String>,
+    pub note: Option<String>,
+    /// Set when the acknowledgement was undone; the alert is open again.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub withdrawn: Option<Withdrawal>,
+}
+
+/// That an acknowledgement was undone.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
+pub struct Withdrawal {
+    #[schema(value_type = String, format = DateTime)]
+    pub at: Timestamp,
+    /// Name of the operator's token, as for the acknowledgement.
+    pub by: Option<String>,
 }
 
 impl Alert {
-    /// Whether the other alert is about the same thing: its user, the spot it shares, or, where it names neither, its place.
+    /// Whether both alerts have one cause: the same user, the same shared spot or, where neither is named, the same place
+    /// to within 10 m.
     pub fn has_cause_of(&self, other: &Self) -> bool {
-        let spot = |alert: &Self| alert.evidence["shares_the_spot_of"].as_str().map(str::to_owned);
+        let spot = |alert: &Self| alert.evidence[SHARED_SPOT].as_str().map(str::to_owned);
         let is_near = match (self.x_m.zip(self.y_m), other.x_m.zip(other.y_m)) {
             (Some((x, y)), Some((ox, oy))) => (x - ox).hypot(y - oy) < SAME_PLACE_M,
             (here, there) => here == there,
         };
         let is_named = self.user.is_some() || spot(self).is_some();
         self.kind == other.kind && self.user == other.user && spot(self) == spot(other) && (is_named || is_near)
+    }
+}
+
+impl AlertEventKind {
+    /// Whether it is an operator's own act, which webhooks do not report.
+    pub fn is_by_operator(self) -> bool {
+        matches!(self, Self::Acknowledged | Self::Unacknowledged)
     }
 }
 
@@ -103,6 +158,9 @@ pub enum AlertEventKind {
     Updated,
     #[serde(rename = "alert.acknowledged")]
     Acknowledged,
+    /// An acknowledgement was undone.
+    #[serde(rename = "alert.unacknowledged")]
+    Unacknowledged,
     #[serde(rename = "alert.cleared")]
     Cleared,
 }

@@ -2,27 +2,28 @@
 //! no clock in here, so a replay gives the same alerts every time.
 
 mod alert;
-mod bends;
-mod blend;
-mod book;
-mod clock;
+mod alert_lifecycle;
+mod ambiguity;
 mod config;
-mod detection;
-mod motion;
+mod evidence;
+mod finding;
+#[cfg(test)]
+mod fixture;
+mod frame_context;
+mod input;
+#[expect(clippy::module_inception, reason = "the list of files names the stages")]
+mod monitor;
 mod pose;
 mod report;
-mod residuals;
-mod sight;
-mod source;
-mod steps;
-mod thresholds;
-mod tracks;
-mod users;
-mod watch;
+mod rules;
+mod stats;
+mod summary;
+mod track;
 
-pub use alert::{Alert, AlertEvent, AlertEventKind, AlertKind, AlertSource, AlertState, Severity};
-pub use config::{Config, ConfigError};
+pub use alert::{
+    Acknowledgement, Alert, AlertEvent, AlertEventKind, AlertKind, AlertSource, AlertState, Severity, Withdrawal,
+};
+pub use config::{Config, ConfigError, Source};
+pub use input::sensor_health::BLINDING_SHARE;
+pub use monitor::Monitor;
 pub use report::{Observation, PositionStatus, Report, TrackedPosition, UserPosition};
-pub use sight::BLINDING_SHARE;
-pub use source::Source;
-pub use watch::Monitor;

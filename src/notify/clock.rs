@@ -1,3 +1,5 @@
+//! The worker's wall clock and monotonic clock; tests make both run fast.
+
 use std::time::Duration;
 
 use jiff::{SignedDuration, Timestamp};

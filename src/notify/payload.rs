@@ -1,3 +1,5 @@
+//! The JSON body of a webhook request.
+
 use jiff::Timestamp;
 use serde::Serialize;
 

@@ -1,3 +1,5 @@
+//! Retry delays of failed deliveries.
+
 use std::time::Duration;
 
 use rand::{Rng, RngExt};

@@ -1,3 +1,5 @@
+//! The status of one endpoint, as `/v1/webhooks` shows it.
+
 use jiff::Timestamp;
 
 use super::Endpoint;

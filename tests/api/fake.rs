@@ -2,18 +2,19 @@
 
 use std::collections::BTreeMap;
 use std::net::{SocketAddr, TcpListener};
+use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 use jiff::Timestamp;
 use ndarray::Array2;
-use oapwatch::api::{self, Acknowledged, Command, Config, Feed, Server, State};
+use oapwatch::api::{self, Acknowledged, Command, Config, Feed, Listen, Listener, Server, State};
 use oapwatch::claim::Claim;
 use oapwatch::frame::Frame;
 use oapwatch::journal::{self, Journal};
 use oapwatch::monitor::{
-    Alert, AlertEvent, AlertEventKind, AlertKind, AlertSource, AlertState, PositionStatus, Report, Severity,
-    TrackedPosition,
+    Acknowledgement, Alert, AlertEvent, AlertEventKind, AlertKind, AlertSource, AlertState, PositionStatus, Report,
+    Severity, TrackedPosition, Withdrawal,
 };
 use oapwatch::optics;
 use tokio::sync::{mpsc, oneshot};
@@ -40,15 +41,52 @@ impl Fake {
 
     /// Starts on the journal of an earlier run; `now_us` stands for the clock.
     pub async fn resume(config: Config, journal: Journal, now_us: u64) -> Self {
-        // reqwest is built without a default; a second installation finds the first in place.
-        let _ = rustls::crypto::ring::default_provider().install_default();
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
         let address = listener.local_addr().unwrap();
+        Self::serve(config, journal, now_us, listener.into(), address, None).await
+    }
+
+    /// Starts on a Unix socket; `address` is then of no use.
+    pub async fn on_socket(config: Config, socket: &Path) -> Self {
+        let journal = Journal::open(&journal::Config::default(), Vec::new()).unwrap();
+        let listener = Listener::bind(&Listen::Unix(socket.to_owned())).unwrap();
+        Self::serve(
+            config,
+            journal,
+            1,
+            listener,
+            SocketAddr::from(([127, 0, 0, 1], 0)),
+            None,
+        )
+        .await
+    }
+
+    /// Starts with the folder of a recorder.
+    pub async fn with_recordings(config: Config, folder: &Path) -> Self {
+        let journal = Journal::open(&journal::Config::default(), Vec::new()).unwrap();
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+        let address = listener.local_addr().unwrap();
+        Self::serve(config, journal, 1, listener.into(), address, Some(folder)).await
+    }
+
+    async fn serve(
+        config: Config,
+        journal: Journal,
+        now_us: u64,
+        listener: Listener,
+        address: SocketAddr,
+        recordings: Option<&Path>,
+    ) -> Self {
+        // reqwest is built without a default; a second installation finds the first in place.
+        let _ = rustls::crypto::ring::default_provider().install_default();
         let feed = Arc::new(Feed::new(journal.last_seq(), now_us));
         let ready = Arc::new(AtomicBool::new(true));
         let (commands, received) = mpsc::channel(64);
         let metrics = oapwatch::metric::recorder().unwrap().handle();
-        let state = State::new(feed.clone(), commands, journal.clone(), metrics, ready.clone());
+        let mut state = State::new(feed.clone(), commands, journal.clone(), metrics, ready.clone());
+        if let Some(folder) = recordings {
+            state = state.with_evidence(folder);
+        }
         tokio::spawn(answer(received, feed.clone(), journal.clone()));
         let (stop, stopped) = oneshot::channel::<()>();
         let server = Server::new(config).unwrap();
@@ -111,18 +149,46 @@ async fn answer(mut received: mpsc::Receiver<Command>, feed: Arc<Feed>, journal:
                 };
                 let _ = reply.send(claims.iter().enumerate().filter_map(beyond).collect());
             }
-            Command::Acknowledge { id, reply } => {
-                let outcome = match journal.alert(&id).unwrap() {
-                    None => Acknowledged::Unknown,
-                    Some(alert) if alert.state == AlertState::Cleared => Acknowledged::AlreadyCleared,
-                    Some(mut alert) => {
-                        alert.state = AlertState::Acknowledged;
-                        publish(&feed, &journal, AlertEventKind::Acknowledged, alert.clone()).await;
-                        Acknowledged::Done(Box::new(alert))
-                    }
+            Command::Acknowledge { id, by, note, reply } => {
+                let change = |alert: &mut Alert| {
+                    alert.state = AlertState::Acknowledged;
+                    alert.acknowledgement = Some(Acknowledgement {
+                        at: at(0),
+                        by,
+                        note,
+                        withdrawn: None,
+                    });
+                    AlertEventKind::Acknowledged
                 };
-                let _ = reply.send(outcome);
+                let _ = reply.send(changed(&feed, &journal, &id, change).await);
             }
+            Command::Unacknowledge { id, by, reply } => {
+                let change = |alert: &mut Alert| {
+                    alert.state = AlertState::Open;
+                    if let Some(acknowledgement) = &mut alert.acknowledgement {
+                        acknowledgement.withdrawn = Some(Withdrawal { at: at(1), by });
+                    }
+                    AlertEventKind::Unacknowledged
+                };
+                let _ = reply.send(changed(&feed, &journal, &id, change).await);
+            }
+        }
+    }
+}
+
+async fn changed(
+    feed: &Feed,
+    journal: &Journal,
+    id: &str,
+    change: impl FnOnce(&mut Alert) -> AlertEventKind,
+) -> Acknowledged {
+    match journal.alert(id).unwrap() {
+        None => Acknowledged::Unknown,
+        Some(alert) if alert.state == AlertState::Cleared => Acknowledged::AlreadyCleared,
+        Some(mut alert) => {
+            let event = change(&mut alert);
+            publish(feed, journal, event, alert.clone()).await;
+            Acknowledged::Done(Box::new(alert))
         }
     }
 }
@@ -146,6 +212,7 @@ pub fn alert(id: &str, second: i64) -> Alert {
             frame: 10,
             file: None,
         },
+        acknowledgement: None,
     }
 }
 

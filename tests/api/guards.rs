@@ -5,9 +5,10 @@ use std::time::{Duration, Instant};
 
 use futures_util::StreamExt;
 use oapwatch::api::{Config, Server};
+use oapwatch::journal::AuditRecord;
 use reqwest::{Client, Method, StatusCode, header};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
-use tokio::net::TcpStream;
+use tokio::net::{TcpStream, UnixStream};
 use tokio::time::timeout;
 use tokio_tungstenite::tungstenite::client::IntoClientRequest;
 
@@ -116,6 +117,9 @@ fn bad_token_files_are_named_before_a_port_is_bound() {
     std::fs::write(dir.path().join("empty"), "\n# nothing\n").unwrap();
     let empty = Server::new(config("empty")).err().unwrap().to_string();
     assert!(empty.contains("api.token_file") && empty.contains("empty"), "{empty}");
+    std::fs::write(dir.path().join("short"), "anna:s3cret-of-anna\nb\n").unwrap();
+    let short = Server::new(config("short")).err().unwrap().to_string();
+    assert!(short.contains("short: line 2"), "{short}");
     let missing = Server::new(config("missing")).err().unwrap().to_string();
     assert!(
         missing.contains("missing") && missing.contains("No such file"),
@@ -226,7 +230,7 @@ async fn who_asks_too_often_waits() {
     let client = Client::new();
     let mut limited = None;
     for _ in 0..200 {
-        let answer = client.get(fake.url("/healthz")).send().await.unwrap();
+        let answer = client.get(fake.url("/openapi.json")).send().await.unwrap();
         if answer.status() == StatusCode::TOO_MANY_REQUESTS {
             limited = Some(answer);
             break;
@@ -235,7 +239,209 @@ async fn who_asks_too_often_waits() {
     let limited = limited.expect("two hundred at once are too many");
     assert!(limited.headers().contains_key(header::RETRY_AFTER));
     assert_eq!(limited.headers()[header::CONTENT_TYPE], "application/problem+json");
+    for _ in 0..50 {
+        let probe = client.get(fake.url("/healthz")).send().await.unwrap();
+        assert_eq!(probe.status(), StatusCode::OK, "a supervisor's probe is not counted");
+    }
+    let rows = audited(&fake, "request.refused").await;
+    assert_eq!(rows.len(), 1, "{rows:?}");
+    assert_eq!(rows[0].entry.client, "127.0.0.1");
     fake.stop().await;
+}
+
+/// Rows of the audit log about one action, newest first.
+async fn audited(fake: &Fake, action: &str) -> Vec<AuditRecord> {
+    fake.journal.settled().await;
+    let rows = fake.journal.audit_log(None, 100).unwrap();
+    let of = |r: &AuditRecord| serde_json::to_value(r.entry.action).unwrap() == action;
+    rows.into_iter().filter(of).collect()
+}
+
+/// Sends bytes as they are and gives the whole answer.
+async fn raw(fake: &Fake, request: &str) -> String {
+    let mut stream = TcpStream::connect(fake.address).await.unwrap();
+    stream.write_all(request.as_bytes()).await.unwrap();
+    until_closed(stream).await
+}
+
+#[tokio::test]
+async fn a_request_names_exactly_one_host() {
+    let fake = Fake::start(Config::default()).await;
+    for (hosts, expected) in [
+        ("Host: localhost\r\n", "HTTP/1.1 200"),
+        ("", "HTTP/1.1 400"),
+        ("Host: localhost\r\nHost: rebound.example\r\n", "HTTP/1.1 400"),
+        ("Host: localhost\r\nHost: localhost\r\n", "HTTP/1.1 400"),
+        ("Host: \u{e4}.example\r\n", "HTTP/1.1 400"),
+    ] {
+        let said = raw(
+            &fake,
+            &format!("GET /healthz HTTP/1.1\r\n{hosts}Connection: close\r\n\r\n"),
+        )
+        .await;
+        assert!(said.starts_with(expected), "{hosts:?}: {said}");
+    }
+    fake.stop().await;
+}
+
+#[tokio::test]
+async fn a_revoked_token_s_streams_end_within_a_second() {
+    let dir = tempfile::tempdir().unwrap();
+    let fake = Fake::start(with_tokens(dir.path())).await;
+    fake.step(1);
+    let url = format!("ws://{}/v1/stream", fake.address);
+    let open = async |token: &str| {
+        let mut request = url.as_str().into_client_request().unwrap();
+        let bearer = format!("Bearer {token}");
+        request.headers_mut().insert("authorization", bearer.parse().unwrap());
+        let (mut socket, _) = tokio_tungstenite::connect_async(request).await.unwrap();
+        assert!(socket.next().await.unwrap().unwrap().is_text());
+        let events = Client::new().get(fake.url("/v1/events")).bearer_auth(token).send();
+        let mut events = events.await.unwrap();
+        assert!(events.chunk().await.unwrap().is_some());
+        (socket, events)
+    };
+    let (mut revoked, mut revoked_events) = open("full-token-1").await;
+    let (mut kept, _kept_events) = open("full-token-2").await;
+    let (mut reader, mut reader_events) = open("read-token").await;
+
+    // One line is taken out of a file.
+    std::fs::write(dir.path().join("full"), "full-token-2\n").unwrap();
+    let started = Instant::now();
+    let close = revoked.next().await.unwrap().unwrap();
+    assert!(close.to_string().contains("revoked"), "{close}");
+    while revoked_events.chunk().await.unwrap().is_some() {}
+    assert!(started.elapsed() < Duration::from_secs(1), "{:?}", started.elapsed());
+
+    // A file is deleted: it has no tokens any more.
+    std::fs::remove_file(dir.path().join("read")).unwrap();
+    let started = Instant::now();
+    assert!(reader.next().await.unwrap().unwrap().is_close());
+    while reader_events.chunk().await.unwrap().is_some() {}
+    assert!(started.elapsed() < Duration::from_secs(1), "{:?}", started.elapsed());
+    assert_eq!(
+        status(&fake, Method::GET, "/v1/positions", Some("read-token")).await,
+        401
+    );
+
+    fake.step(2);
+    assert!(
+        kept.next().await.unwrap().unwrap().is_text(),
+        "who is not revoked stays"
+    );
+    fake.stop().await;
+}
+
+#[tokio::test]
+async fn named_tokens_stand_in_the_alert_and_in_the_audit_log() {
+    let dir = tempfile::tempdir().unwrap();
+    let tokens = "anna:s3cret-of-anna\nplain-token-of-nobody\nold:token-with-a-colon\n";
+    std::fs::write(dir.path().join("full"), tokens).unwrap();
+    std::fs::write(dir.path().join("read"), "wall:s3cret-of-the-wall\n").unwrap();
+    let fake = Fake::start(Config {
+        token_file: Some(dir.path().join("full")),
+        read_token_file: Some(dir.path().join("read")),
+        ..Config::default()
+    })
+    .await;
+    fake.alert("a", 1).await;
+    let path = "/v1/alerts/a/acknowledge";
+    assert_eq!(status(&fake, Method::POST, path, Some("s3cret-of-the-wall")).await, 403);
+    assert_eq!(status(&fake, Method::POST, path, Some("anna")).await, 401);
+    for whole_line in ["old:token-with-a-colon", "token-with-a-colon", "plain-token-of-nobody"] {
+        assert_eq!(status(&fake, Method::GET, "/v1/audit", Some(whole_line)).await, 200);
+    }
+    assert_eq!(
+        status(&fake, Method::GET, "/v1/audit", Some("s3cret-of-the-wall")).await,
+        403
+    );
+    assert_eq!(status(&fake, Method::POST, path, Some("s3cret-of-anna")).await, 200);
+    let alert = fake.journal.alert("a").unwrap().unwrap();
+    assert_eq!(alert.acknowledgement.unwrap().by.as_deref(), Some("anna"));
+
+    let rows = audited(&fake, "alert.acknowledge").await;
+    let entry = &rows[0].entry;
+    assert_eq!(
+        (entry.actor.as_deref(), entry.target.as_deref()),
+        (Some("anna"), Some("a"))
+    );
+    assert_eq!(entry.client, "127.0.0.1");
+    let refused = audited(&fake, "request.refused").await;
+    let actors: Vec<_> = refused.iter().map(|r| r.entry.actor.as_deref()).collect();
+    assert!(actors.contains(&Some("wall")) && actors.contains(&None), "{refused:?}");
+    fake.stop().await;
+}
+
+#[tokio::test]
+async fn claims_that_are_posted_again_and_again_share_a_row_of_the_audit_log() {
+    let fake = Fake::start(Config::default()).await;
+    let claim = r#"{"time":"2026-11-21T08:00:00Z","user":"u","x_m":1,"y_m":1}"#;
+    for _ in 0..30 {
+        let posted = Client::new().post(fake.url("/v1/claims")).body(claim).send().await;
+        assert_eq!(posted.unwrap().status(), StatusCode::OK);
+    }
+    let rows = audited(&fake, "claims.post").await;
+    assert_eq!(rows.len(), 1, "{rows:?}");
+    assert_eq!(rows[0].entry.detail.as_deref(), Some("1 accepted, 0 refused"));
+    let journal = fake.journal.clone();
+    fake.stop().await;
+    journal.settled().await;
+    let rows = journal.audit_log(None, 100).unwrap();
+    let counts: Vec<u64> = rows.iter().map(|r| r.entry.count).collect();
+    assert_eq!(
+        counts,
+        [29, 1],
+        "the rest is written when the window ends or the daemon stops"
+    );
+    assert_eq!(rows[0].entry.detail.as_deref(), Some("29 accepted, 0 refused"));
+}
+
+#[tokio::test]
+async fn behind_a_trusted_proxy_its_clients_are_told_apart() {
+    let limited = |trusted: &[&str]| Config {
+        requests_per_second: 5,
+        trusted_proxies: trusted.iter().map(|t| (*t).to_owned()).collect(),
+        ..Config::default()
+    };
+    for (trusted, expected) in [(&["127.0.0.0/8"][..], 60), (&["192.0.2.0/24"], 11)] {
+        let fake = Fake::start(limited(trusted)).await;
+        let client = Client::new();
+        let mut served = 0;
+        for k in 0..60 {
+            let request = client
+                .get(fake.url("/openapi.json"))
+                .header("x-forwarded-for", format!("203.0.113.{k}"));
+            served += usize::from(request.send().await.unwrap().status() == StatusCode::OK);
+        }
+        // Two of sixty addresses may share one of 1024 buckets; a slow machine earns some requests back.
+        assert!(served.abs_diff(expected) <= 5, "{trusted:?}: {served} served");
+        fake.stop().await;
+    }
+}
+
+#[tokio::test]
+async fn a_unix_socket_serves_who_may_open_it() {
+    use std::os::unix::fs::PermissionsExt;
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("api.sock");
+    let fake = Fake::on_socket(Config::default(), &path).await;
+    fake.step(1);
+    let mode = std::fs::metadata(&path).unwrap().permissions().mode();
+    assert_eq!(mode & 0o777, 0o660);
+    let mut stream = UnixStream::connect(&path).await.unwrap();
+    let request = "GET /v1/positions HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n";
+    stream.write_all(request.as_bytes()).await.unwrap();
+    let mut said = String::new();
+    timeout(PATIENCE, stream.read_to_string(&mut said))
+        .await
+        .unwrap()
+        .unwrap();
+    assert!(
+        said.starts_with("HTTP/1.1 200") && said.contains("\"frame\":1"),
+        "{said}"
+    );
+    fake.stop().await;
+    assert!(!path.exists(), "the socket is removed at the end");
 }
 
 /// Reads until the server closes; gives what it said.
@@ -309,6 +515,7 @@ async fn certificates_are_served_and_follow_the_files() {
     let fake = Fake::start(Config {
         tls_cert_file: Some(dir.path().join("cert")),
         tls_key_file: Some(dir.path().join("key")),
+        hsts_max_age_s: 600,
         ..Config::default()
     })
     .await;
@@ -327,6 +534,17 @@ async fn certificates_are_served_and_follow_the_files() {
         info.peer_certificate().unwrap().to_vec()
     };
     let first = served().await;
+    let hsts = async |fake: &Fake| {
+        let client = Client::builder().tls_danger_accept_invalid_certs(true).build().unwrap();
+        let answer = client
+            .get(format!("https://{}/healthz", fake.address))
+            .send()
+            .await
+            .unwrap();
+        assert_eq!(answer.version(), reqwest::Version::HTTP_2, "ALPN chooses HTTP/2");
+        answer.headers().get("strict-transport-security").cloned()
+    };
+    assert_eq!(hsts(&fake).await.unwrap(), "max-age=600");
     assert!(
         Client::new().get(fake.url("/healthz")).send().await.is_err(),
         "plain HTTP is not served"

@@ -1,8 +1,14 @@
+//! REST: positions, alerts, claims, evidence, problem details.
+
+use ndarray::Array2;
 use oapwatch::api::Config;
+use oapwatch::claim::Claim;
+use oapwatch::frame::Frame;
+use oapwatch::frames::record::{self, Recorder};
 use reqwest::{Client, Response, StatusCode, header};
 use serde_json::{Value, json};
 
-use crate::fake::Fake;
+use crate::fake::{Fake, at};
 
 async fn get(fake: &Fake, path: &str) -> Response {
     Client::new().get(fake.url(path)).send().await.unwrap()
@@ -131,6 +137,133 @@ async fn an_alert_is_acknowledged_once_and_for_all() {
 }
 
 #[tokio::test]
+async fn an_acknowledgement_has_a_note_and_can_be_undone() {
+    let fake = Fake::start(Config::default()).await;
+    fake.alert("a-1", 1).await;
+    let path = fake.url("/v1/alerts/a-1/acknowledge");
+    let post = |body: &str| Client::new().post(&path).body(body.to_owned()).send();
+    let noted = post("{\"note\": \" seen from the tower\\nunit 3 goes \"}")
+        .await
+        .unwrap();
+    assert_eq!(noted.status(), StatusCode::OK);
+    let alert = json_of(noted).await;
+    assert_eq!(alert["state"], "acknowledged");
+    assert_eq!(alert["acknowledgement"]["note"], "seen from the tower\nunit 3 goes");
+    assert_eq!(alert["acknowledgement"]["by"], Value::Null);
+
+    let undone = Client::new().delete(&path).send().await.unwrap();
+    assert_eq!(undone.status(), StatusCode::OK);
+    let stored = json_of(get(&fake, "/v1/alerts/a-1").await).await;
+    assert_eq!(stored["state"], "open");
+    assert!(stored["acknowledgement"]["withdrawn"]["at"].is_string(), "{stored}");
+    assert_eq!(stored["acknowledgement"]["note"], "seen from the tower\nunit 3 goes");
+
+    for wrong in [
+        "{\"note\": 7}",
+        "{\"nota\": \"x\"}",
+        "[",
+        "{\"note\": \"bell \\u0007\"}",
+        &format!("{{\"note\": \"{}\"}}", "x".repeat(1001)),
+    ] {
+        problem(post(wrong).await.unwrap(), 422).await;
+    }
+    problem(post(&"x".repeat(20_000)).await.unwrap(), 413).await;
+    let text = Client::new()
+        .post(&path)
+        .header("content-type", "text/plain")
+        .body("hello");
+    problem(text.send().await.unwrap(), 415).await;
+    problem(
+        Client::new()
+            .delete(fake.url("/v1/alerts/a-2/acknowledge"))
+            .send()
+            .await
+            .unwrap(),
+        404,
+    )
+    .await;
+
+    let log = json_of(get(&fake, "/v1/audit?limit=1").await).await;
+    assert_eq!(log["records"][0]["action"], "alert.unacknowledge");
+    let before = log["next_before"].as_u64().unwrap();
+    let log = json_of(get(&fake, &format!("/v1/audit?before={before}")).await).await;
+    assert_eq!(log["records"][0]["action"], "alert.acknowledge");
+    assert_eq!(log["records"][0]["detail"], "seen from the tower\nunit 3 goes");
+    assert_eq!(log["next_before"], Value::Null);
+    fake.stop().await;
+}
+
+#[tokio::test]
+async fn evidence_is_served_as_frames_as_a_picture_and_with_claims() {
+    let dir = tempfile::tempdir().unwrap();
+    let config = record::Config {
+        folder: Some(dir.path().join("recordings")),
+        after_s: 2.0,
+        ..record::Config::default()
+    };
+    let folder = config.folder.clone().unwrap();
+    let mut recorder = Recorder::start(&config).unwrap().unwrap();
+    let claim: Claim = serde_json::from_value(json!({"time": at(0), "user": "u-1", "x_m": 1.0, "y_m": 2.0})).unwrap();
+    let mut file = None;
+    for k in 0..20 {
+        let frame = Frame {
+            index: k,
+            time: at(k as i64),
+            pixels: Array2::from_elem((64, 64), k as f64),
+            masked: None,
+        };
+        recorder.frame(&frame, std::slice::from_ref(&claim)).expect("taken");
+        if k == 10 {
+            file = recorder.evidence("a-1", frame.time);
+        }
+    }
+    drop(recorder);
+    let file = file.expect("the evidence has a file");
+    assert!(
+        file.is_file() && file.ends_with("evidence/a-1.npy"),
+        "{}",
+        file.display()
+    );
+
+    let fake = Fake::with_recordings(Config::default(), &folder).await;
+    fake.step(1);
+    fake.alert("a-1", 10).await;
+    fake.alert("a-2", 10).await;
+    let npy = get(&fake, "/v1/alerts/a-1/evidence.npy").await;
+    assert_eq!(npy.status(), StatusCode::OK);
+    assert_eq!(npy.bytes().await.unwrap(), std::fs::read(&file).unwrap());
+    let told = json_of(get(&fake, "/v1/alerts/a-1/evidence.json").await).await;
+    let position = told["position"].as_u64().unwrap() as usize;
+    assert_eq!(told["frames"][position]["index"], 10, "the alert's own frame");
+    assert_eq!(told["frames"][position]["claims"][0]["user"], "u-1");
+    let png = get(&fake, "/v1/alerts/a-1/evidence.png?scale=2").await;
+    assert_eq!(png.headers()[header::CONTENT_TYPE], "image/png");
+    let picture = image::load_from_memory(&png.bytes().await.unwrap()).unwrap();
+    assert_eq!((picture.width(), picture.height()), (128, 128));
+
+    for ending in ["npy", "json", "png"] {
+        let detail = problem(get(&fake, &format!("/v1/alerts/a-2/evidence.{ending}")).await, 404).await;
+        assert!(detail.contains("recorded"), "{detail}");
+        problem(get(&fake, &format!("/v1/alerts/a-3/evidence.{ending}")).await, 404).await;
+    }
+    fake.stop().await;
+}
+
+#[tokio::test]
+async fn without_a_recorder_an_alert_of_this_run_has_a_picture() {
+    let fake = Fake::start(Config::default()).await;
+    fake.step(1);
+    fake.alert("a-1", 1).await;
+    problem(get(&fake, "/v1/alerts/a-1/evidence.png").await, 404).await;
+    let alert = fake.journal.alert("a-1").unwrap().unwrap();
+    fake.feed.illustrate(&[alert], &crate::fake::snapshot(1));
+    let png = get(&fake, "/v1/alerts/a-1/evidence.png").await;
+    let picture = image::load_from_memory(&png.bytes().await.unwrap()).unwrap();
+    assert_eq!((picture.width(), picture.height()), (256, 256));
+    fake.stop().await;
+}
+
+#[tokio::test]
 async fn claims_are_counted_and_refused_one_by_one() {
     let fake = Fake::start(Config::default()).await;
     let post = |body: &str| Client::new().post(fake.url("/v1/claims")).body(body.to_owned()).send();
@@ -221,6 +354,10 @@ async fn the_description_is_openapi_3_1_and_lists_every_path() {
         "/v1/alerts",
         "/v1/alerts/{id}",
         "/v1/alerts/{id}/acknowledge",
+        "/v1/alerts/{id}/evidence.npy",
+        "/v1/alerts/{id}/evidence.png",
+        "/v1/alerts/{id}/evidence.json",
+        "/v1/audit",
         "/v1/claims",
         "/v1/frame.png",
         "/v1/stream",
@@ -231,6 +368,12 @@ async fn the_description_is_openapi_3_1_and_lists_every_path() {
     ] {
         assert!(api["paths"][path].is_object(), "{path}");
     }
+    let acknowledge = &api["paths"]["/v1/alerts/{id}/acknowledge"];
+    assert!(acknowledge["post"]["requestBody"].is_object() && acknowledge["delete"].is_object());
+    assert_ne!(
+        acknowledge["post"]["requestBody"]["required"], true,
+        "a note may be left out"
+    );
     fake.stop().await;
 }
 

@@ -41,6 +41,7 @@ pub fn event(event: AlertEventKind, id: &str, kind: AlertKind) -> AlertEvent {
             frame: 7,
             file: None,
         },
+        acknowledgement: None,
     };
     AlertEvent { event, alert }
 }

@@ -14,11 +14,11 @@ pub fn build(config: &Config, camera: &Camera) -> Result<Box<dyn Estimator>, Con
     faer::set_global_parallelism(faer::Par::Seq);
     let name = config.name.as_deref().unwrap_or(DEFAULT);
     if let Some(budget) = config.budget_ms
-        && !(budget.is_finite() && budget > 0.0)
+        && !(1e-3..=60_000.0).contains(&budget)
     {
         return Err(ConfigError::OutOfRange {
             field: "budget_ms",
-            expected: "a positive finite number",
+            expected: "0.001 to 60000 (milliseconds; a frame that takes a minute comes too late)",
             found: budget,
         });
     }

@@ -14,7 +14,7 @@ const MAX_HEADER: usize = 10_000;
 /// Pixels a side, as for `[optics] pixels`.
 const MAX_SIDE: u64 = 4096;
 
-/// What the header says about the frames behind it.
+/// The header: number, shape and type of the frames.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Header {
     pub dtype: Dtype,
@@ -29,6 +29,11 @@ impl Header {
     /// Bytes of one frame.
     pub fn frame_bytes(&self) -> usize {
         self.ny * self.nx * self.dtype.size()
+    }
+
+    /// Bytes of a file that [`super::Writer`] wrote with these frames.
+    pub fn file_bytes(&self) -> u64 {
+        self.data_start + self.frames * self.frame_bytes() as u64
     }
 
     pub(super) fn read(path: &Path, from: &mut impl Read) -> Result<Self, Error> {
@@ -86,7 +91,7 @@ impl Header {
 
     /// The header's bytes for a given number of frames. Their length does not depend on that number, so
     /// that the count can be patched in place.
-    pub(super) fn bytes(&self) -> Vec<u8> {
+    pub fn bytes(&self) -> Vec<u8> {
         let dict = format!(
             "{{'descr': '{}', 'fortran_order': False, 'shape': ({}, {}, {}), }}",
             self.dtype.descr(),

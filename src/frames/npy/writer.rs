@@ -1,3 +1,5 @@
+//! Writes frame files that are valid after every frame.
+
 use std::fs::File;
 use std::io::{Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
@@ -19,8 +21,13 @@ pub struct Writer {
 
 impl Writer {
     /// Creates (or replaces) a frame file for frames of shape (Ny, Nx).
-    pub fn create(path: impl AsRef<Path>, (ny, nx): (usize, usize)) -> Result<Self, Error> {
-        let path = path.as_ref().to_owned();
+    pub fn create(path: impl AsRef<Path>, shape: (usize, usize)) -> Result<Self, Error> {
+        Self::create_with(File::create(&path), path.as_ref(), shape)
+    }
+
+    /// Writes to a file just opened, empty, at `path`.
+    pub fn create_with(file: std::io::Result<File>, path: &Path, (ny, nx): (usize, usize)) -> Result<Self, Error> {
+        let path = path.to_owned();
         let header = Header {
             dtype: Dtype::JOULES,
             frames: 0,
@@ -28,7 +35,7 @@ impl Writer {
             nx,
             data_start: WRITTEN_HEADER as u64,
         };
-        let created = File::create(&path).and_then(|mut file| {
+        let created = file.and_then(|mut file| {
             file.write_all(&header.bytes())?;
             Ok(file)
         });
@@ -72,7 +79,7 @@ impl Writer {
         self.bytes.clear();
         self.bytes.extend(pixels.iter().flat_map(|v| v.to_le_bytes()));
         self.append().map_err(|source| {
-            // A part of a frame is no harm where it cannot be cut off: the header does not count it.
+            // A partial frame that cannot be truncated is harmless: the header does not count it.
             let _ = self.file.set_len(self.end_of(self.header.frames));
             Error::Io {
                 path: self.path.clone(),
@@ -81,7 +88,7 @@ impl Writer {
         })
     }
 
-    /// Sees everything on the disk.
+    /// Flushes everything to the disk.
     pub fn sync(&mut self) -> Result<(), Error> {
         self.file.sync_data().map_err(|source| Error::Io {
             path: self.path.clone(),

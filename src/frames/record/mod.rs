@@ -1,18 +1,21 @@
-//! Keeps what the monitor was given: a ring on disk, and around each alert a copy as evidence. A thread of its
-//! own writes, so that a slow disk costs recordings and never alerts. On a full disk the oldest recordings make way,
-//! so that the ring does not take the journal's room.
+//! Records the input of the monitor: a ring of files, and a copy of the time around each alert as evidence. A separate thread
+//! writes, so that a slow disk costs recordings and never alerts. On a full disk the oldest recordings are removed, so that the
+//! ring does not take the space that the journal needs.
 
 mod config;
+mod evidence;
 mod player;
 mod ring;
 mod standing;
 mod tape;
 
 pub use config::Config;
+pub use evidence::{Evidence, EvidenceFrame, file_name as evidence_file_name, frame_at};
 pub(super) use player::Player;
 pub(super) use ring::recordings;
 pub(super) use tape::index_of;
 
+use std::os::unix::fs::DirBuilderExt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -28,14 +31,16 @@ use crate::metric;
 use standing::Standing;
 use tape::{Entry, Seen, TapeReader, TapeWriter};
 
-/// Evidence that may grow at a time; an alert beyond that lies within the time of another's.
+/// Folder for evidence, within the recorder's own.
+pub const EVIDENCE: &str = "evidence";
+/// Most clips of evidence recorded at a time; a further alert falls within the time of another clip.
 const MOST_CLIPS: usize = 8;
-/// Frames that may wait for the disk.
+/// Most frames that wait for the disk.
 const QUEUE: usize = 64;
-/// After this long a file that could not be written is given up for a new one.
+/// While writing fails, a new file is tried after this long.
 const RETRY: SignedDuration = SignedDuration::from_secs(1);
 
-/// Records on a thread of its own. Dropping it writes what waits and ends the thread.
+/// Handle of the recorder thread. Dropping it writes what is queued and ends the thread.
 #[derive(Debug)]
 pub struct Recorder {
     folder: PathBuf,
@@ -44,16 +49,20 @@ pub struct Recorder {
     segment_bytes: u64,
     next_number: u64,
     current: Option<Segment>,
-    /// The clerk could not write the latest frame it was given.
+    /// Time after an alert that its evidence covers.
+    after: SignedDuration,
+    /// Evidence that is still being recorded: the alert's time and its file.
+    clips: Vec<(Timestamp, Arc<Path>)>,
+    /// The recorder thread could not write the latest frame.
     failing: Arc<AtomicBool>,
     queue: Option<SyncSender<Order>>,
     thread: Option<JoinHandle<()>>,
 }
 
-/// The recorder's thread has it.
+/// A frame that the recorder thread has taken.
 #[derive(Clone, Debug)]
 pub struct Taken {
-    /// The file that holds it; `None` while the disk fails. Claims stand in the next file's head all the same.
+    /// The file that holds it; `None` while writing fails. Its claims are still written to the head of the next file.
     pub file: Option<Arc<Path>>,
 }
 
@@ -74,7 +83,7 @@ enum Order {
         seen: Seen,
     },
     Evidence {
-        name: String,
+        path: Arc<Path>,
         time: Timestamp,
     },
 }
@@ -90,12 +99,18 @@ impl Recorder {
             let path = path.to_owned();
             move |source| Error::Recording { path, source }
         };
-        let evidence = folder.join("evidence");
-        std::fs::create_dir_all(&evidence).map_err(failed(&evidence))?;
+        let evidence = folder.join(EVIDENCE);
+        // Folders that exist keep the mode that their owner gave them.
+        let mut builder = std::fs::DirBuilder::new();
+        builder
+            .recursive(true)
+            .mode(0o700)
+            .create(&evidence)
+            .map_err(failed(&evidence))?;
         let next_number = ring::next_number(&folder).map_err(failed(&folder))?;
         let (queue, orders) = sync_channel(QUEUE);
         let failing = Arc::new(AtomicBool::new(false));
-        let clerk = Clerk {
+        let worker = RecorderThread {
             folder: folder.clone(),
             evidence,
             config: config.clone(),
@@ -107,7 +122,7 @@ impl Recorder {
         };
         let thread = std::thread::Builder::new()
             .name("recorder".into())
-            .spawn(move || clerk.run(&orders))
+            .spawn(move || worker.run(&orders))
             .map_err(failed(&folder))?;
         Ok(Some(Self {
             segment: seconds(config.segment_s),
@@ -115,6 +130,8 @@ impl Recorder {
             folder,
             next_number,
             current: None,
+            after: seconds(config.after_s),
+            clips: Vec::new(),
             failing,
             queue: Some(queue),
             thread: Some(thread),
@@ -122,7 +139,7 @@ impl Recorder {
     }
 
     /// Records a frame as it came, before any correction, with the claims taken in since the one before. `None`
-    /// when the disk cannot keep up and the frame was let go.
+    /// when the disk cannot keep up and the frame was dropped.
     pub fn frame(&mut self, frame: &Frame, claims: &[Claim]) -> Option<Taken> {
         let bytes = 8 * frame.pixels.len() as u64;
         self.write(Some(frame.pixels.dim()), bytes, Seen::frame(frame, claims))
@@ -140,11 +157,28 @@ impl Recorder {
         self.write(None, 0, Seen { entry, pixels: None })
     }
 
-    /// Keeps what lies around an alert, under its id.
-    pub fn evidence(&mut self, alert: &str, time: Timestamp) {
-        // An id of ours needs no change; nothing else may name a path.
-        let name = alert.replace(|c: char| !(c.is_ascii_alphanumeric() || c == '-' || c == '_'), "_");
-        self.order(Order::Evidence { name, time });
+    /// Records the time around an alert under its id. Returns the file: the alert's own or, where the most clips are already being
+    /// recorded, that of an earlier alert, which covers its time too. `None` while writing fails.
+    pub fn evidence(&mut self, alert: &str, time: Timestamp) -> Option<Arc<Path>> {
+        if self.failing.load(Ordering::Relaxed) {
+            return None;
+        }
+        let after = self.after;
+        self.clips
+            .retain(|(began, _)| time.duration_since(*began).abs() <= after);
+        if self.clips.len() >= MOST_CLIPS {
+            return self.clips.last().map(|(_, path)| path.clone());
+        }
+        let path: Arc<Path> = self.folder.join(EVIDENCE).join(evidence_file_name(alert)).into();
+        let path_of_order = path.clone();
+        if !self.order(Order::Evidence {
+            path: path_of_order,
+            time,
+        }) {
+            return None;
+        }
+        self.clips.push((time, path.clone()));
+        Some(path)
     }
 
     fn write(&mut self, shape: Option<(usize, usize)>, bytes: u64, seen: Seen) -> Option<Taken> {
@@ -197,37 +231,37 @@ impl Drop for Recorder {
         if let Some(thread) = self.thread.take()
             && thread.join().is_err()
         {
-            tracing::error!("the recorder's thread ended in a panic");
+            tracing::error!("the recorder thread ended in a panic");
         }
     }
 }
 
-/// The recorder's thread.
-struct Clerk {
+/// State of the recorder thread.
+struct RecorderThread {
     folder: PathBuf,
     evidence: PathBuf,
     config: Config,
     tape: Option<TapeWriter>,
-    /// The file that could not be written; the next one is tried again.
+    /// The file that could not be written; the next file is tried.
     broken: Option<Arc<Path>>,
     failing: Arc<AtomicBool>,
     standing: Standing,
     clips: Vec<Clip>,
 }
 
-/// Evidence that is still growing.
+/// Evidence that is still being recorded.
 struct Clip {
     tape: TapeWriter,
     until: Timestamp,
 }
 
-impl Clerk {
+impl RecorderThread {
     fn run(mut self, orders: &Receiver<Order>) {
         for order in orders {
             let was_failing = self.failing.load(Ordering::Relaxed);
             let done = match order {
                 Order::Write { path, shape, seen } => self.write(path, shape, &seen),
-                Order::Evidence { name, time } => self.keep(&name, time),
+                Order::Evidence { path, time } => self.keep(&path, time),
             };
             let Err(error) = done else { continue };
             metrics::counter!(metric::RECORDER_ERRORS).increment(1);
@@ -235,17 +269,17 @@ impl Clerk {
                 tracing::error!(%error, "not recorded");
             }
             if error.is_full_disk() {
-                self.make_way();
+                self.free_disk();
             }
         }
     }
 
-    /// Gives half of the ring's room back to the disk.
-    fn make_way(&self) {
+    /// Removes the older half of the ring.
+    fn free_disk(&self) {
         let half = ring::size(&self.folder).map(|bytes| bytes / 2);
         match half.and_then(|half| ring::trim(&self.folder, half, Path::new(""))) {
             Ok(0) => {}
-            Ok(removed) => tracing::warn!(removed, "the disk is full: the oldest recordings made way"),
+            Ok(removed) => tracing::warn!(removed, "the disk is full: the oldest recordings were removed"),
             Err(error) => tracing::error!(%error, "the disk is full, and the oldest recordings could not be removed"),
         }
     }
@@ -257,11 +291,11 @@ impl Clerk {
         let written = self.append(&path, shape, seen);
         self.standing.take(&seen.entry.claims);
         self.clips.retain(|clip| seen.entry.time <= clip.until);
-        let mut grown = Ok(());
+        let mut appended = Ok(());
         self.clips.retain_mut(|clip| match clip.tape.push(seen) {
             Ok(()) => true,
             Err(error) => {
-                grown = Err(error);
+                appended = Err(error);
                 false
             }
         });
@@ -272,7 +306,7 @@ impl Clerk {
         } else if was_failing {
             tracing::info!(path = %path.display(), "recording again");
         }
-        written.and(grown)
+        written.and(appended)
     }
 
     fn append(&mut self, path: &Path, shape: (usize, usize), seen: &Seen) -> Result<(), Error> {
@@ -294,16 +328,8 @@ impl Clerk {
         }
     }
 
-    /// Starts a clip with what the ring holds of the time before the alert.
-    fn keep(&mut self, name: &str, time: Timestamp) -> Result<(), Error> {
-        if self.clips.len() >= MOST_CLIPS {
-            tracing::warn!(
-                alert = name,
-                "no evidence of its own: {MOST_CLIPS} alerts are being recorded already"
-            );
-            return Ok(());
-        }
-        let path = self.evidence.join(format!("{name}.npy"));
+    /// Starts a clip with the part of the ring before the alert.
+    fn keep(&mut self, path: &Path, time: Timestamp) -> Result<(), Error> {
         let from = time
             .saturating_sub(seconds(self.config.before_s))
             .unwrap_or(Timestamp::MIN);
@@ -314,7 +340,7 @@ impl Clerk {
             path: self.folder.clone(),
             source,
         })?;
-        // The ring's own file names tell their order; those far before the alert need not be read.
+        // File names give the order of the files; those far before the alert need not be read.
         let few = (self.config.before_s / self.config.segment_s).ceil() as usize + 2;
         files.drain(..files.len().saturating_sub(few.max(10)));
         let mut standing = Standing::default();
@@ -333,10 +359,10 @@ impl Clerk {
                 let shape = seen.pixels.as_ref().map_or((1, 1), ndarray::Array2::dim);
                 let writer = match &mut clip {
                     Some(writer) => writer,
-                    None => clip.insert(TapeWriter::create(&path, shape, standing.claims())?),
+                    None => clip.insert(TapeWriter::create(path, shape, standing.claims())?),
                 };
                 match writer.push(&seen) {
-                    // A camera whose array changed its shape meanwhile: the evidence ends where it changed.
+                    // The camera changed its shape: the evidence ends there.
                     Err(Error::Npy(npy::Error::Shape { .. })) => break,
                     done => done?,
                 }
@@ -344,7 +370,7 @@ impl Clerk {
         }
         if let Some(tape) = clip {
             self.clips.push(Clip { tape, until });
-            self.trim(&self.evidence, self.config.evidence_limit_mb, &path);
+            self.trim(&self.evidence, self.config.evidence_limit_mb, path);
         }
         Ok(())
     }

@@ -1,8 +1,9 @@
-//! One file of a recording: frames in NAME.npy, and in NAME.frames.ndjson a line for each thing that the monitor
-//! was given, in order: times, claims, masks, and what was unusable.
+//! One file of a recording: frames in NAME.npy, and in NAME.frames.ndjson one line for each event that the monitor received, in
+//! order: times, claims, masks, and why a frame was unusable.
 
 use std::fs::File;
 use std::io::{BufRead, BufReader, Write};
+use std::os::unix::fs::{OpenOptionsExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 
 use jiff::Timestamp;
@@ -18,11 +19,11 @@ use crate::frames::{Error, Next, npy};
 pub(super) struct Head {
     /// Version of the format.
     pub oapwatch_recording: u32,
-    /// The claims that stood when the file begins; for a replay that begins with it.
+    /// Claims in force when the file begins, for a replay that begins with it.
     pub claims: Vec<Claim>,
 }
 
-/// Any other line.
+/// A line of the index after the first.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub(in crate::frames) struct Entry {
     pub index: u64,
@@ -38,7 +39,7 @@ pub(in crate::frames) struct Entry {
     pub claims: Vec<Claim>,
 }
 
-/// What was seen at one time: an entry with its pixels.
+/// One event: an entry with its pixels.
 #[derive(Clone, Debug)]
 pub(in crate::frames) struct Seen {
     pub entry: Entry,
@@ -100,12 +101,21 @@ impl Seen {
     }
 }
 
-/// Where the index of a recording lies.
+/// Path of the index of a recording.
 pub(in crate::frames) fn index_of(npy: &Path) -> PathBuf {
     npy.with_extension("frames.ndjson")
 }
 
-/// Writes one file. A frame's pixels go out before its line: what the index names is there.
+/// Creates or empties a file that only its owner may read, whatever the umask: recordings show where every user was.
+fn create_private(path: &Path) -> std::io::Result<File> {
+    let mut options = File::options();
+    let file = options.write(true).create(true).truncate(true).mode(0o600).open(path)?;
+    // The mode above holds for a new file only. A file system without modes is no reason not to record.
+    let _ = file.set_permissions(std::fs::Permissions::from_mode(0o600));
+    Ok(file)
+}
+
+/// Writes one file. A frame's pixels are written before its line, so that the index names only frames that are complete.
 #[derive(Debug)]
 pub(super) struct TapeWriter {
     frames: npy::Writer,
@@ -113,18 +123,18 @@ pub(super) struct TapeWriter {
 }
 
 impl TapeWriter {
-    /// Creates both files, or leaves neither.
+    /// Creates both files or neither.
     pub fn create(path: &Path, shape: (usize, usize), claims: Vec<Claim>) -> Result<Self, Error> {
         Self::create_both(path, shape, claims).inspect_err(|_| {
-            // What could not be written can be absent too.
+            // The first error is the one to report.
             let _ = std::fs::remove_file(path);
             let _ = std::fs::remove_file(index_of(path));
         })
     }
 
     fn create_both(path: &Path, shape: (usize, usize), claims: Vec<Claim>) -> Result<Self, Error> {
-        let frames = npy::Writer::create(path, shape)?;
-        let index = File::create(index_of(path)).map_err(|source| Error::Recording {
+        let frames = npy::Writer::create_with(create_private(path), path, shape)?;
+        let index = create_private(&index_of(path)).map_err(|source| Error::Recording {
             path: index_of(path),
             source,
         })?;
@@ -157,7 +167,7 @@ impl TapeWriter {
     }
 }
 
-/// Reads one file. A last line that was cut short is what a killed recorder was writing: it is passed over.
+/// Reads one file. A truncated last line, left by a killed recorder, is skipped.
 #[derive(Debug)]
 pub(in crate::frames) struct TapeReader {
     path: PathBuf,
@@ -167,7 +177,7 @@ pub(in crate::frames) struct TapeReader {
 }
 
 impl TapeReader {
-    /// The file and the claims that stood when it begins.
+    /// Opens a file; returns the claims in force when it begins.
     pub fn open(path: &Path) -> Result<(Self, Vec<Claim>), Error> {
         let index = index_of(path);
         let file = File::open(&index).map_err(|source| Error::Recording { path: index, source })?;
@@ -205,7 +215,12 @@ impl TapeReader {
         }
     }
 
-    /// The next thing that was seen.
+    /// The next entry of the index, without its pixels. Not to be mixed with [`TapeReader::next`].
+    pub fn entry(&mut self) -> Result<Option<Entry>, Error> {
+        self.line()
+    }
+
+    /// The next event.
     pub fn next(&mut self) -> Result<Option<Seen>, Error> {
         let Some(entry) = self.line::<Entry>()? else {
             return Ok(None);

@@ -1,3 +1,5 @@
+//! Tests of the delivery queue: order per alert, retries, recovery after an outage.
+
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 

@@ -1,0 +1,419 @@
+//! Whether a spot is wider than one beam's: a score test (Rao, 1948) of its second moments, summed over frames.
+
+use nalgebra::{Matrix2, Matrix3, Vector3};
+
+use super::block_history::{BlockHistory, MIN_DRIFT_BLOCKS, RECENT_FRAMES, Recent};
+use super::robust::median_high;
+use crate::estimate;
+
+/// Windows of newest frames that are tested: the shortest for a strong second beam, the longest for one that no frame shows. They
+/// share data, and no correction is made for their number (the soaks of docs/verdicts.md hold the rate of false alerts).
+const WINDOWS: [usize; 5] = [3, 10, 20, 40, RECENT_FRAMES];
+/// Frames before a window that it is compared with at least.
+const MIN_FRAMES_BEFORE: u32 = 30;
+/// Standard deviation of a beam's drift until its blocks show it, σ²: a user who walks for ten seconds is seen through another
+/// part of the lens. Larger hides a second beam, smaller takes the lens for one. Not measured.
+const ASSUMED_DRIFT: f64 = 0.004;
+/// Smallest drift, however steady the blocks, σ². Not measured.
+const MIN_DRIFT: f64 = 0.002;
+/// Standard deviation of honest moments about what all beams show, σ²: a lens is not the same everywhere. Larger hides a second
+/// beam that was there from the start. Not measured.
+const LENS_SCATTER: f64 = 0.1;
+/// Age in frames from which a frame counts for the scatter of frames: a second beam that has just come on is no scatter.
+const SETTLED: usize = 20;
+/// Frames over which the scatter is averaged: as long as the blocks reach back.
+const MEMORY: f64 = 1200.0;
+/// Other beams from which their median is taken for what all beams share.
+const MIN_OTHERS: usize = 3;
+/// Largest squared Mahalanobis distance that one frame counts for (winsorised): a bird is one event.
+const MAX_FRAME: f64 = 25.0;
+/// Directions of a second beam that are tried, over half a turn.
+const DIRECTIONS: usize = 16;
+
+/// Second moments (xx, xy, yy) beyond one spot's, σ², in information form: scores and informations of frames add.
+#[derive(Clone, Copy, Debug)]
+pub struct SecondMomentScore {
+    score: Vector3<f64>,
+    information: Matrix3<f64>,
+}
+
+/// A beam's second moments. Two beams d apart, with shares w and 1 − w of the light, have w(1 − w)·d² along the line between them,
+/// however they fade; frames add up what none of them shows.
+#[derive(Clone, Debug, Default)]
+pub struct SecondMomentTest {
+    recent: Recent<SecondMomentScore>,
+    past: BlockHistory<SecondMomentScore>,
+    /// Mean squared Mahalanobis distance of a frame from those before, over its expectation, and the frames it is of.
+    dispersion: f64,
+    dispersion_frames: f64,
+    windows: [Option<WindowEstimate>; WINDOWS.len()],
+}
+
+/// Moments of a window, and their rise over what came before it, each with its covariance.
+#[derive(Clone, Copy, Debug)]
+struct WindowEstimate {
+    level: (Vector3<f64>, Matrix3<f64>),
+    rise: Option<(Vector3<f64>, Matrix3<f64>)>,
+}
+
+/// What the other beams show in each window.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct CommonMode([CommonWindow; WINDOWS.len()]);
+
+#[derive(Clone, Copy, Debug, Default)]
+struct CommonWindow {
+    level: (Vector3<f64>, Matrix3<f64>),
+    rise: (Vector3<f64>, Matrix3<f64>),
+}
+
+/// Trace of the moments beyond what is expected, σ², and −ln p of them.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Widening {
+    pub trace: f64,
+    pub neg_log_p: f64,
+}
+
+impl Default for SecondMomentScore {
+    fn default() -> Self {
+        Self {
+            score: Vector3::zeros(),
+            information: Matrix3::zeros(),
+        }
+    }
+}
+
+impl SecondMomentScore {
+    /// A fit's score, its covariance times `inflation`.
+    pub fn of(score: &estimate::SecondMomentScore, inflation: f64) -> Self {
+        let s = score.information;
+        Self {
+            score: Vector3::from(score.score) / inflation,
+            information: Matrix3::from_fn(|r, c| 0.5 * (s[r][c] + s[c][r])) / inflation,
+        }
+    }
+
+    /// Of light spread by `moments`, σ², of that signal-to-noise ratio. A Gaussian spot f of unit norm has
+    /// ‖½f_xx‖² = 1/8 and ‖f_xy‖² = 1/4 with its energy adjusted; the three are orthogonal to each other and to its position.
+    pub fn of_spread(moments: Matrix2<f64>, snr: f64) -> Self {
+        let information = Matrix3::from_diagonal(&Vector3::new(0.125, 0.25, 0.125)) * (snr * snr);
+        Self {
+            score: information * Vector3::new(moments[(0, 0)], moments[(0, 1)], moments[(1, 1)]),
+            information,
+        }
+    }
+
+    fn add(&mut self, other: &Self) {
+        self.score += other.score;
+        self.information += other.information;
+    }
+
+    /// The moments and their covariance.
+    fn solved(&self) -> Option<(Vector3<f64>, Matrix3<f64>)> {
+        let cov = self.information.cholesky()?.inverse();
+        Some((cov * self.score, cov))
+    }
+
+    /// Squared Mahalanobis distance of the moments from `expected`.
+    fn distance2(&self, expected: Vector3<f64>) -> Option<f64> {
+        let off = self.solved()?.0 - expected;
+        Some(off.dot(&(self.information * off)))
+    }
+}
+
+impl SecondMomentTest {
+    /// Takes a frame. With `learn` the frame that it pushes out of the newest is added to the past.
+    pub fn push(&mut self, frame: &SecondMomentScore, learn: bool) {
+        let expected = self.mean_before(0).unwrap_or_default();
+        let Some(distance2) = frame.distance2(expected).filter(|d| d.is_finite()) else {
+            return;
+        };
+        let mut frame = *frame;
+        if distance2 > MAX_FRAME {
+            let usual = frame.information * expected;
+            frame.score = usual + (frame.score - usual) * (MAX_FRAME / distance2).sqrt();
+        }
+        let old = self.recent.push(frame);
+        if learn {
+            self.learn_dispersion(expected);
+            if let Some(old) = old {
+                self.past.push(|block| block.add(&old));
+            }
+        }
+        self.update_windows();
+    }
+
+    fn learn_dispersion(&mut self, expected: Vector3<f64>) {
+        let settled = self.recent.iter().rev().nth(SETTLED);
+        if let Some(distance2) = settled.and_then(|m| m.distance2(expected)) {
+            self.dispersion_frames = (self.dispersion_frames + 1.0).min(MEMORY);
+            self.dispersion += (distance2 / 3.0 - self.dispersion) / self.dispersion_frames;
+        }
+    }
+
+    /// Everything before the newest `n` frames, where that is enough.
+    fn sum_before(&self, n: usize) -> Option<SecondMomentScore> {
+        let old = self.recent.len().checked_sub(n)?;
+        (self.past.frames() + old as u32 >= MIN_FRAMES_BEFORE).then(|| {
+            let mut sum = *self.past.filling();
+            self.past
+                .blocks()
+                .chain(self.recent.iter().take(old))
+                .for_each(|m| sum.add(m));
+            sum
+        })
+    }
+
+    fn mean_before(&self, n: usize) -> Option<Vector3<f64>> {
+        self.sum_before(n)?.solved().map(|(mean, _)| mean)
+    }
+
+    fn newest(&self, n: usize) -> Option<(Vector3<f64>, Matrix3<f64>)> {
+        let first = self.recent.len().checked_sub(n)?;
+        let mut sum = SecondMomentScore::default();
+        self.recent.iter().skip(first).for_each(|m| sum.add(m));
+        sum.solved()
+    }
+
+    /// Standard deviation of the blocks' means beyond their noise.
+    fn drift(&self) -> f64 {
+        let means: Vec<_> = self.past.blocks().filter_map(|b| b.solved()).collect();
+        if means.len() < MIN_DRIFT_BLOCKS {
+            return ASSUMED_DRIFT;
+        }
+        let n = means.len() as f64;
+        let middle = means.iter().map(|(m, _)| m).sum::<Vector3<f64>>() / n;
+        let squares: f64 = means.iter().map(|(m, _)| (m - middle).norm_squared()).sum();
+        let noise: f64 = means.iter().map(|(_, cov)| cov.trace()).sum::<f64>() * self.dispersion.max(1.0) / n;
+        (((squares / (n - 1.0) - noise) / 3.0).max(0.0)).sqrt().max(MIN_DRIFT)
+    }
+
+    fn update_windows(&mut self) {
+        let dispersion = self.dispersion.max(1.0);
+        let drift = Matrix3::identity() * self.drift().powi(2);
+        self.windows = WINDOWS.map(|n| {
+            let (mean, cov) = self.newest(n)?;
+            let cov = cov * dispersion;
+            let before = self.sum_before(n).and_then(|m| m.solved());
+            let rise = before.map(|(past, past_cov)| (mean - past, cov + past_cov * dispersion + drift));
+            Some(WindowEstimate {
+                level: (mean, cov),
+                rise,
+            })
+        });
+    }
+
+    /// The most significant window, as it is against the other beams or by its rise against its own past.
+    pub fn most_significant(&self, common: &CommonMode) -> Widening {
+        let mut most = Widening::default();
+        let lens = Matrix3::identity() * LENS_SCATTER.powi(2);
+        for (window, common) in self.windows.iter().zip(&common.0) {
+            let Some(window) = window else { break };
+            let level = Some((window.level.0 - common.level.0, window.level.1 + common.level.1 + lens));
+            let rise = window
+                .rise
+                .map(|(rise, cov)| (rise - common.rise.0, cov + common.rise.1));
+            for (off, cov) in level.into_iter().chain(rise) {
+                let Some(inverse) = cov.try_inverse() else { continue };
+                let found = widening(off, inverse);
+                if found.neg_log_p > most.neg_log_p {
+                    most = found;
+                }
+            }
+        }
+        most
+    }
+}
+
+impl CommonMode {
+    /// Medians over `others`, where there are enough, with their own uncertainty.
+    pub fn of<'a>(others: impl Iterator<Item = &'a SecondMomentTest> + Clone) -> Self {
+        Self(std::array::from_fn(|k| {
+            let windows = || others.clone().filter_map(|b| b.windows[k]);
+            CommonWindow {
+                level: middle(windows().map(|w| w.level.0).collect()),
+                rise: middle(windows().filter_map(|w| w.rise).map(|r| r.0).collect()),
+            }
+        }))
+    }
+}
+
+/// Component-wise median of three or more, and its variance from their scatter (1.4826·MAD, π/2 for a median).
+fn middle(of: Vec<Vector3<f64>>) -> (Vector3<f64>, Matrix3<f64>) {
+    if of.len() < MIN_OTHERS {
+        return (Vector3::zeros(), Matrix3::zeros());
+    }
+    let axis = |k: usize| {
+        let middle = median_high(of.iter().map(|m| m[k])).unwrap_or(0.0);
+        let scatter = 1.4826 * median_high(of.iter().map(|m| (m[k] - middle).abs())).unwrap_or(0.0);
+        (
+            middle,
+            std::f64::consts::FRAC_PI_2 * scatter * scatter / of.len() as f64,
+        )
+    };
+    let [x, xy, y] = [0, 1, 2].map(axis);
+    (
+        Vector3::new(x.0, xy.0, y.0),
+        Matrix3::from_diagonal(&Vector3::new(x.1, xy.1, y.1)),
+    )
+}
+
+/// The moments of a second beam in the direction that explains `off` best. Whitened, the directions are the edge of a convex
+/// cone: a closed convex curve on the unit sphere, at most 2π long. The largest of them exceeds u with a probability of at
+/// most Q(u) + e^(−u²/2) (Rice, 1945, for the upcrossings), below 1.5·e^(−u²/2).
+fn widening(off: Vector3<f64>, inverse: Matrix3<f64>) -> Widening {
+    let mut best = Widening::default();
+    for k in 0..DIRECTIONS {
+        let (y, x) = (std::f64::consts::PI * k as f64 / DIRECTIONS as f64).sin_cos();
+        let v = Vector3::new(x * x, x * y, y * y);
+        let (slope, curvature) = (v.dot(&(inverse * off)), v.dot(&(inverse * v)));
+        let neg_log_p = 0.5 * slope * slope / curvature - 1.5f64.ln();
+        if slope > 0.0 && neg_log_p > best.neg_log_p {
+            best = Widening {
+                trace: slope / curvature,
+                neg_log_p,
+            };
+        }
+    }
+    best
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::SeedableRng;
+    use rand_chacha::ChaCha8Rng;
+    use rand_distr::{Distribution, StandardNormal};
+
+    use super::*;
+
+    /// Frames of a beam of SNR 40, moments to 0.07 σ², whose moments are `truth`.
+    fn frames(n: usize, truth: [f64; 3], seed: u64) -> Vec<SecondMomentScore> {
+        let information = [200.0, 400.0, 200.0];
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        (0..n)
+            .map(|_| {
+                let score = Vector3::from_fn(|k, _| {
+                    let z: f64 = StandardNormal.sample(&mut rng);
+                    information[k] * truth[k] + z * f64::sqrt(information[k])
+                });
+                SecondMomentScore {
+                    score,
+                    information: Matrix3::from_diagonal(&Vector3::from(information)),
+                }
+            })
+            .collect()
+    }
+
+    fn pushed(frames: &[SecondMomentScore]) -> SecondMomentTest {
+        let mut test = SecondMomentTest::default();
+        frames.iter().for_each(|m| test.push(m, true));
+        test
+    }
+
+    fn neg_log_p(test: &SecondMomentTest) -> f64 {
+        test.most_significant(&CommonMode::default()).neg_log_p
+    }
+
+    #[test]
+    fn two_equal_beams_a_sigma_apart_have_a_quarter_along_their_line() {
+        // At ±½ along x: w(1 − w)·d² = ¼; SNR 10.
+        let spread = Matrix2::new(0.25, 0.0, 0.0, 0.0);
+        let score = SecondMomentScore::of_spread(spread, 10.0);
+        let (moments, cov) = score.solved().unwrap();
+        assert!((moments - Vector3::new(0.25, 0.0, 0.0)).norm() < 1e-12);
+        // Information 100/8: a variance of 0.08.
+        assert!((cov[(0, 0)] - 0.08).abs() < 1e-12);
+        assert!((score.distance2(Vector3::zeros()).unwrap() - 0.0625 / 0.08).abs() < 1e-9);
+    }
+
+    #[test]
+    fn scores_of_frames_add() {
+        let one = SecondMomentScore::of_spread(Matrix2::new(0.1, 0.0, 0.0, 0.3), 4.0);
+        let mut sum = one;
+        sum.add(&one);
+        let ((a, cov_a), (b, cov_b)) = (one.solved().unwrap(), sum.solved().unwrap());
+        assert!((a - b).norm() < 1e-12 && (cov_a - cov_b * 2.0).norm() < 1e-12);
+        assert!(SecondMomentScore::default().solved().is_none());
+    }
+
+    #[test]
+    fn an_inflated_fit_has_the_same_moments_and_less_information() {
+        let fit = estimate::SecondMomentScore {
+            score: [25.0, 0.0, 0.0],
+            information: [[100.0, 0.0, 0.0], [0.0, 200.0, 0.0], [0.0, 0.0, 100.0]],
+        };
+        let (moments, cov) = SecondMomentScore::of(&fit, 4.0).solved().unwrap();
+        assert!((moments.x - 0.25).abs() < 1e-12 && (cov[(0, 0)] - 0.04).abs() < 1e-12);
+    }
+
+    #[test]
+    fn the_direction_of_a_second_beam_by_hand() {
+        // Along x, three standard deviations out: 3²/2 − ln 1.5.
+        let found = widening(Vector3::new(0.3, 0.0, 0.0), Matrix3::identity() * 100.0);
+        assert!((found.neg_log_p - (4.5 - 1.5f64.ln())).abs() < 1e-12 && (found.trace - 0.3).abs() < 1e-12);
+        // Narrower than one spot is no second beam.
+        let narrower = widening(Vector3::new(-0.3, 0.0, -0.3), Matrix3::identity() * 100.0);
+        assert_eq!(narrower, Widening::default());
+    }
+
+    #[test]
+    fn the_common_mode_needs_three_others() {
+        let of = |n: usize| middle((0..n).map(|k| Vector3::new(k as f64, 0.0, 0.0)).collect());
+        assert_eq!(of(2).0, Vector3::zeros());
+        let (middle, cov) = of(3);
+        // Median 1, MAD 1: 1.4826²·π/2/3.
+        assert_eq!(middle.x, 1.0);
+        let expected = 1.4826f64.powi(2) * std::f64::consts::FRAC_PI_2 / 3.0;
+        assert!((cov[(0, 0)] - expected).abs() < 1e-12 && cov[(1, 1)] == 0.0);
+    }
+
+    #[test]
+    fn one_beam_is_not_significant_whatever_its_shape() {
+        let shape = [0.05, -0.02, 0.03];
+        let mut most: f64 = 0.0;
+        for seed in 0..20 {
+            let mut test = SecondMomentTest::default();
+            for m in frames(2000, shape, seed) {
+                test.push(&m, true);
+                most = most.max(neg_log_p(&test));
+            }
+        }
+        assert!((5.0..16.0).contains(&most), "{most}");
+    }
+
+    #[test]
+    fn a_second_beam_that_no_frame_shows_is_found_in_a_second() {
+        // Equal beams a σ apart along the diagonal, after five seconds of one.
+        for seed in 0..20 {
+            let mut test = pushed(&frames(50, [0.0; 3], seed));
+            for m in frames(10, [0.125; 3], 100 + seed) {
+                test.push(&m, true);
+            }
+            let found = test.most_significant(&CommonMode::default());
+            assert!(
+                found.neg_log_p > 19.0 && (found.trace - 0.25).abs() < 0.1,
+                "seed {seed}: {found:?}"
+            );
+        }
+    }
+
+    #[test]
+    fn what_all_spots_show_and_a_single_frame_prove_nothing() {
+        let mut test = pushed(&frames(600, [0.0; 3], 1));
+        let smear = [0.2, 0.0, 0.2];
+        for m in frames(10, smear, 2) {
+            test.push(&m, false);
+        }
+        assert!(neg_log_p(&test) > 20.0);
+        let others: Vec<SecondMomentTest> = (10..15)
+            .map(|seed| {
+                let mut other = pushed(&frames(600, [0.0; 3], seed));
+                frames(10, smear, 100 + seed).iter().for_each(|m| other.push(m, false));
+                other
+            })
+            .collect();
+        assert!(test.most_significant(&CommonMode::of(others.iter())).neg_log_p < 10.0);
+        let mut test = pushed(&frames(600, [0.0; 3], 3));
+        frames(1, [5.0, 0.0, 5.0], 4).iter().for_each(|m| test.push(m, false));
+        assert!(neg_log_p(&test) < 15.0);
+    }
+}
