@@ -3,9 +3,10 @@
 use std::io::IsTerminal;
 
 use serde::{Deserialize, Serialize};
+use tracing_subscriber::filter::Targets;
 use tracing_subscriber::layer::SubscriberExt;
 use tracing_subscriber::util::SubscriberInitExt;
-use tracing_subscriber::{EnvFilter, Layer, Registry, reload};
+use tracing_subscriber::{Layer, Registry, reload};
 
 /// `[log]`.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -31,11 +32,11 @@ pub struct Error {
 
 /// Changes the level of a running daemon.
 #[derive(Clone)]
-pub struct Handle(reload::Handle<EnvFilter, Registry>);
+pub struct Handle(reload::Handle<Targets, Registry>);
 
 impl Config {
-    pub fn filter(&self) -> Result<EnvFilter, Error> {
-        EnvFilter::builder().parse(&self.level).map_err(|source| Error {
+    pub fn filter(&self) -> Result<Targets, Error> {
+        self.level.parse().map_err(|source| Error {
             level: self.level.clone(),
             source,
         })
