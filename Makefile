@@ -22,7 +22,6 @@ test: setup setup-test
 setup:
 	@command -v cargo >/dev/null || { echo "Rust is missing: install it from https://rustup.rs"; exit 1; }
 	$(call need,command -v cc,build-essential)
-	$(call need,sh -c 'ls /usr/lib/llvm-*/lib/ | grep -qE "^libclang(-[0-9.]+)?[.]so"',libclang-dev)
 
 setup-test:
 	$(call need,command -v chromium,chromium chromium-driver)
@@ -92,8 +91,7 @@ check-aarch64: VERB := check
 aarch64 check-aarch64: setup
 	$(call need,command -v aarch64-linux-gnu-gcc,gcc-aarch64-linux-gnu libc6-dev-arm64-cross)
 	rustup target add aarch64-unknown-linux-gnu
-	BINDGEN_EXTRA_CLANG_ARGS_aarch64_unknown_linux_gnu=--sysroot=/usr/aarch64-linux-gnu \
-		CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_LINKER=aarch64-linux-gnu-gcc \
+	CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_LINKER=aarch64-linux-gnu-gcc \
 		cargo $(VERB) --release --locked --target aarch64-unknown-linux-gnu --target-dir target/cross --bin oapwatch
 
 # The program for the usual computer of a UAV, target/cross/aarch64-unknown-linux-gnu/release/oapwatch, and the same run under
