@@ -5,6 +5,10 @@
 //! ARCHITECTURE.md has the map.
 // One room is let out of this: frames/v4l2/sys, which speaks to the kernel and says why at each place.
 #![deny(unsafe_code)]
+#![cfg_attr(not(test), warn(unused_crate_dependencies))]
+
+// The program's allocator, set in main.rs.
+use mimalloc as _;
 
 pub mod claim;
 pub mod frame;
