@@ -16,8 +16,20 @@ run: setup
 build: setup
 	cargo build --release --locked
 
-test: setup setup-test
-	cargo test --locked
+# Tests share the program's build. Where CI is set nothing is skipped: what a test needs is installed first.
+test: setup $(if $(CI),setup-test,test-skips)
+	cargo test --release --locked
+
+.PHONY: test-skips
+test-skips:
+	@command -v chromium chromium-browser google-chrome >/dev/null || echo "Skipping the page in a browser: Chromium is missing (make setup-test installs it)"
+	@test -x target/schemathesis/bin/schemathesis || echo "Skipping requests made from the API's description: schemathesis is missing (make setup-test installs it)"
+
+.PHONY: test-checked
+# The tests with overflow checks and debug assertions in this crate; its dependencies are those of the release build.
+CHECKED := --config 'profile.release.package.oapwatch.debug-assertions=true' --config 'profile.release.package.oapwatch.overflow-checks=true'
+test-checked: setup $(if $(CI),setup-test,test-skips)
+	cargo test --release --locked $(CHECKED)
 
 setup:
 	@command -v cargo >/dev/null || { echo "Rust is missing: install it from https://rustup.rs"; exit 1; }
@@ -29,10 +41,11 @@ setup-test:
 	@cmp -s tests/schemathesis/requirements.txt target/schemathesis/installed.txt || { echo "Installing schemathesis"; \
 		python3 -m venv --clear target/schemathesis && target/schemathesis/bin/pip install --quiet --requirement tests/schemathesis/requirements.txt \
 		&& cp tests/schemathesis/requirements.txt target/schemathesis/installed.txt; }
-	@command -v cargo-deny >/dev/null || { echo "Installing cargo-deny"; cargo install --locked --quiet cargo-deny; }
 
 .PHONY: test-licences
-test-licences: setup-test
+# A debug build of cargo-deny takes half the time of a release build and checks as fast.
+test-licences: setup
+	@command -v cargo-deny >/dev/null || { echo "Installing cargo-deny"; cargo install --debug --locked --quiet cargo-deny; }
 	cargo deny --locked check licenses bans sources
 	@cargo metadata --locked --format-version 1 --manifest-path fuzz/Cargo.toml >/dev/null
 
@@ -77,7 +90,7 @@ soak: build
 .PHONY: siege
 # Floods, slow and endless clients, a thousand viewers, a gigabyte of garbage: what they cost the monitor. Not in CI: minutes.
 siege: build
-	OAPWATCH_PROGRAM=$(CURDIR)/target/release/oapwatch cargo test --locked --test daemon -- --ignored --nocapture --test-threads 1 siege
+	OAPWATCH_PROGRAM=$(CURDIR)/target/release/oapwatch cargo test --release --locked --test daemon -- --ignored --nocapture --test-threads 1 siege
 
 .PHONY: overload
 # How old results grow under ten times the frames that the daemon can handle.
