@@ -116,8 +116,10 @@ async fn the_audit_log_is_kept_in_order_over_a_restart_and_within_its_age() {
     let last = journal.audit_log(None, 1).unwrap()[0].id;
     assert_eq!(targets(&journal, Some(last)), ["b", "a"]);
 
-    // Nothing was raised, so the first round is not put off for a clock that may be wrong.
-    journal.maintain(now + SignedDuration::from_hours(24 * 91));
+    // The first round after two days is skipped: the clock may be wrong.
+    for _ in 0..2 {
+        journal.maintain(now + SignedDuration::from_hours(24 * 91));
+    }
     journal.settled().await;
     drop(journal);
     let journal = Journal::open(&config, vec![]).unwrap();

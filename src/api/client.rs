@@ -124,7 +124,7 @@ impl TrustedProxies {
     }
 
     /// The client behind `peer`. Each proxy appends the address it was called from, so the list is read from its end: the
-    /// first address that is not a trusted proxy's is the client, and what stands before it is the client's own word.
+    /// first address that is not a trusted proxy's is the client's, and what stands before it was written by the client.
     fn client_of(&self, peer: Client, headers: &HeaderMap) -> Client {
         let mut client = peer;
         let named: Vec<&str> = headers

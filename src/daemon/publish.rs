@@ -11,7 +11,7 @@ use crate::journal::Journal;
 use crate::monitor::{Alert, AlertEvent, AlertEventKind};
 
 /// Longest time that a hanging disk delays the publication of an event.
-const PATIENCE: Duration = Duration::from_secs(2);
+const JOURNAL_TIMEOUT: Duration = Duration::from_secs(2);
 
 /// Hands results from the compute thread to the publisher. It never waits: a newer snapshot replaces an older one, and events
 /// are queued (they are few, and the journal bounds its backlog).
@@ -103,7 +103,7 @@ impl Outlet {
                 if let Err(error) = journal.record_numbered(&numbered, Timestamp::now()) {
                     tracing::error!(%error, "alert events are lost to the journal");
                 }
-                if tokio::time::timeout(PATIENCE, journal.settled()).await.is_err() {
+                if tokio::time::timeout(JOURNAL_TIMEOUT, journal.settled()).await.is_err() {
                     tracing::error!("the journal's disk hangs; alerts are published before they are on it");
                 }
                 feed.publish_events(numbered);

@@ -69,7 +69,7 @@ impl Store {
                 break;
             }
         }
-        // Some room is made at once, so that not every later write makes its own.
+        // A tenth is freed at once, so that not every later write has to free its own.
         let target = retention.max_bytes - retention.max_bytes / 10;
         if self.used_bytes()? > retention.max_bytes {
             while self.used_bytes()? > target {

@@ -15,8 +15,7 @@ use crate::journal::{self, Recorded};
 /// Read of an answer so that its connection can be used again; a longer one costs the connection.
 const ANSWER: usize = 4 << 10;
 
-/// A receiver that asks for more patience than this is asked again all the same: nobody may put off alerts
-/// for good.
+/// Upper limit of `Retry-After`: no receiver may put off alerts indefinitely.
 const LONGEST_RETRY_AFTER: Duration = Duration::from_secs(3600);
 
 /// How a request ended.

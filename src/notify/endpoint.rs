@@ -157,7 +157,7 @@ fn is_name(name: &str) -> bool {
     (1..=64).contains(&name.len()) && name.chars().all(allowed)
 }
 
-/// The host, for people, and a hash of the whole URL, which is different for each and gives nothing away.
+/// The host, for readers, and a hash of the whole URL, which is unique and reveals nothing of it.
 fn name_of(url: &Url) -> String {
     let host: String = url
         .host_str()
