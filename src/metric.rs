@@ -1,5 +1,5 @@
-//! Names of all metrics, by Prometheus conventions: base units, `_total` on counters, no user ids as labels.
-//! Rooms count with the `metrics` macros under these names; what a name means is described here and nowhere else.
+//! Names and descriptions of all metrics, by Prometheus conventions: base units, `_total` on counters, no user ids as labels.
+//! Modules count with the `metrics` macros under these names.
 
 use metrics::Unit;
 use metrics_exporter_prometheus::{BuildError, Matcher, PrometheusBuilder, PrometheusRecorder};
@@ -7,7 +7,7 @@ use metrics_exporter_prometheus::{BuildError, Matcher, PrometheusBuilder, Promet
 pub const FRAMES_CAPTURED: &str = "oapwatch_frames_captured_total";
 pub const FRAMES_DROPPED: &str = "oapwatch_frames_dropped_total";
 pub const FRAMES_UNUSABLE: &str = "oapwatch_frames_unusable_total";
-/// The estimator's budget ended before it had tried everything.
+/// The time budget of the estimator ended before its search did.
 pub const FRAMES_CUT_SHORT: &str = "oapwatch_frames_cut_short_total";
 pub const LAST_GOOD_FRAME: &str = "oapwatch_last_good_frame_timestamp_seconds";
 /// Label `stage`: one of [`STAGES`].
@@ -21,7 +21,7 @@ pub const USERS_UNSEEN: &str = "oapwatch_users_unseen";
 pub const ALERTS_RAISED: &str = "oapwatch_alerts_raised_total";
 /// Label `kind`.
 pub const ALERTS_OPEN: &str = "oapwatch_alerts_open";
-/// Label `outcome`: accepted, late (kept as history), duplicate, refused (contradicts, too old, no room), malformed, shed (more than there is time for).
+/// Label `outcome`: accepted, late (kept as history), duplicate, refused (contradicts, too old, store full), malformed, shed (more than there is time for).
 pub const CLAIMS: &str = "oapwatch_claims_total";
 pub const CLAIMS_LAST: &str = "oapwatch_claims_last_timestamp_seconds";
 pub const CLAIMS_SKIPPED: &str = "oapwatch_claims_log_skipped_bytes_total";
@@ -55,11 +55,22 @@ pub const HTTP_REFUSED: &str = "oapwatch_http_refused_total";
 /// Label `protocol`: websocket, sse.
 pub const STREAM_CLIENTS: &str = "oapwatch_stream_clients";
 pub const STREAM_POSITIONS_MISSED: &str = "oapwatch_stream_positions_missed_total";
+/// The metrics that every Prometheus client exports of its process.
+pub const PROCESS_CPU: &str = "process_cpu_seconds_total";
+pub const PROCESS_RESIDENT: &str = "process_resident_memory_bytes";
+pub const PROCESS_VIRTUAL: &str = "process_virtual_memory_bytes";
+pub const PROCESS_FDS: &str = "process_open_fds";
+pub const PROCESS_MAX_FDS: &str = "process_max_fds";
+pub const PROCESS_THREADS: &str = "process_threads";
+pub const PROCESS_START: &str = "process_start_time_seconds";
 /// Always 1; label `version`.
 pub const BUILD_INFO: &str = "oapwatch_build_info";
 
 /// Values of the label `stage`, in the order of the chain.
 pub const STAGES: [&str; 4] = ["estimate", "monitor", "journal", "publish"];
+
+/// Values of the label `outcome` of [`CLAIMS`].
+const CLAIM_OUTCOMES: [&str; 6] = ["accepted", "late", "duplicate", "refused", "malformed", "shed"];
 
 const LATENCY_BUCKETS: [f64; 14] = [
     50e-6, 100e-6, 250e-6, 500e-6, 1e-3, 2.5e-3, 5e-3, 10e-3, 25e-3, 50e-3, 100e-3, 250e-3, 1.0, 5.0,
@@ -72,14 +83,14 @@ pub fn recorder() -> Result<PrometheusRecorder, BuildError> {
         .build_recorder())
 }
 
-/// Gives every metric its help text, and counters that must not be absent their zero.
+/// Registers the help text of every metric and the initial values of those that must not be absent.
 pub fn describe() {
     use metrics::{counter, describe_counter as c, describe_gauge as g, describe_histogram as h, gauge};
 
     c!(FRAMES_CAPTURED, "Frames the source delivered.");
     c!(
         FRAMES_DROPPED,
-        "Frames replaced by a newer one before they were looked at."
+        "Frames replaced by a newer one before they were processed."
     );
     c!(
         FRAMES_UNUSABLE,
@@ -87,12 +98,12 @@ pub fn describe() {
     );
     c!(
         FRAMES_CUT_SHORT,
-        "Frames whose best answer within the time budget was taken."
+        "Frames whose estimate was cut short by the time budget."
     );
     g!(
         LAST_GOOD_FRAME,
         Unit::Seconds,
-        "Unix time of the last frame that gave a result."
+        "Unix time of the last frame with a result; 0 before the first."
     );
     h!(STAGE_SECONDS, Unit::Seconds, "Time a frame spends in each stage.");
     h!(
@@ -100,10 +111,10 @@ pub fn describe() {
         Unit::Seconds,
         "Time from a frame's arrival to its published report."
     );
-    g!(EMITTERS, "Beams seen in the latest frame, by status.");
-    g!(USERS_UNSEEN, "Active users in view that no beam answers for.");
+    g!(EMITTERS, "Emitters in the latest frame, by status.");
+    g!(USERS_UNSEEN, "Active users in view without an emitter.");
     c!(ALERTS_RAISED, "Alerts raised, by kind.");
-    g!(ALERTS_OPEN, "Alerts not yet cleared, by kind.");
+    g!(ALERTS_OPEN, "Alerts that are not cleared, by kind.");
     c!(CLAIMS, "Claims received, by outcome.");
     c!(
         CLAIMS_SKIPPED,
@@ -113,23 +124,23 @@ pub fn describe() {
     g!(
         CLAIMS_LAST,
         Unit::Seconds,
-        "Unix time that the newest accepted claim was made for."
+        "Unix time stated by the newest accepted claim; 0 before the first."
     );
     c!(WEBHOOK_ATTEMPTS, "Webhook delivery attempts, by endpoint and outcome.");
-    g!(WEBHOOK_QUEUED, "Webhook deliveries that wait.");
+    g!(WEBHOOK_QUEUED, "Webhook deliveries in the queue.");
     g!(
         WEBHOOK_OLDEST,
         Unit::Seconds,
-        "Age of the oldest webhook delivery that waits."
+        "Age of the oldest webhook delivery in the queue."
     );
     g!(
         WEBHOOK_DEAD_LETTERS,
-        "Webhook deliveries given up on and kept for a replay."
+        "Webhook deliveries that failed for good and are kept for a replay."
     );
     g!(JOURNAL_BYTES, Unit::Bytes, "Size of the journal on disk.");
     g!(JOURNAL_WRITABLE, "1 while alerts reach the disk, else 0.");
-    g!(JOURNAL_UNWRITTEN, "Alert events in memory that the disk has not taken.");
-    c!(JOURNAL_LOST, "Alert events that found disk and memory full.");
+    g!(JOURNAL_UNWRITTEN, "Alert events in memory that are not on disk yet.");
+    c!(JOURNAL_LOST, "Alert events lost because disk and memory were full.");
     c!(JOURNAL_FAILURES, "Writes to the journal that failed.");
     h!(
         JOURNAL_WRITE_SECONDS,
@@ -141,30 +152,98 @@ pub fn describe() {
         RECORDER_DROPPED,
         "Frames and evidence not recorded because the disk could not keep up."
     );
-    c!(RECORDER_ERRORS, "Recordings that failed: disk full, folder gone.");
+    c!(
+        RECORDER_ERRORS,
+        "Writes of the recorder that failed, such as on a full disk."
+    );
     c!(SOURCE_OPENED, "Times the camera was opened.");
-    c!(SOURCE_FRAMES_LOST, "Frames the driver lost before we saw them.");
+    c!(SOURCE_FRAMES_LOST, "Frames lost by the driver.");
     c!(SOURCE_FAULTS, "Faults of the camera, by kind.");
     c!(HTTP_REQUESTS, "Requests answered, by method, route and status.");
     h!(HTTP_SECONDS, Unit::Seconds, "Time to answer a request, by route.");
     g!(HTTP_CONNECTIONS, "Open connections.");
-    c!(HTTP_REFUSED, "Connections and requests turned away, by reason.");
+    c!(HTTP_REFUSED, "Connections and requests refused, by reason.");
     g!(STREAM_CLIENTS, "Open streams, by protocol.");
-    c!(STREAM_POSITIONS_MISSED, "Position messages that slow readers lost.");
+    c!(STREAM_POSITIONS_MISSED, "Position messages dropped for slow readers.");
+    c!(
+        PROCESS_CPU,
+        Unit::Seconds,
+        "User and system time of the process, whole seconds."
+    );
+    g!(PROCESS_RESIDENT, Unit::Bytes, "Resident memory of the process.");
+    g!(PROCESS_VIRTUAL, Unit::Bytes, "Virtual memory of the process.");
+    g!(PROCESS_FDS, "Open file descriptors of the process.");
+    g!(PROCESS_MAX_FDS, "Most file descriptors that the process may open.");
+    g!(PROCESS_THREADS, "Threads of the process.");
+    g!(PROCESS_START, Unit::Seconds, "Unix time at which the daemon started.");
     g!(BUILD_INFO, "The running version; always 1.");
 
     for name in [
         FRAMES_CAPTURED,
         FRAMES_DROPPED,
         FRAMES_UNUSABLE,
+        FRAMES_CUT_SHORT,
         CLAIMS_SKIPPED,
         STREAM_POSITIONS_MISSED,
         JOURNAL_FAILURES,
+        JOURNAL_LOST,
+        RECORDER_DROPPED,
+        RECORDER_ERRORS,
+        SOURCE_OPENED,
+        SOURCE_FRAMES_LOST,
     ] {
         counter!(name).increment(0);
     }
-    for outcome in ["accepted", "late", "duplicate", "refused", "malformed", "shed"] {
+    for outcome in CLAIM_OUTCOMES {
         counter!(CLAIMS, "outcome" => outcome).increment(0);
     }
+    // A rule on the age of these must fire also where the first never comes.
+    for name in [LAST_GOOD_FRAME, CLAIMS_LAST] {
+        gauge!(name).set(0.0);
+    }
     gauge!(BUILD_INFO, "version" => env!("CARGO_PKG_VERSION")).set(1.0);
+}
+
+#[cfg(test)]
+mod tests {
+    /// The names of metrics in a text.
+    fn names(text: &str) -> impl Iterator<Item = &str> {
+        let words = text.split(|c: char| !(c.is_ascii_alphanumeric() || c == '_'));
+        words.filter(|w| w.starts_with("oapwatch_") || w.starts_with("process_"))
+    }
+
+    #[test]
+    fn rules_and_dashboard_use_metrics_that_exist() {
+        let known: Vec<&str> = names(include_str!("metric.rs")).collect();
+        for (file, text) in [
+            ("prometheus-alerts.yml", include_str!("../deploy/prometheus-alerts.yml")),
+            (
+                "grafana-dashboard.json",
+                include_str!("../deploy/grafana-dashboard.json"),
+            ),
+        ] {
+            let used: Vec<&str> = names(text).collect();
+            assert!(used.len() > 5, "{file}");
+            for name in used {
+                assert!(known.contains(&name.trim_end_matches("_bucket")), "{file}: {name}");
+            }
+        }
+    }
+
+    #[test]
+    fn nothing_that_a_rule_needs_is_absent_at_the_start() {
+        let recorder = super::recorder().unwrap();
+        let handle = recorder.handle();
+        metrics::with_local_recorder(&recorder, super::describe);
+        let text = handle.render();
+        for line in [
+            "oapwatch_last_good_frame_timestamp_seconds 0",
+            "oapwatch_claims_last_timestamp_seconds 0",
+            "oapwatch_journal_events_lost_total 0",
+            "oapwatch_recorder_errors_total 0",
+            "oapwatch_claims_total{outcome=\"refused\"} 0",
+        ] {
+            assert!(text.lines().any(|l| l == line), "{line} is not in:\n{text}");
+        }
+    }
 }

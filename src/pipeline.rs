@@ -8,7 +8,7 @@ use crate::claims::{self, Claim, Store};
 use crate::config::Config;
 use crate::estimate::{self, Estimate, Estimator};
 use crate::frame::Frame;
-use crate::frames::SourceKind;
+use crate::frames::{self, SourceKind};
 use crate::monitor::{self, Monitor, Observation, Report};
 use crate::optics::Camera;
 
@@ -21,6 +21,8 @@ pub enum Error {
     Monitor(#[from] monitor::ConfigError),
     #[error(transparent)]
     Claims(#[from] claims::ConfigError),
+    #[error(transparent)]
+    Source(#[from] frames::Error),
 }
 
 /// Owns everything that one frame after another goes through.
@@ -51,7 +53,7 @@ impl Pipeline {
         let source = monitor::Source {
             kind: config.source.kind.name().to_owned(),
             file: file.map(|f| f.display().to_string()),
-            rate_hz: config.source.rate_hz,
+            rate_hz: config.source.frame_rate_hz()?,
         };
         Ok(Self {
             estimator: estimate::build(&config.estimator, camera)?,

@@ -1,4 +1,4 @@
-//! Reads TOML files and refuses values in them: an error names the file, the line or key, what was expected and what was found.
+//! Reads TOML files and checks their values; an error names the file, the line or key, what was expected and what was found.
 
 use std::fmt::Debug;
 use std::ops::RangeInclusive;
@@ -17,7 +17,7 @@ pub enum Error {
     },
 }
 
-/// The known key an unknown one was probably meant to be.
+/// The known key most similar to an unknown one.
 #[derive(Debug)]
 pub struct Nearest(Option<String>);
 
@@ -53,12 +53,12 @@ fn nearest_key(message: &str) -> Option<String> {
     nearest(wrong, names).map(str::to_owned)
 }
 
-/// The name most like `wrong` (Jaro and Winkler's similarity).
+/// The name most similar to `wrong` (Jaro–Winkler similarity).
 pub fn nearest<'a>(wrong: &str, names: impl Iterator<Item = &'a str>) -> Option<&'a str> {
     names.max_by(|a, b| strsim::jaro_winkler(wrong, a).total_cmp(&strsim::jaro_winkler(wrong, b)))
 }
 
-/// A value that a key must not have.
+/// A value outside the range of its key.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("{key}: expected {expected}, found {found}")]
 pub struct OutOfRange {
@@ -129,10 +129,18 @@ impl Key {
         self.check(value, value.iter().all(|v| v.is_finite()), "two finite numbers")
     }
 
-    /// `reason`: why the range ends where it does, for the message.
+    /// Checks `value` against a range; `reason` says why the range ends there, for the message.
     pub fn within(&self, value: f64, range: RangeInclusive<f64>, reason: &str) -> Result<f64, OutOfRange> {
-        let expected = format!("{:e} to {:e} ({reason})", range.start(), range.end());
+        let expected = format!("{} to {} ({reason})", plain(*range.start()), plain(*range.end()));
         self.check(value, range.contains(&value), &expected)
+    }
+}
+
+/// A number without an exponent where that is short.
+fn plain(value: f64) -> String {
+    match value == 0.0 || (1e-3..1e6).contains(&value.abs()) {
+        true => value.to_string(),
+        false => format!("{value:e}"),
     }
 }
 
@@ -154,7 +162,7 @@ mod tests {
         }
         assert_eq!(
             key.within(5.0, 0.5..=4.0, "walking").unwrap_err().expected,
-            "5e-1 to 4e0 (walking)"
+            "0.5 to 4 (walking)"
         );
     }
 

@@ -269,3 +269,33 @@ fn what_cannot_be_replayed_is_refused() {
     );
     assert!(Recorder::start(&Config::default()).unwrap().is_none());
 }
+
+#[test]
+fn recordings_and_evidence_are_their_owner_s_whatever_the_umask() {
+    use std::os::unix::fs::PermissionsExt;
+    let dir = tempfile::tempdir().unwrap();
+    let folder = dir.path().join("new/recordings");
+    let config = config(&folder);
+    let mut recorder = Recorder::start(&config).unwrap().unwrap();
+    let mut evidence = None;
+    for k in 0..5 {
+        let frame = frame(k);
+        recorder.frame(&frame, &[]).expect("taken");
+        if k == 2 {
+            evidence = recorder.evidence("alert-1", frame.time);
+        }
+    }
+    drop(recorder);
+    let evidence = evidence.expect("the evidence has a file");
+    let mode = |path: &Path| std::fs::metadata(path).unwrap().permissions().mode() & 0o777;
+    for made in [&folder, &folder.join("evidence"), &dir.path().join("new")] {
+        assert_eq!(mode(made), 0o700, "{}", made.display());
+    }
+    let ring = std::fs::read_dir(&folder).unwrap().map(|entry| entry.unwrap().path());
+    let mut files: Vec<_> = ring.filter(|path| path.is_file()).collect();
+    files.extend([evidence.to_path_buf(), evidence.with_extension("frames.ndjson")]);
+    assert!(files.len() >= 4, "{files:?}");
+    for file in files {
+        assert_eq!(mode(&file), 0o600, "{}", file.display());
+    }
+}

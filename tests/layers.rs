@@ -7,8 +7,12 @@ use std::path::{Path, PathBuf};
 /// Modules from the lowest up: each imports only from those before it.
 const LAYERS: &[&str] = &[
     "toml_file",
+    "hash",
+    "stats",
     "logging",
     "metric",
+    "hash",
+    "stats",
     "frame",
     "claim",
     "optics",
@@ -141,15 +145,19 @@ fn code(path: &Path) -> String {
     lines.collect::<Vec<_>>().join("\n")
 }
 
-/// Absolute paths that the `use` statements name, or only those that are handed on.
-fn used(source: &Source, only_public: bool) -> Vec<Module> {
+/// Absolute paths that the `use` statements name: those that hand names on (`pub use`), or those that do not.
+fn used(source: &Source, public: bool) -> Vec<Module> {
     let mut found = Vec::new();
     let mut rest = source.text.as_str();
     while let Some(at) = rest.find("use ") {
         let line = &rest[rest[..at].rfind('\n').map_or(0, |k| k + 1)..at];
         rest = &rest[at + "use ".len()..];
-        let is_public = line.trim_start().starts_with("pub");
-        if line.trim().is_empty() && !only_public || is_public {
+        let is_statement = if public {
+            line.starts_with("pub") && line.ends_with(' ')
+        } else {
+            line.trim().is_empty()
+        };
+        if is_statement {
             let end = rest.find(';').unwrap_or(rest.len());
             let tree = rest[..end].split_whitespace().collect::<Vec<_>>().join(" ");
             found.extend(expand(&tree).iter().filter_map(|path| absolute(&source.module, path)));
@@ -214,7 +222,8 @@ fn inline_paths(source: &Source) -> Vec<Module> {
         let before = &source.text[..at];
         let start = before.rfind(|c| !name(c)).map_or(0, |k| k + 1);
         let first = &before[start..];
-        let is_inner = before[..start].ends_with("::") || before[..start].ends_with("in ");
+        let line = &before[before.rfind('\n').map_or(0, |k| k + 1)..start];
+        let is_inner = ["::", "in ", "use "].iter().any(|end| line.ends_with(end));
         if is_inner || !(first == "crate" || defines(&source.text, first)) {
             continue;
         }

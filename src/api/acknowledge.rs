@@ -1,4 +1,4 @@
-//! `/v1/alerts/{id}/acknowledge`: an operator takes note of an alert, or takes that back.
+//! `/v1/alerts/{id}/acknowledge`: acknowledging an alert, and withdrawing that.
 
 use axum::body::Bytes;
 use axum::extract::State as Shared;
@@ -8,7 +8,7 @@ use axum::response::Response;
 use serde::Deserialize;
 use tokio::sync::oneshot;
 
-use super::audit::Caller;
+use super::client::Caller;
 use super::extract::Path;
 use super::problem::Problem;
 use super::state::{Acknowledged, Command, State};
@@ -71,7 +71,7 @@ fn note(headers: &HeaderMap, body: &[u8]) -> Result<Option<String>, Problem> {
     Ok(Some(note))
 }
 
-/// Says that somebody has taken note of an alert
+/// Acknowledges an alert
 ///
 /// The name of the caller's token and a note, if one is given, are kept in the alert. An alert that is acknowledged already
 /// stays as it is, unless there is a note: that takes the place of the one before, which the audit log keeps.
@@ -108,7 +108,7 @@ pub async fn acknowledge(
     Ok(response)
 }
 
-/// Takes an acknowledgement back: the alert is open again
+/// Withdraws an acknowledgement: the alert is open again
 ///
 /// The alert keeps the acknowledgement, with who withdrew it and when.
 #[utoipa::path(delete, path = "/v1/alerts/{id}/acknowledge", tag = "alerts",

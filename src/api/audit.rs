@@ -4,28 +4,17 @@ use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-use axum::extract::{MatchedPath, Request, State as Shared};
-use axum::http::StatusCode;
-use axum::response::Response;
+use axum::extract::{MatchedPath, Request};
 use jiff::Timestamp;
-use serde::{Deserialize, Serialize};
 
-use super::auth::Actor;
-use super::client::Client;
-use super::extract::{Query, within};
-use super::problem::Problem;
-use super::state::State;
-use super::{alerts, respond};
+use super::client::{Caller, Client};
 use crate::claim::escape_undisplayable;
-use crate::journal::{AuditAction, AuditEntry, AuditRecord, Journal};
+use crate::journal::{AuditAction, AuditEntry, Journal};
 
 /// Repetitions of one thing by one client share a row for this long: an access network posts claims many times a second.
 const WINDOW: Duration = Duration::from_secs(60);
 /// Things that may repeat at a time; what comes beyond them shares one row.
 const MOST_WINDOWS: usize = 512;
-
-const DEFAULT_LIMIT: usize = 100;
-const MAX_LIMIT: usize = 1000;
 
 /// Writes the audit log. Clones share it.
 #[derive(Clone)]
@@ -57,30 +46,6 @@ struct Tally {
     accepted: u64,
     refused: u64,
     detail: Option<String>,
-}
-
-/// Who sends a request, for the handlers that change something.
-#[derive(Clone, Debug)]
-pub struct Caller {
-    pub actor: Actor,
-    pub client: Client,
-}
-
-impl Caller {
-    pub fn name(&self) -> Option<String> {
-        self.actor.0.as_deref().map(str::to_owned)
-    }
-}
-
-impl<S: Send + Sync> axum::extract::FromRequestParts<S> for Caller {
-    type Rejection = std::convert::Infallible;
-
-    async fn from_request_parts(parts: &mut axum::http::request::Parts, _: &S) -> Result<Self, Self::Rejection> {
-        Ok(Self {
-            actor: parts.extensions.get::<Actor>().cloned().unwrap_or_default(),
-            client: parts.extensions.get::<Client>().copied().unwrap_or(Client::Unix),
-        })
-    }
 }
 
 impl Audit {
@@ -212,47 +177,4 @@ impl Audit {
             tracing::warn!("a row of the audit log is lost to the journal: too many wait for its disk");
         }
     }
-}
-
-#[derive(Debug, Deserialize, utoipa::IntoParams)]
-#[into_params(parameter_in = Query)]
-#[serde(deny_unknown_fields)]
-pub struct AuditQuery {
-    /// Rows on a page, 100 when left out
-    #[param(minimum = 1, maximum = 1000)]
-    limit: Option<usize>,
-    /// `next_before` of the page before
-    before: Option<u64>,
-}
-
-/// A page of the audit log.
-#[derive(Debug, Serialize, utoipa::ToSchema)]
-pub struct AuditPage {
-    /// Newest first.
-    records: Vec<AuditRecord>,
-    /// What to give as `before` for the next page; null on the last.
-    next_before: Option<u64>,
-}
-
-/// Who acknowledged alerts, posted claims, changed webhooks, or was refused
-///
-/// Needs a token with full access where tokens are asked for. Claims and refusals that repeat within a minute share a row.
-#[utoipa::path(get, path = "/v1/audit", tag = "monitor", params(AuditQuery),
-    responses(
-        (status = 200, description = "A page of the audit log", body = AuditPage),
-        (status = 400, description = "A parameter cannot be read", body = Problem, content_type = "application/problem+json"),
-        (status = 403, description = "The token may only look", body = Problem, content_type = "application/problem+json"),
-        (status = 503, description = "The journal cannot be read", body = Problem, content_type = "application/problem+json"),
-    ))]
-pub async fn list(Shared(state): Shared<State>, Query(query): Query<AuditQuery>) -> Result<Response, Problem> {
-    let limit = within("limit", query.limit.unwrap_or(DEFAULT_LIMIT), 1, MAX_LIMIT)?;
-    if let Some(found) = query.before.filter(|before| i64::try_from(*before).is_err()) {
-        let detail = format!("before: expected the id of a row, found {found}");
-        return Err(Problem::new(StatusCode::BAD_REQUEST, detail));
-    }
-    let mut records = alerts::read(&state, move |journal| journal.audit_log(query.before, limit + 1)).await?;
-    let has_more = records.len() > limit;
-    records.truncate(limit);
-    let next_before = records.last().filter(|_| has_more).map(|record| record.id);
-    Ok(respond::json(&AuditPage { records, next_before }))
 }

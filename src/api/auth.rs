@@ -16,7 +16,7 @@ use subtle::ConstantTimeEq;
 use tokio::sync::watch;
 
 use super::audit::Audit;
-use super::client::Client;
+use super::client::{Actor, Client};
 use super::config::Config;
 use super::problem::Problem;
 use crate::metric;
@@ -82,10 +82,6 @@ pub struct Tokens {
     /// Counts changes, for streams to ask again whether their token is still in force.
     changes: watch::Sender<u64>,
 }
-
-/// Who sends a request, by their token; inserted into every request that is let through.
-#[derive(Clone, Debug, Default)]
-pub struct Actor(pub Option<Arc<str>>);
 
 /// That a request's token is in force, for as long as it is.
 #[derive(Clone)]
@@ -372,6 +368,50 @@ mod tests {
             ("a:b:c", (Some("a"), "b:c")),
         ] {
             assert_eq!(split_name(line), expected, "{line}");
+        }
+    }
+
+    /// Collects what is logged.
+    #[derive(Clone, Default)]
+    struct Log(Arc<std::sync::Mutex<Vec<u8>>>);
+
+    impl io::Write for Log {
+        fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+            self.0.lock().expect("no panic").extend_from_slice(bytes);
+            Ok(bytes.len())
+        }
+
+        fn flush(&mut self) -> io::Result<()> {
+            Ok(())
+        }
+    }
+
+    fn logged(act: impl FnOnce()) -> String {
+        let log = Log::default();
+        let writer = log.clone();
+        let subscriber = tracing_subscriber::fmt().with_writer(move || writer.clone()).finish();
+        tracing::subscriber::with_default(subscriber, act);
+        let bytes = log.0.lock().expect("no panic").clone();
+        String::from_utf8(bytes).expect("text")
+    }
+
+    #[test]
+    fn a_key_that_others_can_read_is_warned_of() {
+        use std::os::unix::fs::PermissionsExt;
+        let dir = tempfile::tempdir().expect("a folder");
+        let tls = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/api/tls/first");
+        let key = dir.path().join("key.pem");
+        std::fs::copy(format!("{tls}.key.pem"), &key).expect("the key");
+        let config = Config {
+            tls_cert_file: Some(format!("{tls}.cert.pem").into()),
+            tls_key_file: Some(key.clone()),
+            ..Config::default()
+        };
+        for (mode, expected) in [(0o600, false), (0o640, true), (0o604, true)] {
+            std::fs::set_permissions(&key, std::fs::Permissions::from_mode(mode)).expect("its owner");
+            let log = logged(|| drop(crate::api::Server::new(config.clone()).expect("a server")));
+            let is_warned = log.contains("key.pem") && log.contains("lets other users read");
+            assert_eq!(is_warned, expected, "{mode:o}: {log}");
         }
     }
 }

@@ -5,10 +5,10 @@ use axum::extract::State as Shared;
 use axum::extract::rejection::BytesRejection;
 use axum::http::{HeaderMap, StatusCode, header};
 use axum::response::Response;
-use serde::Serialize;
 use tokio::sync::{mpsc, oneshot};
 
-use super::audit::Caller;
+use super::client::Caller;
+use super::intake::Intake;
 use super::problem::Problem;
 use super::respond;
 use super::state::{Command, State};
@@ -19,34 +19,6 @@ use crate::{claims, metric};
 const MAX_CLAIMS: usize = 20_000;
 /// A request with so many claims takes up as much of the queue to the monitor as one that has few.
 const CLAIMS_A_PLACE: usize = 500;
-/// Reasons listed in one answer; the count is exact beyond it.
-const MAX_REASONS: usize = 100;
-
-/// What became of the claims in a body.
-#[derive(Clone, Debug, Default, Serialize, utoipa::ToSchema)]
-pub struct Intake {
-    pub accepted: usize,
-    pub refused: usize,
-    /// Why claims were refused, the first hundred.
-    pub reasons: Vec<Refusal>,
-}
-
-/// One claim that was not taken.
-#[derive(Clone, Debug, Serialize, utoipa::ToSchema)]
-pub struct Refusal {
-    /// Line in the body, from 1.
-    pub line: usize,
-    pub reason: String,
-}
-
-impl Intake {
-    fn refuse(&mut self, line: usize, reason: String) {
-        self.refused += 1;
-        if self.reasons.len() < MAX_REASONS {
-            self.reasons.push(Refusal { line, reason });
-        }
-    }
-}
 
 pub(super) fn busy() -> Problem {
     Problem::later(

@@ -1,17 +1,17 @@
 //! Who sends a request: the other end of the connection or, behind a trusted proxy, whom the proxy names.
 
+use std::convert::Infallible;
 use std::fmt;
 use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
 
 use axum::extract::connect_info::{ConnectInfo, Connected};
-use axum::extract::{Request, State as Shared};
+use axum::extract::{FromRequestParts, Request, State as Shared};
 use axum::http::HeaderMap;
+use axum::http::request::Parts;
 use axum::middleware::Next;
 use axum::response::Response;
 use ipnet::IpNet;
-
-use super::config::{Config, ConfigError};
 
 /// The network address of a client.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
@@ -55,6 +55,40 @@ impl Connected<std::os::unix::net::SocketAddr> for Client {
     }
 }
 
+/// Who sends a request, by the name of their token; inserted into every request that is let through.
+#[derive(Clone, Debug, Default)]
+pub struct Actor(pub Option<Arc<str>>);
+
+/// Who sends a request, for the handlers that change something.
+#[derive(Clone, Debug)]
+pub struct Caller {
+    pub actor: Actor,
+    pub client: Client,
+}
+
+impl Caller {
+    /// The name of the caller's token, where it has one.
+    pub fn name(&self) -> Option<String> {
+        self.actor.0.as_deref().map(str::to_owned)
+    }
+}
+
+impl<S: Send + Sync> FromRequestParts<S> for Caller {
+    type Rejection = Infallible;
+
+    async fn from_request_parts(parts: &mut Parts, _: &S) -> Result<Self, Infallible> {
+        Ok(Self {
+            actor: parts.extensions.get::<Actor>().cloned().unwrap_or_default(),
+            client: parts.extensions.get::<Client>().copied().unwrap_or(Client::Unix),
+        })
+    }
+}
+
+/// An entry of `[api] trusted_proxies` that is no network.
+#[derive(Debug, thiserror::Error)]
+#[error("api.trusted_proxies: expected networks such as \"10.0.0.0/8\", addresses or \"unix\", found {0:?}")]
+pub struct NoNetwork(String);
+
 /// Proxies whose `X-Forwarded-For` is believed.
 #[derive(Clone, Debug, Default)]
 pub struct TrustedProxies {
@@ -64,16 +98,16 @@ pub struct TrustedProxies {
 
 impl TrustedProxies {
     /// Reads `[api] trusted_proxies`: networks such as `10.0.0.0/8`, single addresses, and `unix`.
-    pub fn new(config: &Config) -> Result<Self, ConfigError> {
+    pub fn new(networks: &[String]) -> Result<Self, NoNetwork> {
         let mut proxies = Self::default();
-        for found in &config.trusted_proxies {
+        for found in networks {
             if found == "unix" {
                 proxies.unix = true;
                 continue;
             }
             let single = || found.parse::<IpAddr>().ok().map(IpNet::from);
             let network = found.parse::<IpNet>().ok().or_else(single);
-            let network = network.ok_or_else(|| ConfigError::NoNetwork { found: found.clone() })?;
+            let network = network.ok_or_else(|| NoNetwork(found.clone()))?;
             proxies.networks.push(network);
         }
         Ok(proxies)
@@ -90,7 +124,7 @@ impl TrustedProxies {
     }
 
     /// The client behind `peer`. Each proxy appends the address it was called from, so the list is read from its end: the
-    /// first address that is not a trusted proxy's is the client, and what stands before it is the client's own word.
+    /// first address that is not a trusted proxy's is the client's, and what stands before it was written by the client.
     fn client_of(&self, peer: Client, headers: &HeaderMap) -> Client {
         let mut client = peer;
         let named: Vec<&str> = headers
@@ -140,11 +174,8 @@ mod tests {
     }
 
     fn trusting(networks: &[&str]) -> TrustedProxies {
-        let config = Config {
-            trusted_proxies: networks.iter().map(|n| (*n).to_owned()).collect(),
-            ..Config::default()
-        };
-        TrustedProxies::new(&config).expect("networks")
+        let networks: Vec<String> = networks.iter().map(|n| (*n).to_owned()).collect();
+        TrustedProxies::new(&networks).expect("networks")
     }
 
     fn headers(values: &[&'static str]) -> HeaderMap {
@@ -193,11 +224,7 @@ mod tests {
     #[test]
     fn what_is_no_network_is_refused() {
         for wrong in ["10.0.0.0/33", "proxy.example", "", "10.0.0"] {
-            let config = Config {
-                trusted_proxies: vec![wrong.into()],
-                ..Config::default()
-            };
-            let message = TrustedProxies::new(&config).expect_err(wrong).to_string();
+            let message = TrustedProxies::new(&[wrong.into()]).expect_err(wrong).to_string();
             assert!(message.contains("api.trusted_proxies"), "{message}");
         }
     }

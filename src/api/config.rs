@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
-use super::client::TrustedProxies;
+use super::client::{NoNetwork, TrustedProxies};
 use super::listener::Listen;
 
 /// `[api]`.
@@ -28,7 +28,7 @@ pub struct Config {
     pub allowed_hosts: Vec<String>,
     /// Proxies whose `X-Forwarded-For` names the client: networks, addresses, or `unix` for the socket.
     pub trusted_proxies: Vec<String>,
-    /// How long browsers are told to use TLS only (`Strict-Transport-Security`), s; 0 does not tell them. Needs TLS here.
+    /// `max-age` of `Strict-Transport-Security`, s: for this long browsers use TLS only. 0 sends no such header. Needs TLS here.
     pub hsts_max_age_s: u64,
     /// Connections open at a time, streams included; one client holds at most three times as many as are still free.
     pub max_connections: usize,
@@ -52,8 +52,8 @@ pub enum ConfigError {
         "api.hsts_max_age_s: expected 0 without api.tls_cert_file, since browsers take it over TLS only, found {found}"
     )]
     HstsWithoutTls { found: u64 },
-    #[error("api.trusted_proxies: expected networks such as \"10.0.0.0/8\", addresses or \"unix\", found {found:?}")]
-    NoNetwork { found: String },
+    #[error(transparent)]
+    NoNetwork(#[from] NoNetwork),
     #[error("api.{missing}: expected a file, since api.{given} is set; found nothing")]
     HalfTls { given: &'static str, missing: &'static str },
     #[error("api.{field}: expected {expected}, found {found}")]
@@ -86,8 +86,8 @@ impl Default for Config {
 }
 
 impl Config {
-    /// Patience with a client that is slow.
-    pub(super) fn patience(&self) -> Duration {
+    /// Time limit for a slow client.
+    pub(super) fn client_timeout(&self) -> Duration {
         Duration::from_secs_f64(self.client_timeout_s)
     }
 
@@ -106,7 +106,7 @@ impl Config {
                 found: self.hsts_max_age_s,
             });
         }
-        TrustedProxies::new(self)?;
+        TrustedProxies::new(&self.trusted_proxies)?;
         match (&self.tls_cert_file, &self.tls_key_file) {
             (Some(_), None) => {
                 return Err(ConfigError::HalfTls {
@@ -122,18 +122,18 @@ impl Config {
             }
             _ => {}
         }
-        if self.max_connections == 0 {
+        if !(1..=100_000).contains(&self.max_connections) {
             return Err(ConfigError::OutOfRange {
                 field: "max_connections",
-                expected: "at least 1",
-                found: 0.0,
+                expected: "1 to 100000 (a host has no more ports for one client)",
+                found: self.max_connections as f64,
             });
         }
-        if self.requests_per_second == 0 {
+        if !(1..=1_000_000).contains(&self.requests_per_second) {
             return Err(ConfigError::OutOfRange {
                 field: "requests_per_second",
-                expected: "at least 1",
-                found: 0.0,
+                expected: "1 to 1000000 (more than the API can answer)",
+                found: self.requests_per_second.into(),
             });
         }
         if !(0.1..=3600.0).contains(&self.client_timeout_s) {

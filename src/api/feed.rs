@@ -35,7 +35,7 @@ const CLAIMS_SHOWN: usize = 500;
 #[derive(Debug)]
 pub struct Published {
     pub seq: u64,
-    /// Counts snapshots, so that a reader can be told how many it missed.
+    /// Counts snapshots, from which the number that a reader missed follows.
     ordinal: u64,
     pub snapshot: Snapshot,
     body: OnceLock<String>,

@@ -1,8 +1,5 @@
 //! `/v1/frame.png`: the latest frame, drawn once for all viewers.
 
-use std::sync::Mutex;
-use std::time::{Duration, Instant};
-
 use axum::body::Bytes;
 use axum::extract::State as Shared;
 use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
@@ -10,13 +7,10 @@ use axum::response::{IntoResponse, Response};
 use serde::Deserialize;
 
 use super::extract::{Query, within};
-use super::feed::Published;
 use super::problem::Problem;
 use super::state::State;
 use super::{conditional, picture, positions};
 
-/// A picture is drawn anew at most this often, however many viewers ask.
-const REDRAW: Duration = Duration::from_millis(100);
 /// Side of the picture when no scale is asked for, at least.
 const DEFAULT_SIDE: usize = 512;
 pub(super) const MAX_SIDE: usize = 2048;
@@ -31,42 +25,6 @@ pub struct PictureQuery {
     scale: Option<usize>,
     /// Whether detections are drawn; true when left out
     detections: Option<bool>,
-}
-
-type Look = (usize, bool);
-
-/// Pictures of the latest frame, drawn once for all viewers.
-#[derive(Default)]
-pub struct Pictures(Mutex<Drawn>);
-
-#[derive(Default)]
-struct Drawn {
-    seq: u64,
-    at: Option<Instant>,
-    looks: Vec<(Look, Bytes)>,
-}
-
-impl Pictures {
-    fn get(&self, published: &Published, look: Look) -> Option<(u64, Bytes)> {
-        let drawn = self.0.lock().unwrap_or_else(|p| p.into_inner());
-        let fresh = drawn.seq == published.seq || drawn.at.is_some_and(|at| at.elapsed() < REDRAW);
-        let found = drawn.looks.iter().find(|(l, _)| *l == look).filter(|_| fresh)?;
-        Some((drawn.seq, found.1.clone()))
-    }
-
-    fn put(&self, seq: u64, look: Look, png: Bytes) {
-        let mut drawn = self.0.lock().unwrap_or_else(|p| p.into_inner());
-        if drawn.seq != seq {
-            *drawn = Drawn {
-                seq,
-                at: Some(Instant::now()),
-                looks: Vec::new(),
-            };
-        }
-        if drawn.looks.len() < 8 {
-            drawn.looks.push((look, png));
-        }
-    }
 }
 
 /// The latest frame as a picture, +x to the right and +y up, with its detections drawn

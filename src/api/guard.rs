@@ -69,8 +69,8 @@ fn host_name(authority: &str) -> &str {
     }
 }
 
-/// The host that a request is for. Programs on the way may take another of two hosts than we do, so that one of them must
-/// be the only one (RFC 9112, 3.2; RFC 9113, 8.3.1).
+/// The host that a request is for. Of two hosts a proxy may use another than this server, so exactly one is accepted (RFC 9112,
+/// 3.2; RFC 9113, 8.3.1).
 fn authority<'a>(version: Version, uri: &'a Uri, headers: &'a HeaderMap) -> Result<Option<&'a str>, &'static str> {
     let mut named = headers.get_all(header::HOST).iter();
     let host = match (named.next(), named.next()) {
@@ -148,8 +148,8 @@ impl Rates {
     }
 }
 
-/// Whether a supervisor asks whether we live. A probe that is turned away would have us restarted just when somebody floods
-/// us, and it costs next to nothing.
+/// Whether a path is a liveness or readiness probe. A probe that is refused would make a supervisor restart the daemon during a
+/// flood, and a probe costs almost nothing.
 fn is_probe(path: &str) -> bool {
     ["/healthz", "/readyz"].contains(&path)
 }

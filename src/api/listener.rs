@@ -119,7 +119,7 @@ impl Listener {
     }
 }
 
-/// The socket gets its mode before anybody can find it: under another name first.
+/// Binds under another name first, so that the socket has its mode before clients find it.
 fn bind_unix(path: &Path) -> io::Result<UnixListener> {
     match std::fs::symlink_metadata(path) {
         Ok(meta) if !meta.file_type().is_socket() => {

@@ -6,6 +6,7 @@
 mod acknowledge;
 mod alerts;
 mod audit;
+mod audit_log;
 mod auth;
 mod claims;
 mod client;
@@ -18,10 +19,12 @@ mod feed;
 mod frame;
 mod guard;
 mod history;
+mod intake;
 mod listener;
 mod openapi;
 mod page;
 mod picture;
+mod picture_cache;
 mod positions;
 mod probes;
 mod problem;
@@ -86,7 +89,7 @@ fn router(state: State, config: &Config, tokens: Arc<auth::Tokens>, proxies: Arc
         .layer(from_fn_with_state(proxies, client::identify))
         .layer(TimeoutLayer::with_status_code(
             StatusCode::REQUEST_TIMEOUT,
-            config.patience(),
+            config.client_timeout(),
         ))
         .layer(CatchPanicLayer::new())
         .layer(from_fn(problem::for_every_error))
@@ -104,7 +107,7 @@ fn router(state: State, config: &Config, tokens: Arc<auth::Tokens>, proxies: Arc
     routes.layer(from_fn(measure)).with_state(state)
 }
 
-/// Tells browsers to use TLS only (RFC 6797).
+/// Makes browsers use TLS only (RFC 6797).
 fn strict_transport(max_age_s: u64) -> SetResponseHeaderLayer<HeaderValue> {
     let value = HeaderValue::from_str(&format!("max-age={max_age_s}")).expect("digits");
     SetResponseHeaderLayer::overriding(header::STRICT_TRANSPORT_SECURITY, value)

@@ -9,7 +9,7 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::state::State;
-use super::{acknowledge, alerts, audit, claims, evidence, frame, positions, probes, sse, webhooks, websocket};
+use super::{acknowledge, alerts, audit_log, claims, evidence, frame, positions, probes, sse, webhooks, websocket};
 
 #[derive(OpenApi)]
 #[openapi(
@@ -55,7 +55,7 @@ pub fn router() -> (Router<State>, utoipa::openapi::OpenApi) {
         .routes(routes!(webhooks::dead_letters))
         .routes(routes!(webhooks::replay))
         .routes(routes!(webhooks::enable))
-        .routes(routes!(audit::list))
+        .routes(routes!(audit_log::list))
         .routes(routes!(probes::healthz))
         .routes(routes!(probes::readyz))
         .routes(routes!(probes::metrics))

@@ -26,14 +26,15 @@ use super::listener::Listener;
 use super::state::State;
 use crate::metric;
 
-/// Requests under way when the daemon stops have this long.
+/// Time that running requests get when the daemon stops.
 const SHUTDOWN_GRACE: Duration = Duration::from_secs(1);
 /// How often token files and certificates are read again: what was taken out of a file ends its streams within a second.
 const RELOAD_EVERY: Duration = Duration::from_millis(300);
 const MAX_HEADER_BYTES: usize = 32 << 10;
 /// An HTTP/2 client that answers no ping within the client timeout is cut off.
 const HTTP2_PING_EVERY: Duration = Duration::from_secs(15);
-/// Requests under way on one HTTP/2 connection: what a page needs, and few enough that connections remain the limit.
+/// Concurrent requests on one HTTP/2 connection: enough for the page, and few enough that the number of connections remains
+/// the limit.
 const HTTP2_STREAMS: u32 = 32;
 /// What an HTTP/2 connection begins with (RFC 9113, 3.4).
 const HTTP2_PREFACE: &[u8] = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n";
@@ -77,7 +78,7 @@ impl Server {
     pub fn new(config: Config) -> Result<Self, Error> {
         config.validate()?;
         let tokens = Arc::new(Tokens::load(&config)?);
-        let proxies = Arc::new(TrustedProxies::new(&config)?);
+        let proxies = Arc::new(TrustedProxies::new(&config.trusted_proxies).map_err(ConfigError::from)?);
         let tls = match (&config.tls_cert_file, &config.tls_key_file) {
             (Some(cert), Some(key)) => Some(Tls::load(cert.clone(), key.clone())?),
             _ => None,
@@ -114,7 +115,7 @@ impl Server {
         let audit = state.audit.clone();
         let app = super::router(state, &self.config, self.tokens.clone(), self.proxies.clone());
         let service = app.into_make_service_with_connect_info::<Client>();
-        let timeout = self.config.patience();
+        let timeout = self.config.client_timeout();
         let limits = Limits {
             connections: ConnectionQuota::new(self.config.max_connections),
             proxies: self.proxies.clone(),
@@ -158,7 +159,7 @@ impl Server {
     }
 }
 
-/// Stops a server when `shutdown` completes: streams are told, requests under way get a second.
+/// Stops a server when `shutdown` completes: streams are closed, running requests get a second.
 async fn stop_on<A: axum_server::Address>(
     shutdown: impl Future<Output = ()>,
     stopping: watch::Sender<bool>,
@@ -303,7 +304,7 @@ impl ClientStream for UnixStream {
     }
 }
 
-/// Turns connections away above a limit, before any handshake, and cuts those that stall.
+/// Refuses connections above a limit, before any handshake, and closes those that stall.
 #[derive(Clone)]
 struct Limited<A> {
     inner: A,

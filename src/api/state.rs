@@ -9,7 +9,7 @@ use tokio::sync::{mpsc, oneshot, watch};
 
 use super::audit::Audit;
 use super::feed::Feed;
-use super::frame::Pictures;
+use super::picture_cache::PictureCache;
 use crate::claim::Claim;
 use crate::frames::record;
 use crate::journal::Journal;
@@ -20,19 +20,19 @@ use crate::notify::Notifier;
 #[derive(Clone)]
 pub struct State {
     pub feed: Arc<Feed>,
-    /// To the compute thread. Full means overload: the client is told to come back.
+    /// To the compute thread. A full queue means overload: the client gets 503 with `Retry-After`.
     pub commands: mpsc::Sender<Command>,
     pub journal: Journal,
     pub metrics: PrometheusHandle,
     /// The model is loaded and the pipeline runs; `/readyz` asks for good frames besides.
     pub ready: Arc<AtomicBool>,
-    /// Webhook status and replay; none where no webhook is spoken of.
+    /// Webhook status and replay; none where no webhook is configured.
     pub(super) notifier: Option<Notifier>,
-    pub(super) pictures: Arc<Pictures>,
+    pub(super) pictures: Arc<PictureCache>,
     pub(super) audit: Audit,
     /// The recorder's folder for evidence, where frames are recorded.
     pub(super) evidence: Option<Arc<Path>>,
-    /// Turns true when the server stops, for streams to say goodbye.
+    /// Turns true when the server stops: streams then close.
     pub(super) stopping: watch::Sender<bool>,
 }
 

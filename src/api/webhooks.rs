@@ -5,7 +5,7 @@ use axum::http::StatusCode;
 use axum::response::Response;
 use serde::{Deserialize, Serialize};
 
-use super::audit::Caller;
+use super::client::Caller;
 use super::extract::{Path, Query};
 use super::problem::Problem;
 use super::respond;

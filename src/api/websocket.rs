@@ -20,7 +20,7 @@ use super::stream::{self, Reader};
 
 /// A ping is sent this often.
 const PING_EVERY: Duration = Duration::from_secs(15);
-/// A client that has not been heard of for this long is gone.
+/// A client from which nothing came for this long is disconnected.
 const SILENCE: Duration = Duration::from_secs(40);
 /// One message must have left within this time.
 const SEND_WITHIN: Duration = Duration::from_secs(20);

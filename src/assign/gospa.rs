@@ -1,3 +1,5 @@
+//! The GOSPA metric.
+
 use super::{Matching, assign};
 
 /// Generalised optimal sub-pattern assignment score of one frame, in its parts.
@@ -16,8 +18,8 @@ pub struct Gospa {
 }
 
 /// GOSPA of order 2 with α = 2 and cutoff `cutoff_m` between true and estimated positions, m (Rahmathullah,
-/// García-Fernández and Svensson, 2017, proposition 1): unlike OSPA it is not divided by the number of points, and falls
-/// apart into localisation error, missed and false.
+/// García-Fernández and Svensson, 2017, proposition 1): unlike OSPA it is not divided by the number of points, and it is
+/// the sum of localisation error, missed and false.
 pub fn gospa(truth: &[[f64; 2]], estimates: &[[f64; 2]], cutoff_m: f64) -> Gospa {
     let squared = |i: usize, j: usize| {
         let (t, e) = (truth[i], estimates[j]);
@@ -57,7 +59,7 @@ mod tests {
     }
 
     proptest::proptest! {
-        /// It is a metric: symmetric, and no detour is shorter.
+        /// It is a metric: symmetric, and the triangle inequality holds.
         #[test]
         fn is_a_metric(
             a in proptest::collection::vec(proptest::array::uniform2(-20.0f64..20.0), 0..5),

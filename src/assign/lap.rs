@@ -1,3 +1,5 @@
+//! The linear assignment problem with dummies.
+
 use pathfinding::prelude::{Matrix, kuhn_munkres_min};
 
 /// Costs are quantised to this many steps of `c_max`: `pathfinding` wants integers (it never ends on NaN or ∞).

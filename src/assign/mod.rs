@@ -1,4 +1,4 @@
-//! Floor 1: optimal assignment with dummies, and the scores that rest on it.
+//! Layer 1: optimal assignment with dummies, and the metrics based on it.
 
 mod gospa;
 mod lap;

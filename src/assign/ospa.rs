@@ -1,3 +1,5 @@
+//! The OSPA metric.
+
 use super::{Matching, assign};
 
 /// Optimal sub-pattern assignment score of one frame.

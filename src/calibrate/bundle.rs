@@ -4,42 +4,46 @@
 use faer::Mat;
 use rayon::prelude::*;
 
-use super::believe::{Displacement, displacements, excess_variance, median};
 use super::device::{DEVICE, Prior, device_of, set_device};
+use super::exposure::{Exposure, NormalEquations, PER_SPOT, ScaledCholesky, Spot};
 use super::maps;
-use super::shot::{Normal, PER_SPOT, Scaled, Shot, Spot};
 use super::sources::{add_missing, background_strength, drop_dark, solve_energies};
+use super::survey_residuals::{Displacement, displacements, excess_variance};
 use super::truth::Beacon;
 use crate::optics::{Camera, Distortion};
+use crate::stats::median;
 
-/// Mahalanobis distance past which a beacon's position is not believed.
-const REJECT: f64 = 5.0;
-/// A beacon is absent, and a source that nobody surveyed is modelled, below and above this share of the median energy.
-const NOTABLE: f64 = 0.15;
-/// Median over the frames of the background's χ² of three degrees of freedom from which one is modelled; 1 % exceed it by chance.
-const BACKGROUND: f64 = 11.3;
+/// Mahalanobis distance beyond which a surveyed position is rejected. A position error is Gaussian to about here: 4·10⁻⁶ of
+/// honest ones lie beyond (χ² with two degrees of freedom), while a swapped or mistyped one lies far beyond.
+const REJECT_SIGMAS: f64 = 5.0;
+/// Share of the median energy below which a spot is removed, and above which a residual is modelled as a source without a
+/// surveyed position.
+const SIGNIFICANT_SHARE: f64 = 0.15;
+/// Background χ² (three degrees of freedom, median over the frames) above which a background is modelled; 1 % of frames without
+/// one exceed it.
+const BACKGROUND_CHI2: f64 = 11.3;
 const MAX_ROUNDS: usize = 24;
 
-/// The fit's state.
+/// State of the bundle adjustment.
 pub struct Fit<'a> {
     pub camera: Camera,
-    pub shots: Vec<Shot>,
+    pub exposures: Vec<Exposure>,
     beacons: &'a [Beacon],
     /// Standard deviation of a surveyed position around its spot beyond what the pixel noise explains, squared,
     /// m² on the sensor.
-    pub tether_m2: f64,
+    pub survey_var_m2: f64,
     prior: Prior,
-    normals: Vec<Normal>,
+    normals: Vec<NormalEquations>,
 }
 
 impl<'a> Fit<'a> {
-    /// Sets up one shot a frame, with a spot wherever a beacon should be seen.
-    pub fn new(camera: Camera, mut shots: Vec<Shot>, beacons: &'a [Beacon]) -> Self {
-        for shot in &mut shots {
-            shot.spots = beacons
+    /// Places one spot for each beacon that the camera sees in its frame.
+    pub fn new(camera: Camera, mut exposures: Vec<Exposure>, beacons: &'a [Beacon]) -> Self {
+        for exposure in &mut exposures {
+            exposure.spots = beacons
                 .iter()
                 .enumerate()
-                .filter(|(_, b)| b.frame == shot.frame && b.ground_m.iter().all(|v| v.is_finite()))
+                .filter(|(_, b)| b.frame == exposure.frame && b.ground_m.iter().all(|v| v.is_finite()))
                 .filter(|(_, b)| camera.sees(b.ground_m))
                 .map(|(k, b)| {
                     let predicted_m = camera.to_sensor(b.ground_m);
@@ -48,7 +52,7 @@ impl<'a> Fit<'a> {
                         predicted_m,
                         sensor_m: predicted_m,
                         energy_j: 0.0,
-                        trusted: true,
+                        is_inlier: true,
                     }
                 })
                 .collect();
@@ -57,41 +61,44 @@ impl<'a> Fit<'a> {
         Self {
             prior: Prior::of(&camera),
             camera,
-            shots,
+            exposures,
             beacons,
-            tether_m2: reach * reach,
+            survey_var_m2: reach * reach,
             normals: Vec::new(),
         }
     }
 
-    /// Runs the whole fit. `progress` hears of each round: its number, the reduced χ² and the tether, m on the ground.
+    /// Runs the fit. `progress` is called after each round with its number, the reduced χ² and the standard deviation of the
+    /// survey, m on the ground.
     pub fn run(&mut self, progress: &mut dyn FnMut(usize, f64, f64)) {
         let camera = &self.camera;
-        self.shots.par_iter_mut().for_each(|shot| solve_energies(shot, camera));
-        self.fit_shots(12);
-        self.judge_background();
+        self.exposures
+            .par_iter_mut()
+            .for_each(|exposure| solve_energies(exposure, camera));
+        self.fit_exposures(12);
+        self.select_background();
         self.update_noise();
-        self.tidy_spots();
+        self.update_sources();
         let mut quiet = 0;
         for round in 0..MAX_ROUNDS {
-            let before = (device_of(&self.camera), self.camera.noise_std_j, self.tether_m2);
-            self.judge_beacons();
-            self.judge_shots();
+            let before = (device_of(&self.camera), self.camera.noise_std_j, self.survey_var_m2);
+            self.reject_outlying_beacons();
+            self.reject_unexplained_exposures();
             self.device_step();
             if round == 2 || round == 5 {
-                self.tidy_spots();
+                self.update_sources();
             }
             self.update_noise();
             if round >= 2 {
-                if let Some(maps) = maps::estimate(&self.camera, &self.shots) {
+                if let Some(maps) = maps::estimate(&self.camera, &self.exposures) {
                     self.camera.pixels = Some(std::sync::Arc::new(maps));
                 }
-                self.fit_shots(3);
+                self.fit_exposures(3);
             }
             progress(
                 round + 1,
                 self.reduced_chi2(),
-                self.tether_m2.sqrt() * self.camera.ground_scale(),
+                self.survey_var_m2.sqrt() * self.camera.ground_scale(),
             );
             quiet = if self.has_settled(before) && round >= 6 {
                 quiet + 1
@@ -102,22 +109,22 @@ impl<'a> Fit<'a> {
                 break;
             }
         }
-        self.judge_beacons();
+        self.reject_outlying_beacons();
     }
 
-    /// Median over the trusted frames.
+    /// Median reduced χ² of the inlier frames.
     pub fn reduced_chi2(&self) -> f64 {
         median(
-            self.shots
+            self.exposures
                 .iter()
-                .filter(|s| s.trusted)
+                .filter(|s| s.is_inlier)
                 .map(|s| s.reduced_chi2(&self.camera))
                 .collect(),
         )
         .unwrap_or(f64::NAN)
     }
 
-    fn has_settled(&self, (device, noise, tether): ([f64; DEVICE], f64, f64)) -> bool {
+    fn has_settled(&self, (device, noise, survey_var): ([f64; DEVICE], f64, f64)) -> bool {
         let r = self.camera.x.half_width();
         let now = device_of(&self.camera);
         let moved = (now[0] - device[0]).abs().max((now[1] - device[1]).abs());
@@ -133,33 +140,36 @@ impl<'a> Fit<'a> {
         moved.max(bent) < 100.0 * small
             && (now[8] - device[8]).abs() < 1e-4
             && (noise / self.camera.noise_std_j - 1.0).abs() < 0.01
-            && (tether / self.tether_m2 - 1.0).abs() < 0.1
+            && (survey_var / self.survey_var_m2 - 1.0).abs() < 0.1
     }
 
-    fn fit_shots(&mut self, steps: usize) {
-        let (camera, tether) = (&self.camera, self.tether_m2);
+    fn fit_exposures(&mut self, steps: usize) {
+        let (camera, survey_var) = (&self.camera, self.survey_var_m2);
         self.normals = self
-            .shots
+            .exposures
             .par_iter_mut()
-            .map(|shot| shot.fit(camera, tether, steps))
+            .map(|exposure| exposure.fit(camera, survey_var, steps))
             .collect();
     }
 
-    /// Total cost of the trusted frames.
+    /// Total cost of the inlier frames and the device prior.
     fn cost(&self) -> f64 {
-        let shots = self.shots.iter().filter(|s| s.trusted);
-        shots.map(|s| s.chi2 + s.tether_cost(self.tether_m2)).sum::<f64>() + self.prior.cost(&device_of(&self.camera))
+        let exposures = self.exposures.iter().filter(|s| s.is_inlier);
+        exposures
+            .map(|s| s.chi2 + s.survey_cost(self.survey_var_m2))
+            .sum::<f64>()
+            + self.prior.cost(&device_of(&self.camera))
     }
 
-    /// One accepted Gauss–Newton step of the device, nuisances eliminated; damped until the cost falls.
+    /// One Gauss–Newton step of the device parameters with the nuisances eliminated; the damping grows until the cost falls.
     fn device_step(&mut self) {
         let (mut s, mut g) = (Mat::<f64>::zeros(DEVICE, DEVICE), vec![0.0; DEVICE]);
         let parts: Vec<_> = self
-            .shots
+            .exposures
             .par_iter()
             .zip(&self.normals)
-            .filter(|(shot, _)| shot.trusted && !shot.spots.is_empty())
-            .filter_map(|(shot, normal)| self.eliminated(shot, normal))
+            .filter(|(exposure, _)| exposure.is_inlier && !exposure.spots.is_empty())
+            .filter_map(|(exposure, normal)| self.eliminated(exposure, normal))
             .collect();
         for (block, rhs) in parts {
             s += block;
@@ -173,39 +183,39 @@ impl<'a> Fit<'a> {
         let cost = self.cost();
         let mut damping = 0.0;
         for _ in 0..6 {
-            if let Some(solver) = Scaled::new(&s, damping) {
+            if let Some(solver) = ScaledCholesky::new(&s, damping) {
                 let step = solver.solve(&g);
-                let kept = (self.camera.clone(), self.shots.clone());
+                let kept = (self.camera.clone(), self.exposures.clone());
                 let moved: [f64; DEVICE] = std::array::from_fn(|k| device[k] + step[k]);
                 set_device(&mut self.camera, &moved);
                 self.predict();
-                self.fit_shots(4);
+                self.fit_exposures(4);
                 if self.cost() <= cost {
                     return;
                 }
-                (self.camera, self.shots) = kept;
+                (self.camera, self.exposures) = kept;
             }
             damping = if damping == 0.0 { 1e-3 } else { damping * 30.0 };
         }
-        self.fit_shots(1);
+        self.fit_exposures(1);
     }
 
-    /// Predicts every beacon's spot anew; the tether then pulls the spot along.
+    /// Updates the predicted position of every spot after a change of the device; the survey prior moves the spots with it.
     fn predict(&mut self) {
         let (camera, beacons) = (&self.camera, self.beacons);
-        for spot in self.shots.iter_mut().flat_map(|shot| &mut shot.spots) {
+        for spot in self.exposures.iter_mut().flat_map(|exposure| &mut exposure.spots) {
             if let Some(k) = spot.beacon {
                 spot.predicted_m = camera.to_sensor(beacons[k].ground_m);
             }
         }
     }
 
-    /// Schur complement of one frame: its share of the device's normal equations.
-    fn eliminated(&self, shot: &Shot, normal: &Normal) -> Option<(Mat<f64>, Vec<f64>)> {
-        let k = self.sensitivity(shot);
-        let local = shot.local_columns();
-        let (h, g_local) = shot.tethered(normal, self.tether_m2);
-        let solver = Scaled::new(&h, 0.0)?;
+    /// Schur complement of one frame: its contribution to the device's normal equations.
+    fn eliminated(&self, exposure: &Exposure, normal: &NormalEquations) -> Option<(Mat<f64>, Vec<f64>)> {
+        let k = self.sensitivity(exposure);
+        let local = exposure.local_columns();
+        let (h, g_local) = exposure.with_survey_prior(normal, self.survey_var_m2);
+        let solver = ScaledCholesky::new(&h, 0.0)?;
         let gk = &normal.gram * &k;
         let cross = Mat::from_fn(local.len(), DEVICE, |a, b| gk[(local[a], b)]);
         let mut block = k.transpose() * &gk;
@@ -220,12 +230,12 @@ impl<'a> Fit<'a> {
         Some((block, rhs))
     }
 
-    /// ∂(raw columns)/∂(device): where the device's parameters move the spots of a frame.
-    fn sensitivity(&self, shot: &Shot) -> Mat<f64> {
-        let rows = PER_SPOT * shot.spots.len() + shot.background.map_or(0, |b| b.len());
+    /// ∂(columns of the frame)/∂(device parameters).
+    fn sensitivity(&self, exposure: &Exposure) -> Mat<f64> {
+        let rows = PER_SPOT * exposure.spots.len() + exposure.background.map_or(0, |b| b.len());
         let mut k = Mat::<f64>::zeros(rows, DEVICE);
-        for (i, spot) in shot.spots.iter().enumerate() {
-            if let Some(beacon) = spot.beacon.filter(|_| spot.trusted) {
+        for (i, spot) in exposure.spots.iter().enumerate() {
+            if let Some(beacon) = spot.beacon.filter(|_| spot.is_inlier) {
                 let tangents = self.camera.tangents(self.beacons[beacon].ground_m);
                 let by = self
                     .camera
@@ -244,19 +254,19 @@ impl<'a> Fit<'a> {
         k
     }
 
-    /// Re-estimates the tether from how far the untethered spots lie from their beacons, and decides whom to believe.
-    fn judge_beacons(&mut self) {
+    /// Re-estimates the survey variance from the displacements and rejects outlying surveyed positions.
+    fn reject_outlying_beacons(&mut self) {
         let free: Vec<Vec<Option<Displacement>>> = self
-            .shots
+            .exposures
             .par_iter()
             .zip(&self.normals)
-            .map(|(shot, normal)| displacements(shot, normal))
+            .map(|(exposure, normal)| displacements(exposure, normal))
             .collect();
         let each = || {
-            self.shots
+            self.exposures
                 .iter()
                 .zip(&free)
-                .filter(|(s, _)| s.trusted)
+                .filter(|(s, _)| s.is_inlier)
                 .flat_map(|(_, f)| f.iter().flatten())
         };
         let axes: Vec<(f64, f64)> = each()
@@ -266,55 +276,62 @@ impl<'a> Fit<'a> {
             return;
         }
         let typical = median(axes.iter().map(|a| a.1).collect()).unwrap_or(0.0);
-        self.tether_m2 = excess_variance(&axes).max(0.01 * typical).max(1e-22);
-        let tether = self.tether_m2;
-        for (shot, free) in self.shots.iter_mut().zip(free) {
-            for (spot, d) in shot.spots.iter_mut().zip(free) {
-                spot.trusted = d.is_some_and(|d| d.mahalanobis2(tether) < REJECT * REJECT);
+        self.survey_var_m2 = excess_variance(&axes).max(0.01 * typical).max(1e-22);
+        let survey_var = self.survey_var_m2;
+        for (exposure, free) in self.exposures.iter_mut().zip(free) {
+            for (spot, d) in exposure.spots.iter_mut().zip(free) {
+                spot.is_inlier = d.is_some_and(|d| d.mahalanobis2(survey_var) < REJECT_SIGMAS * REJECT_SIGMAS);
             }
         }
     }
 
-    /// Leaves the background out of all frames unless most show one: under melted spots it costs accuracy.
-    fn judge_background(&mut self) {
-        let tether = self.tether_m2;
-        let strengths = self.shots.par_iter().zip(&self.normals);
-        let strengths = strengths.filter_map(|(shot, normal)| background_strength(shot, normal, tether));
-        if median(strengths.collect()).is_some_and(|s| s > BACKGROUND) {
+    /// Removes the background from the model unless it is significant in most frames: with overlapping spots it costs accuracy.
+    fn select_background(&mut self) {
+        let survey_var = self.survey_var_m2;
+        let strengths = self.exposures.par_iter().zip(&self.normals);
+        let strengths = strengths.filter_map(|(exposure, normal)| background_strength(exposure, normal, survey_var));
+        if median(strengths.collect()).is_some_and(|s| s > BACKGROUND_CHI2) {
             return;
         }
-        self.shots.iter_mut().for_each(|shot| shot.background = None);
-        self.fit_shots(4);
+        self.exposures
+            .iter_mut()
+            .for_each(|exposure| exposure.background = None);
+        self.fit_exposures(4);
     }
 
-    /// A frame that is explained far worse than most has something in it that the fit does not know.
-    fn judge_shots(&mut self) {
+    /// Excludes frames whose reduced χ² is over four times the median: they hold something that the model lacks.
+    fn reject_unexplained_exposures(&mut self) {
         let camera = &self.camera;
-        let Some(typical) = median(self.shots.iter().map(|s| s.reduced_chi2(camera)).collect()) else {
+        let Some(typical) = median(self.exposures.iter().map(|s| s.reduced_chi2(camera)).collect()) else {
             return;
         };
-        for shot in &mut self.shots {
-            shot.trusted = shot.reduced_chi2(camera) < 4.0 * typical.max(1.0);
+        for exposure in &mut self.exposures {
+            exposure.is_inlier = exposure.reduced_chi2(camera) < 4.0 * typical.max(1.0);
         }
     }
 
-    /// Drops spots without light and adds light without a spot, then fits again.
-    fn tidy_spots(&mut self) {
-        let energies: Vec<f64> = self.shots.iter().flat_map(|s| &s.spots).map(|s| s.energy_j).collect();
+    /// Removes spots without light, adds sources where the residual is significant, and refits.
+    fn update_sources(&mut self) {
+        let energies: Vec<f64> = self
+            .exposures
+            .iter()
+            .flat_map(|s| &s.spots)
+            .map(|s| s.energy_j)
+            .collect();
         let typical = median(energies).unwrap_or(0.0);
-        let (camera, tether) = (&self.camera, self.tether_m2);
-        self.shots
+        let (camera, survey_var) = (&self.camera, self.survey_var_m2);
+        self.exposures
             .par_iter_mut()
             .zip(&mut self.normals)
-            .for_each(|(shot, normal)| {
+            .for_each(|(exposure, normal)| {
                 for _ in 0..12 {
-                    let kept = shot.spots.len();
-                    drop_dark(shot, normal, tether, NOTABLE * typical);
-                    let added = add_missing(shot, camera, NOTABLE * typical);
-                    if shot.spots.len() == kept && !added {
+                    let kept = exposure.spots.len();
+                    drop_dark(exposure, normal, survey_var, SIGNIFICANT_SHARE * typical);
+                    let added = add_missing(exposure, camera, SIGNIFICANT_SHARE * typical);
+                    if exposure.spots.len() == kept && !added {
                         break;
                     }
-                    *normal = shot.fit(camera, tether, 6);
+                    *normal = exposure.fit(camera, survey_var, 6);
                 }
             });
     }
@@ -323,22 +340,22 @@ impl<'a> Fit<'a> {
         let camera = &self.camera;
         let n = camera.x.n * camera.y.n;
         let residuals: Vec<f64> = self
-            .shots
+            .exposures
             .par_iter()
-            .filter(|s| s.trusted)
-            .flat_map_iter(|shot| {
+            .filter(|s| s.is_inlier)
+            .flat_map_iter(|exposure| {
                 let mut r = vec![0.0; n];
-                shot.residual(camera, &mut r);
+                exposure.residual(camera, &mut r);
                 let used: Vec<f64> = r
                     .iter()
-                    .zip(shot.used(camera))
+                    .zip(exposure.used(camera))
                     .filter(|(_, u)| *u)
                     .map(|(r, _)| r.abs())
                     .collect();
                 used
             })
             .collect();
-        // Median of |r| of a Gaussian: 0.6745 σ.
+        // The median of |r| of a Gaussian is 0.6745 σ.
         if let Some(m) = median(residuals).filter(|m| *m > 0.0) {
             self.camera.noise_std_j = m / 0.674_489_75;
         }

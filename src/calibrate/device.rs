@@ -1,11 +1,12 @@
-//! The parameters of the device that all frames share, and what is believed of them beforehand.
+//! The device parameters that all frames share, and their prior.
 
 use crate::optics::{Camera, Distortion};
 
 /// Distortion, ln σ_eff, spot growth.
 pub(super) const DEVICE: usize = Distortion::PARAMETERS + 2;
 
-/// Gaussian prior of the device parameters: generous next to real lenses, there to keep what few beacons cannot tell.
+/// Gaussian prior of the device parameters: wide compared with real lenses, so that it decides only what few beacons leave
+/// undetermined.
 pub(super) struct Prior {
     pub mean: [f64; DEVICE],
     pub std: [f64; DEVICE],
@@ -43,7 +44,7 @@ impl Prior {
     }
 }
 
-/// The parameters as the fit has them.
+/// The device parameters of a camera, in the order of [`Prior`].
 pub(super) fn device_of(camera: &Camera) -> [f64; DEVICE] {
     let d = camera.distortion.parameters();
     std::array::from_fn(|k| match k {
@@ -53,6 +54,7 @@ pub(super) fn device_of(camera: &Camera) -> [f64; DEVICE] {
     })
 }
 
+/// Writes device parameters into a camera.
 pub(super) fn set_device(camera: &mut Camera, device: &[f64; DEVICE]) {
     camera.distortion = Distortion::from_parameters(std::array::from_fn(|k| device[k]));
     camera.spot_sigma_m = device[Distortion::PARAMETERS].exp();

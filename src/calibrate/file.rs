@@ -1,4 +1,4 @@
-//! The calibration file: TOML that a person can read, whole or not at all.
+//! Reads and writes the calibration file (TOML); a write replaces the whole file or nothing.
 
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
@@ -73,7 +73,7 @@ struct Pixels {
     bad: Vec<[usize; 2]>,
 }
 
-/// Reads a calibration file. Whether it fits a camera is for [`Calibration::applied_to`] to say.
+/// Reads a calibration file. [`Calibration::applied_to`] checks that it fits a camera.
 pub fn read(path: &Path) -> Result<Calibration, Error> {
     let text = std::fs::read_to_string(path).map_err(|source| Error::Io {
         path: path.to_owned(),
@@ -130,7 +130,7 @@ fn array(path: &Path, map: &'static str, rows: Vec<Vec<f64>>) -> Result<Array2<f
     Ok(Array2::from_shape_vec((ny, nx), rows.concat()).expect("every row has nx values"))
 }
 
-/// The file's text, opened by `remarks`, one comment a line.
+/// The text of the file, with `remarks` as comments at its head, one a line.
 pub fn render(calibration: &Calibration, remarks: &[String]) -> String {
     let mut out = String::new();
     for remark in remarks {
@@ -233,7 +233,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_written_is_read_back() {
+    fn a_written_file_reads_back_equal() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("c.toml");
         write(&path, &render(&calibration(), &["fitted in a test".to_owned()])).unwrap();

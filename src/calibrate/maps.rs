@@ -1,14 +1,15 @@
-//! Gain, dark level and bad pixels, from what the fitted spots leave behind.
+//! Gain, dark level and bad pixels, from the residuals of the fitted spots.
 
 use ndarray::Array2;
 
-use super::shot::Shot;
+use super::exposure::Exposure;
 use crate::optics::{Camera, PixelMaps};
+use crate::stats::median;
 
-/// Fewer frames than this say too little about any one pixel.
+/// Fewest frames that maps are estimated from.
 const MIN_FRAMES: usize = 10;
 
-/// Sums of one pixel over the frames, with m what an ideal pixel would read and z what this one read beyond that.
+/// Sums of one pixel over the frames: m is the expected value of an ideal pixel, z the recorded value minus m.
 #[derive(Clone, Copy, Default)]
 struct Sums {
     n: f64,
@@ -21,19 +22,19 @@ struct Sums {
 
 /// Estimates the maps as the posterior mean of z = (g − 1)·m + d under Gaussian scatter of g around 1 and d around 0.
 /// The two scatters are estimated too, by expectation-maximisation (empirical Bayes: Efron and Morris, 1973), so that
-/// pixels which saw little light stay near the array's mean. None when there are too few frames.
-pub fn estimate(camera: &Camera, shots: &[Shot]) -> Option<PixelMaps> {
-    let trusted: Vec<&Shot> = shots.iter().filter(|s| s.trusted).collect();
-    if trusted.len() < MIN_FRAMES {
+/// pixels with little light stay near the array's mean. None when there are too few frames.
+pub fn estimate(camera: &Camera, exposures: &[Exposure]) -> Option<PixelMaps> {
+    let is_inlier: Vec<&Exposure> = exposures.iter().filter(|s| s.is_inlier).collect();
+    if is_inlier.len() < MIN_FRAMES {
         return None;
     }
     let (ny, nx) = camera.shape();
     let mut sums = vec![Sums::default(); ny * nx];
     let mut ideal = vec![0.0; ny * nx];
-    for shot in &trusted {
-        shot.ideal(camera, &mut ideal);
-        for (p, sum) in sums.iter_mut().enumerate().filter(|(p, _)| shot.valid[*p]) {
-            let (m, z) = (ideal[p], shot.pixels[p] - ideal[p]);
+    for exposure in &is_inlier {
+        exposure.ideal(camera, &mut ideal);
+        for (p, sum) in sums.iter_mut().enumerate().filter(|(p, _)| exposure.valid[*p]) {
+            let (m, z) = (ideal[p], exposure.pixels[p] - ideal[p]);
             sum.n += 1.0;
             sum.m += m;
             sum.mm += m * m;
@@ -66,7 +67,7 @@ pub fn estimate(camera: &Camera, shots: &[Shot]) -> Option<PixelMaps> {
     let value = |p: usize, v: f64| if good(p) { v } else { 0.0 };
     let excess = Array2::from_shape_fn((ny, nx), |(y, x)| value(y * nx + x, fitted[y * nx + x].excess));
     let dark_j = Array2::from_shape_fn((ny, nx), |(y, x)| value(y * nx + x, fitted[y * nx + x].dark));
-    // The energies carry the mean gain.
+    // The mean gain is absorbed by the energies.
     let mean = excess.sum() / (0..sums.len()).filter(|&p| good(p)).count() as f64;
     let bad = Array2::from_shape_vec((ny, nx), bad).expect("one flag a pixel");
     let gain = excess
@@ -99,8 +100,8 @@ impl Posterior {
     }
 }
 
-/// A pixel is bad when no gain and dark level explain it as well as they explain the others, or when it plainly
-/// does not see the light that falls on it.
+/// A pixel is bad when its residual variance with its own gain and dark level is far above the median, or when its gain is far
+/// from 1 with a small uncertainty.
 fn find_bad(sums: &[Sums], noise2: f64) -> Vec<bool> {
     let free: Vec<Posterior> = sums
         .iter()
@@ -111,24 +112,22 @@ fn find_bad(sums: &[Sums], noise2: f64) -> Vec<bool> {
         .zip(&free)
         .map(|(s, f)| (s.zz - f.excess * s.zm - f.dark * s.z).max(0.0) / s.n.max(1.0))
         .collect();
-    let mut sorted: Vec<f64> = sums
+    let used: Vec<f64> = sums
         .iter()
         .zip(&left)
         .filter(|(s, _)| s.n > 0.0)
         .map(|(_, l)| *l)
         .collect();
-    if sorted.is_empty() {
+    let Some(typical) = median(used) else {
         return vec![true; sums.len()];
-    }
-    sorted.sort_by(f64::total_cmp);
-    let typical = sorted[sorted.len() / 2];
+    };
     sums.iter()
         .zip(free.iter().zip(&left))
         .map(|(s, (f, &left))| {
             let scatter = (2.0 / s.n.max(1.0)).sqrt();
-            let restless = left > typical * (4.0 + 12.0 * scatter);
-            let blind = f.excess_var < 0.01 && !(-0.5..1.0).contains(&f.excess);
-            s.n == 0.0 || restless || blind
+            let is_noisy = left > typical * (4.0 + 12.0 * scatter);
+            let is_insensitive = f.excess_var < 0.01 && !(-0.5..1.0).contains(&f.excess);
+            s.n == 0.0 || is_noisy || is_insensitive
         })
         .collect()
 }

@@ -1,49 +1,63 @@
-//! Floor 2: what a device is, from frames with known positions.
+//! Layer 2: fits the camera, the spot and the pixel maps to frames with known positions.
 
-mod believe;
 mod bundle;
+mod cross_validation;
 mod device;
+mod exposure;
 pub mod file;
-mod judge;
 mod maps;
-mod shot;
 mod sources;
+mod survey_residuals;
 pub mod truth;
 
 use ndarray::Array2;
 
 use crate::estimate::{self, Estimator};
 use crate::optics::{Calibration, CalibrationError, Camera};
-pub use judge::Score;
-use shot::Shot;
+pub use cross_validation::Score;
+use exposure::Exposure;
 use truth::Beacon;
 
-/// What a fit found.
+/// Result of a fit.
 #[derive(Clone, Debug)]
 pub struct Fitted {
     pub calibration: Calibration,
-    /// Median reduced χ² of the frames that took part.
+    /// Median reduced χ² of the inlier frames.
     pub reduced_chi2: f64,
-    /// Standard deviation per axis of the surveyed positions around their spots beyond the pixel noise, m on the ground.
+    /// Standard deviation per axis of the surveyed positions around their spots, in excess of the pixel noise, m on the ground.
     pub survey_std_m: f64,
-    /// Beacons whose positions took part.
-    pub believed: Vec<Beacon>,
-    /// Beacons whose positions did not: no light there, or too far from it.
+    /// Beacons whose positions were used.
+    pub accepted: Vec<Beacon>,
+    /// Beacons whose positions were rejected: no light there, or too far from it.
     pub rejected: Vec<Beacon>,
-    /// Frames that nothing explained.
+    /// Frames that the model does not explain.
     pub unexplained: Vec<usize>,
 }
 
-/// A calibration with what it was held to.
+/// A calibration with its cross-validation.
 #[derive(Clone, Debug)]
 pub struct Calibrated {
     /// Fitted to all frames.
     pub fitted: Fitted,
     pub frames: usize,
-    /// The camera as it was, on the held-out frames.
+    /// Score of the camera before calibration on the held-out frames.
     pub before: Score,
-    /// The camera as fitted to the other frames, on the held-out frames.
+    /// Score of the camera fitted to the other frames on the held-out frames.
     pub after: Score,
+}
+
+/// Factor on the noise that the estimator predicts, up to which a residual counts as noise: covariances are right to some ten
+/// per cent in median, and gains that no calibration removes add to them.
+const NOISE_ALLOWANCE: f64 = 2.0;
+
+impl Calibrated {
+    /// Median squared distance of the held-out positions from the emitters, in excess of the noise, where it is larger than what
+    /// the calibration gained, m². Such positions do not describe the frames: they are of another time, or of other frames.
+    pub fn unexplained_m2(&self) -> Option<f64> {
+        let excess = self.after.median_m2 - NOISE_ALLOWANCE * self.after.noise_median_m2;
+        let gained = self.before.median_m2 - self.after.median_m2;
+        (excess > gained.max(0.0)).then_some(excess)
+    }
 }
 
 /// Why there is no calibration.
@@ -57,7 +71,7 @@ pub enum Error {
     Unusable(#[from] CalibrationError),
 }
 
-/// How far a fit is.
+/// Progress of a fit.
 #[derive(Clone, Copy, Debug)]
 pub struct Progress {
     pub stage: &'static str,
@@ -66,12 +80,12 @@ pub struct Progress {
     pub survey_std_m: f64,
 }
 
-/// With fewer frames there is nothing to hold out.
+/// Fewest frames: cross-validation needs one of each five.
 const MIN_FRAMES: usize = 5;
 /// One frame in this many is held out.
 const HELD_OUT: usize = 5;
 
-/// Fits to four frames in five, judges on the fifth with the estimators that `build` makes, and fits again to all.
+/// Fits to four frames in five, scores the fifth with the estimators that `build` makes, and refits to all.
 pub fn calibrate(
     camera: &Camera,
     frames: &[(usize, &Array2<f64>)],
@@ -100,8 +114,8 @@ pub fn calibrate(
         report("fitting to four frames in five", round, chi2, std)
     });
     let trial = first.calibration.applied_to(camera)?;
-    let before = judge::score(&mut *build(camera)?, &held, beacons);
-    let after = judge::score(&mut *build(&trial)?, &held, beacons);
+    let before = cross_validation::score(&mut *build(camera)?, &held, beacons);
+    let after = cross_validation::score(&mut *build(&trial)?, &held, beacons);
     let fitted = fit(&trial, frames, beacons, &mut |round, chi2, std| {
         report("fitting to all frames", round, chi2, std)
     });
@@ -114,8 +128,7 @@ pub fn calibrate(
     })
 }
 
-/// Fits the device to frames of shape (Ny, Nx) in joules. `frames` pairs each frame with its number; `camera` is where
-/// the fit starts.
+/// Fits the device to frames of shape (Ny, Nx), J. `frames` pairs each frame with its number; the fit starts from `camera`.
 pub fn fit(
     camera: &Camera,
     frames: &[(usize, &Array2<f64>)],
@@ -123,42 +136,42 @@ pub fn fit(
     progress: &mut dyn FnMut(usize, f64, f64),
 ) -> Fitted {
     let saturated = camera.saturation_j.unwrap_or(f64::INFINITY);
-    let shots = frames
+    let exposures = frames
         .iter()
-        .map(|(frame, pixels)| Shot {
+        .map(|(frame, pixels)| Exposure {
             frame: *frame,
             pixels: pixels.iter().map(|v| if v.is_finite() { *v } else { 0.0 }).collect(),
             valid: pixels.iter().map(|v| v.is_finite() && *v < saturated).collect(),
             spots: Vec::new(),
             background: Some([0.0; 3]),
             chi2: 0.0,
-            trusted: true,
+            is_inlier: true,
         })
         .collect();
-    let mut fit = bundle::Fit::new(camera.clone(), shots, beacons);
+    let mut fit = bundle::Fit::new(camera.clone(), exposures, beacons);
     fit.run(progress);
-    let mut is_believed = vec![false; beacons.len()];
-    for shot in fit.shots.iter().filter(|s| s.trusted) {
-        for spot in shot.spots.iter().filter(|s| s.trusted) {
+    let mut is_accepted = vec![false; beacons.len()];
+    for exposure in fit.exposures.iter().filter(|s| s.is_inlier) {
+        for spot in exposure.spots.iter().filter(|s| s.is_inlier) {
             if let Some(k) = spot.beacon {
-                is_believed[k] = true;
+                is_accepted[k] = true;
             }
         }
     }
     let among = |wanted: bool| {
         let here = |b: &Beacon| frames.iter().any(|(f, _)| *f == b.frame);
-        let pairs = beacons.iter().zip(&is_believed);
+        let pairs = beacons.iter().zip(&is_accepted);
         pairs
-            .filter(|(b, believed)| **believed == wanted && here(b))
+            .filter(|(b, accepted)| **accepted == wanted && here(b))
             .map(|(b, _)| *b)
             .collect()
     };
     Fitted {
         calibration: Calibration::of(&fit.camera),
         reduced_chi2: fit.reduced_chi2(),
-        survey_std_m: fit.tether_m2.sqrt() * fit.camera.ground_scale(),
-        believed: among(true),
+        survey_std_m: fit.survey_var_m2.sqrt() * fit.camera.ground_scale(),
+        accepted: among(true),
         rejected: among(false),
-        unexplained: fit.shots.iter().filter(|s| !s.trusted).map(|s| s.frame).collect(),
+        unexplained: fit.exposures.iter().filter(|s| !s.is_inlier).map(|s| s.frame).collect(),
     }
 }

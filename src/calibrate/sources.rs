@@ -1,66 +1,71 @@
-//! Which sources a frame holds, and how bright they are.
+//! The sources of a frame and their energies.
 
 use faer::Mat;
 
-use super::shot::{Normal, PER_SPOT, Scaled, Shot, Spot};
+use super::exposure::{Exposure, NormalEquations, PER_SPOT, ScaledCholesky, Spot};
 use crate::optics::{Camera, psf};
 
-/// Standard deviations of the residual that light without a spot must reach.
-const SIGNIFICANT: f64 = 12.0;
+/// Matched-filter significance, in standard deviations, above which a residual becomes a source. Trades weak sources missed
+/// against false ones, which would absorb light of a true one.
+const DETECTION_SIGMAS: f64 = 12.0;
 
-/// Energies and background with the positions held where they are: a linear problem.
-pub(super) fn solve_energies(shot: &mut Shot, camera: &Camera) {
-    let n = shot.spots.len();
-    let normal = shot.normal(camera);
+/// Solves for energies and background with positions fixed: a linear problem.
+pub(super) fn solve_energies(exposure: &mut Exposure, camera: &Camera) {
+    let n = exposure.spots.len();
+    let normal = exposure.normal(camera);
     let linear: Vec<usize> = (0..n)
         .map(|i| PER_SPOT * i + 2)
         .chain(PER_SPOT * n..normal.rhs.len())
         .collect();
     let h = Mat::from_fn(linear.len(), linear.len(), |a, b| normal.gram[(linear[a], linear[b])]);
     let g: Vec<f64> = linear.iter().map(|&c| normal.rhs[c]).collect();
-    if let Some(solution) = Scaled::new(&h, 1e-9).map(|s| s.solve(&g)) {
-        for (spot, e) in shot.spots.iter_mut().zip(&solution) {
+    if let Some(solution) = ScaledCholesky::new(&h, 1e-9).map(|s| s.solve(&g)) {
+        for (spot, e) in exposure.spots.iter_mut().zip(&solution) {
             spot.energy_j = *e;
         }
-        if let Some(background) = &mut shot.background {
+        if let Some(background) = &mut exposure.background {
             background.copy_from_slice(&solution[n..]);
         }
     }
 }
 
-/// χ² of a frame's background against none, everything else of the frame fitted with it.
-pub(super) fn background_strength(shot: &Shot, normal: &Normal, tether_m2: f64) -> Option<f64> {
-    let background = shot.background?;
-    let (h, _) = shot.tethered(normal, tether_m2);
-    let inverse = Scaled::new(&h, 1e-12)?.solve_many(&Mat::identity(h.nrows(), h.nrows()));
-    let first = 3 * shot.spots.len();
+/// χ² of the background against none, marginal over the other unknowns of the frame.
+pub(super) fn background_strength(exposure: &Exposure, normal: &NormalEquations, survey_var_m2: f64) -> Option<f64> {
+    let background = exposure.background?;
+    let (h, _) = exposure.with_survey_prior(normal, survey_var_m2);
+    let inverse = ScaledCholesky::new(&h, 1e-12)?.solve_many(&Mat::identity(h.nrows(), h.nrows()));
+    let first = 3 * exposure.spots.len();
     let covariance = Mat::from_fn(background.len(), background.len(), |a, b| {
         inverse[(first + a, first + b)]
     });
-    let weighted = Scaled::new(&covariance, 0.0)?.solve(&background);
+    let weighted = ScaledCholesky::new(&covariance, 0.0)?.solve(&background);
     Some(background.iter().zip(weighted).map(|(b, w)| b * w).sum())
 }
 
-/// Drops the spots that surely have less energy than `least_j`: two that overlap may share theirs out at will.
-pub(super) fn drop_dark(shot: &mut Shot, normal: &Normal, tether_m2: f64, least_j: f64) {
-    let (h, _) = shot.tethered(normal, tether_m2);
-    let Some(solver) = Scaled::new(&h, 1e-12) else { return };
+/// Removes spots whose energy plus three standard deviations is below `least_j`. The standard deviation is large for two that
+/// overlap, whose energies are determined only in sum.
+pub(super) fn drop_dark(exposure: &mut Exposure, normal: &NormalEquations, survey_var_m2: f64, least_j: f64) {
+    let (h, _) = exposure.with_survey_prior(normal, survey_var_m2);
+    let Some(solver) = ScaledCholesky::new(&h, 1e-12) else {
+        return;
+    };
     let inverse = solver.solve_many(&Mat::identity(h.nrows(), h.nrows()));
     let mut i = 0;
-    shot.spots.retain(|spot| {
+    exposure.spots.retain(|spot| {
         let std = inverse[(3 * i + 2, 3 * i + 2)].max(0.0).sqrt();
         i += 1;
         spot.energy_j + 3.0 * std > least_j
     });
 }
 
-/// Puts a spot without a beacon on the strongest light that the residual holds, if it is worth `least_j`.
-pub(super) fn add_missing(shot: &mut Shot, camera: &Camera, least_j: f64) -> bool {
+/// Adds a spot without a beacon at the strongest peak of the matched-filtered residual, if its energy is at least `least_j`.
+/// Returns whether one was added.
+pub(super) fn add_missing(exposure: &mut Exposure, camera: &Camera, least_j: f64) -> bool {
     let (ny, nx) = camera.shape();
     let mut residual = vec![0.0; ny * nx];
-    shot.residual(camera, &mut residual);
+    exposure.residual(camera, &mut residual);
     let sigma = camera.spot_sigma_m;
-    // Matched filter, one axis after the other: kernels centred on each pixel.
+    // Separable matched filter with kernels centred on each pixel.
     let kernels = |axis: &crate::optics::Axis| -> Vec<Vec<f64>> {
         (0..axis.n)
             .map(|k| {
@@ -93,15 +98,15 @@ pub(super) fn add_missing(shot: &mut Shot, camera: &Camera, least_j: f64) -> boo
         return false;
     };
     let apart = |s: &Spot| (s.sensor_m[0] - sensor_m[0]).hypot(s.sensor_m[1] - sensor_m[1]) > 1.5 * sigma;
-    if strength < SIGNIFICANT * camera.noise_std_j || energy_j < least_j || !shot.spots.iter().all(apart) {
+    if strength < DETECTION_SIGMAS * camera.noise_std_j || energy_j < least_j || !exposure.spots.iter().all(apart) {
         return false;
     }
-    shot.spots.push(Spot {
+    exposure.spots.push(Spot {
         beacon: None,
         predicted_m: sensor_m,
         sensor_m,
         energy_j,
-        trusted: false,
+        is_inlier: false,
     });
     true
 }

@@ -1,15 +1,15 @@
-//! Known positions, as a user would write them down: NDJSON, one object a frame.
+//! Reads known positions: NDJSON, one object a frame.
 //!
 //! Accepted: `{"frame":0,"emitters":[{"x_m":1,"y_m":2},…]}` (what `simulate` writes), `{"frame":0,"positions":[[1,2],…]}`,
 //! `{"frame":0,"xy_m":[[1,2],…]}`, `{"frame":0,"x_m":1,"y_m":2}` (one beacon a line, several lines a frame). Without
-//! `frame`, the n-th line belongs to the n-th frame. A frame may be left out, and so may be emitters nobody surveyed.
+//! `frame`, the n-th line belongs to the n-th frame. Frames and emitters without a surveyed position may be left out.
 
 use std::io::BufRead;
 use std::path::{Path, PathBuf};
 
 use serde_json::Value;
 
-/// A surveyed position: what somebody says, which may be wrong.
+/// A surveyed position. It may be wrong: the fit rejects outliers.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Beacon {
     /// Frame number in the recording.
@@ -43,7 +43,7 @@ pub enum Error {
     Empty { path: PathBuf, example: &'static str },
 }
 
-/// A field that is not what it should be; the reader adds file and line.
+/// A field with an unexpected value; the reader adds file and line.
 struct Wrong {
     field: &'static str,
     expected: &'static str,
@@ -111,6 +111,13 @@ fn parse_row(row: &Value, rows_before: usize, line: usize, out: &mut Vec<Beacon>
             .try_for_each(|(k, frame)| parse_row(frame, k, line, out));
     }
     let frame = match object.get("frame") {
+        None if object.contains_key("time") => {
+            return Err(wrong(
+                "frame",
+                "a frame number; a line with a time and none, such as a claim, belongs to no frame",
+                row,
+            ));
+        }
         None => rows_before,
         Some(value) => value
             .as_u64()
@@ -162,7 +169,7 @@ mod tests {
     }
 
     #[test]
-    fn every_form_a_user_would_write_is_read() {
+    fn every_accepted_form_is_read() {
         let all = [
             r#"{"frame":3,"emitters":[{"x_m":1,"y_m":2,"energy_j":0.1},{"x_m":3,"y_m":4}]}"#,
             r#"{"frame":3,"positions":[[1,2],[3,4]]}"#,
@@ -190,6 +197,8 @@ mod tests {
                 .unwrap_err()
                 .contains("line 1, frame")
         );
+        let claim = r#"{"time":"2026-01-01T00:00:00Z","user":"u-1","x_m":1,"y_m":2,"sigma_m":0.3,"state":"active"}"#;
+        assert!(parse(claim).unwrap_err().contains("line 1, frame"));
         assert!(parse("{\"frame\":0").unwrap_err().contains("line 1: not JSON"));
         assert!(parse("\n").unwrap_err().contains("no positions"));
     }

@@ -2,6 +2,7 @@ use jiff::{SignedDuration, Timestamp};
 use serde_json::Value;
 
 use super::{Claim, ClaimState, Config, config::Origin};
+use crate::claim::{escape_undisplayable, is_displayable_name};
 
 /// Longest user name accepted, in bytes.
 const LONGEST_USER: usize = 256;
@@ -78,7 +79,7 @@ pub fn parse_line(line: &[u8], config: &Config) -> Result<Claim, LineError> {
 }
 
 const TIME: &str = "an RFC 3339 time or seconds since 1970";
-const USER: &str = "a name of 1 to 256 characters";
+const USER: &str = "a name of 1 to 256 visible characters, without white space at its ends";
 const METRES: &str = "metres within 10000 km of the nadir";
 const LATITUDE: &str = "degrees between -90 and 90";
 const LONGITUDE: &str = "degrees between -180 and 180";
@@ -102,7 +103,7 @@ fn required<'a>(object: &'a Value, name: &str, expected: &'static str) -> Result
 }
 
 fn wrong(field: &str, expected: &'static str, found: &Value) -> LineError {
-    let mut found = found.to_string();
+    let mut found = escape_undisplayable(&found.to_string()).into_owned();
     if found.len() > 80 {
         let cut = (0..=77).rev().find(|&i| found.is_char_boundary(i)).unwrap_or(0);
         found.truncate(cut);
@@ -129,7 +130,7 @@ fn user(name: &str, value: &Value) -> Result<String, LineError> {
         Value::Number(n) => n.to_string(),
         _ => return Err(wrong(name, USER, value)),
     };
-    if user.is_empty() || user.chars().count() > LONGEST_USER || user.chars().any(char::is_control) {
+    if user.chars().count() > LONGEST_USER || !is_displayable_name(&user) {
         return Err(wrong(name, USER, value));
     }
     Ok(user)
@@ -210,6 +211,15 @@ mod tests {
             (r#"{"user":"u","x_m":1,"y_m":2}"#, "time"),
             (r#"{"time":"yesterday","user":"u","x_m":1,"y_m":2}"#, "time"),
             (r#"{"time":"2026-11-21T08:00:00Z","user":"","x_m":1,"y_m":2}"#, "user"),
+            (r#"{"time":"2026-11-21T08:00:00Z","user":" ","x_m":1,"y_m":2}"#, "user"),
+            (
+                "{\"time\":\"2026-11-21T08:00:00Z\",\"user\":\"u-1\u{200b}\",\"x_m\":1,\"y_m\":2}",
+                "user",
+            ),
+            (
+                "{\"time\":\"2026-11-21T08:00:00Z\",\"user\":\"u-\u{202e}1\",\"x_m\":1,\"y_m\":2}",
+                "user",
+            ),
             (r#"{"time":"2026-11-21T08:00:00Z","user":"u","x_m":"1","y_m":2}"#, "x_m"),
             (
                 r#"{"time":"2026-11-21T08:00:00Z","user":"u","x_m":1,"y_m":1e300}"#,
@@ -226,6 +236,10 @@ mod tests {
         ] {
             let message = parse(line).unwrap_err().to_string();
             assert!(message.contains(&format!("`{field}`")), "{line}: {message}");
+            assert!(
+                !message.contains(['\u{200b}', '\u{202e}']),
+                "what is not seen is spelled out: {message}"
+            );
         }
         assert!(matches!(parse("{\"time\""), Err(LineError::NotJson(_))));
         assert!(matches!(parse("[1]"), Err(LineError::Wrong { .. })));

@@ -1,4 +1,4 @@
-//! Floor 2: positions that the access network asserts. An attacker may write them; nothing below the
+//! Positions that the access network asserts. An attacker may write them; nothing below the
 //! monitor ever sees one.
 
 mod ahead;
@@ -8,6 +8,7 @@ mod follower;
 mod history;
 mod inbox;
 mod line;
+mod outcome;
 mod pressure;
 mod roster;
 mod store;
@@ -18,10 +19,11 @@ pub use follower::{Follower, LONGEST_LINE, Poll, Refused, read_log};
 pub use history::Standing;
 pub use inbox::{Batch, Inbox, MOST_NEW};
 pub use line::{LineError, parse_line};
+pub use outcome::{NO_ROOM, Outcome};
 pub use pressure::{Squeeze, WINDOW_S};
 pub use roster::Roster;
-pub use store::{Beam, Counts, NO_ROOM, Outcome, Store};
+pub use store::{Beam, Counts, Store};
 
-pub(crate) use store::seconds;
+pub(crate) use crate::claim::seconds;
 
 pub use crate::claim::{Claim, ClaimState};

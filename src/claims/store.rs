@@ -10,8 +10,9 @@ use serde::Serialize;
 use super::ahead::{Ahead, MOST_IN_A_REPLAY, MOST_LIVE};
 use super::candidates::Index;
 use super::history::{History, Standing};
+use super::outcome::Outcome;
 use super::pressure::{Dropped, Pressure, Squeeze};
-use super::{Claim, Config, Roster};
+use super::{Claim, Config, Roster, seconds};
 
 /// A user silent or ended for this long is forgotten first when room is needed, whoever they are.
 const FORGET_AFTER_S: f64 = 600.0;
@@ -59,40 +60,6 @@ pub struct Store {
     changes: Vec<(Arc<str>, bool)>,
 }
 
-/// What became of a claim.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Outcome {
-    /// The user's newest claim now.
-    Accepted,
-    /// Kept until its own time comes.
-    Ahead,
-    /// Older than the user's newest claim: kept as history only.
-    Late,
-    /// Older than the whole history.
-    TooLate,
-    /// The same claim again.
-    Duplicate,
-    /// The user already claimed another position for the same time; the first stands.
-    Conflicting,
-    /// No room for another user, or for another claim ahead of its time.
-    Full,
-}
-
-/// Why a claim was refused for want of room.
-pub const NO_ROOM: &str = "the store of claims is full";
-
-impl Outcome {
-    /// Why the claim was refused, where it was.
-    pub fn refusal(self) -> Option<&'static str> {
-        match self {
-            Self::Full => Some(NO_ROOM),
-            Self::Conflicting => Some("another position was claimed for this user and time"),
-            Self::TooLate => Some("older than all that is kept of this user"),
-            Self::Accepted | Self::Ahead | Self::Late | Self::Duplicate => None,
-        }
-    }
-}
-
 /// How many claims had each outcome.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct Counts {
@@ -138,11 +105,6 @@ enum Class {
     Known,
     /// A beam answered, last at this time.
     Answered(Timestamp),
-}
-
-/// Seconds from `from` to `to`.
-pub(crate) fn seconds(from: Timestamp, to: Timestamp) -> f64 {
-    (to.as_nanosecond() - from.as_nanosecond()) as f64 * 1e-9
 }
 
 impl User {

@@ -1,6 +1,8 @@
+//! Errors of commands, their messages and exit codes.
+
 use std::process::ExitCode;
 
-/// Why a command ended without success; decides the exit code.
+/// Why a command failed; decides the exit code.
 #[derive(Debug)]
 pub enum Failure {
     /// A config or scene that cannot be used: 64.
@@ -26,34 +28,46 @@ impl Failure {
         Self::Other(e.into())
     }
 
-    /// Prints the one message, with its causes, and gives the exit code. A reader that closed our stdout
-    /// (`oapwatch locate … | head`) is no failure.
+    fn error(&self) -> &anyhow::Error {
+        match self {
+            Self::Config(e) | Self::Input(e) | Self::Other(e) => e,
+        }
+    }
+
+    /// The error with its causes, in one line.
+    pub fn message(&self) -> String {
+        message(self.error())
+    }
+
+    /// Prints one message with its causes and returns the exit code. A reader that closed stdout (`oapwatch locate … | head`) is
+    /// not an error.
     pub fn report(self) -> ExitCode {
-        let (code, error) = match self {
-            Self::Config(e) => (64, e),
-            Self::Input(e) => (2, e),
-            Self::Other(e) => (1, e),
+        let code = match &self {
+            Self::Config(_) => 64,
+            Self::Input(_) => 2,
+            Self::Other(_) => 1,
         };
+        let error = self.error();
         let reader_left = error
             .downcast_ref::<std::io::Error>()
             .is_some_and(|e| e.kind() == std::io::ErrorKind::BrokenPipe);
         if reader_left {
             return ExitCode::SUCCESS;
         }
-        eprintln!("oapwatch: {}", message(&error));
+        eprintln!("oapwatch: {}", message(error));
         ExitCode::from(code)
     }
 }
 
-/// The error and its causes, each said once: many name their cause in their own words already.
+/// The error and its causes, without repeating a cause that a message already ends with.
 fn message(error: &anyhow::Error) -> String {
-    let mut told = error.to_string();
+    let mut message = error.to_string();
     for cause in error.chain().skip(1).map(ToString::to_string) {
-        if !told.ends_with(&cause) {
-            told = format!("{told}: {cause}");
+        if !message.ends_with(&cause) {
+            message = format!("{message}: {cause}");
         }
     }
-    told
+    message
 }
 
 #[cfg(test)]
@@ -61,7 +75,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_cause_is_said_once() {
+    fn a_cause_is_named_once() {
         let disk = || std::io::Error::other("disk full");
         let error = anyhow::Error::new(crate::frames::Error::Recording {
             path: "a.npy".into(),

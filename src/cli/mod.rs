@@ -1,4 +1,4 @@
-//! The command line: one file a command.
+//! The command line: one file per command.
 
 mod calibrate;
 mod check;
@@ -47,17 +47,17 @@ enum Command {
     Review(review::Args),
     /// Make frames, truth and claims from a scene
     Simulate(simulate::Args),
-    /// Say which effects a scene simulates, why, and what each costs
+    /// List the effects that a scene simulates, the reason and the cost of each
     Explain(explain::Args),
     /// Fit the device's calibration from frames with known positions
     Calibrate(calibrate::Args),
     /// Measure what accuracy costs in time
     Tradeoff(tradeoff::Args),
-    /// Write or compare golden answers: what every estimator and the monitor say of the same frames
+    /// Write or compare golden answers: results of every estimator and the monitor on the same frames
     Golden(golden::Args),
     /// Stream simulated frames with their truth to a network's trainer
     TrainingData(training_data::Args),
-    /// Try the program on hard cases and print what holds
+    /// Run a catalogue of hard cases and print which requirements hold
     Stability(stability::Args),
     /// Validate a config or scene without running it
     Check(check::Args),

@@ -1,4 +1,4 @@
-//! A scene's frame with its truth drawn in, to look at.
+//! Draws a frame of a scene with its truth as SVG.
 
 use std::path::Path;
 

@@ -1,3 +1,5 @@
+//! `oapwatch review`: runs the whole chain over a recording and prints the alert events.
+
 use std::io::Write;
 use std::iter::from_fn;
 use std::path::PathBuf;
@@ -13,14 +15,17 @@ use crate::monitor::AlertEvent;
 use crate::pipeline::Pipeline;
 
 #[derive(Debug, clap::Args)]
+#[command(
+    after_help = "Examples:\n  oapwatch simulate --scene config/scenes/eavesdropper.toml --frames 300 --out out\n  oapwatch review --config out/oapwatch.toml"
+)]
 pub struct Args {
     /// Config with a replay source
     #[arg(long)]
     config: PathBuf,
 }
 
-/// Runs the daemon's chain over a recording. A claim stands from its own time on, so that the same input gives the
-/// same bytes however fast it is read.
+/// Runs the daemon's chain over a recording. A claim takes effect at its own time, so that the same input gives the same bytes at
+/// any speed.
 pub fn run(args: Args) -> Outcome {
     let mut config = Config::load(&args.config).map_err(Failure::config)?;
     let camera = config.optics.camera().map_err(Failure::config)?;
@@ -89,10 +94,7 @@ fn claims_of(config: &claims::Config) -> Result<Vec<claims::Claim>, Failure> {
     }
     let unnamed = log.refused_count - log.refused.len() as u64;
     if unnamed > 0 {
-        eprintln!(
-            "oapwatch: {}: {unnamed} more lines are no claims; skipped",
-            path.display()
-        );
+        eprintln!("oapwatch: {}: {unnamed} more malformed lines skipped", path.display());
     }
     Ok(log.claims)
 }

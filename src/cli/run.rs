@@ -1,3 +1,5 @@
+//! `oapwatch run`: the daemon.
+
 use std::path::PathBuf;
 
 use super::{Failure, Outcome};
@@ -7,8 +9,11 @@ use crate::daemon::Daemon;
 use crate::logging;
 
 #[derive(Debug, clap::Args)]
+#[command(
+    after_help = "Examples:\n  oapwatch run\n  oapwatch run --config /etc/oapwatch/oapwatch.toml\n  oapwatch run --listen localhost:9000"
+)]
 pub struct Args {
-    /// Without one it runs on the built-in simulator
+    /// Config file; without one the daemon runs on the built-in simulator
     #[arg(long)]
     config: Option<PathBuf>,
     /// Address for the API instead of the one configured: 127.0.0.1:8787, localhost:8787 or unix:PATH
@@ -16,8 +21,8 @@ pub struct Args {
     listen: Option<Listen>,
 }
 
-/// Threads that serve the API, and those that wait for the journal on its behalf. A machine of many cores has no more of
-/// them: each costs memory, and the frames have threads of their own, and where it can be a core.
+/// Most threads that serve the API, and most that wait for the journal on its behalf. Bounded because each costs memory and the
+/// frames have threads of their own.
 const MOST_SERVING: usize = 4;
 const MOST_WAITING: usize = 32;
 
@@ -30,9 +35,9 @@ pub fn run(args: Args) -> Outcome {
         config.api.listen = listen;
     }
     let logging = logging::install(&config.log).map_err(Failure::config)?;
-    // The kernel would round a few megabytes in use up to tens, more of them the longer it runs.
+    // Huge pages would raise the resident memory from a few megabytes to tens, growing with time.
     if let Err(refused) = rustix::thread::disable_transparent_huge_pages(true) {
-        tracing::warn!(%refused, "transparent huge pages stay on: more memory than need be");
+        tracing::warn!(%refused, "transparent huge pages stay on: memory use will be higher");
     }
     let daemon = Daemon::new(config, args.config).map_err(Failure::Config)?;
     let cores = std::thread::available_parallelism().map_or(1, |n| n.get());

@@ -1,4 +1,4 @@
-//! A simulated recording on disk: frames.npy, truth.ndjson and claims.ndjson, telling of the same frames whatever happens.
+//! Writes a simulated recording: frames.npy, truth.ndjson and claims.ndjson, which hold the same frames even after an error.
 
 use std::fs::File;
 use std::io::{self, Seek, SeekFrom, Write};
@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use crate::frames::npy;
 use crate::scene::SimulatedFrame;
 
-/// Could not write a file of the recording.
+/// Why a file of the recording could not be written.
 #[derive(Debug, thiserror::Error)]
 pub enum WriteError {
     #[error("{path}: {reason}")]
@@ -16,8 +16,8 @@ pub enum WriteError {
     Npy(#[from] npy::Error),
 }
 
-/// Writes frames as they come. The lines of a batch go out before its frames: the header of frames.npy counts what is
-/// whole, and after a failed write the lines are cut back to that.
+/// Writes batches of frames. The lines of a batch are written before its frames; the header of frames.npy counts complete frames,
+/// and after a failed write the lines are truncated to them.
 #[derive(Debug)]
 pub struct Recording {
     frames: npy::Writer,
@@ -51,7 +51,7 @@ impl Recording {
         self.frames.frames()
     }
 
-    /// Appends frames. After an error the files hold those of them that still fitted.
+    /// Appends frames. After an error the files hold those that were written completely.
     pub fn append(&mut self, batch: &[SimulatedFrame]) -> Result<(), WriteError> {
         let before = self.frames();
         let done = self.append_parts(batch);
@@ -107,7 +107,7 @@ impl Lines {
         })
     }
 
-    /// Keeps what was there before the batch and the lines of the frames that were `kept`, as far as they were written.
+    /// Truncates the file to the lines before the batch and those of the frames that were `kept`.
     fn cut_to(&mut self, kept: &[SimulatedFrame], lines: impl Fn(&SimulatedFrame) -> Vec<u8>) -> io::Result<()> {
         self.length += kept.iter().map(|f| lines(f).len() as u64).sum::<u64>();
         self.file.set_len(self.length)?;

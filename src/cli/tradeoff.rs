@@ -1,11 +1,18 @@
+//! `oapwatch tradeoff`: measures accuracy against time.
+
+use std::io::Write;
 use std::path::PathBuf;
 
-use indicatif::{ProgressBar, ProgressStyle};
-
+use super::progress::Steps;
 use super::{Failure, Outcome};
-use crate::study::tradeoff::{Plan, Trained, run as study};
+use crate::estimate::Rules;
+use crate::study::ablation;
+use crate::study::tradeoff::{Oracle, Plan, Trained, run as study};
 
 #[derive(Debug, clap::Args)]
+#[command(
+    after_help = "Examples:\n  oapwatch tradeoff --quick --out out\n  oapwatch tradeoff --cells P8/60,E1/64 --rungs ml,map --frames 1000 --out out\n  oapwatch tradeoff --oracle --quick"
+)]
 pub struct Args {
     /// Folder for tradeoff.md, tradeoff.json and the pictures; measurements already there are kept
     #[arg(long, default_value = "tradeoff")]
@@ -13,24 +20,38 @@ pub struct Args {
     /// Under a minute, fewer frames
     #[arg(long)]
     quick: bool,
-    /// Frames a cell
+    /// Frames per cell
     #[arg(long)]
     frames: Option<usize>,
     /// Only these cells, as "P8/60,E1/64"
     #[arg(long, value_delimiter = ',')]
     cells: Vec<String>,
-    /// Only these rungs, as "pencil,ml"
+    /// Only these estimators, as "pencil,ml"
     #[arg(long, value_delimiter = ',')]
     rungs: Vec<String>,
+    /// What each of these rules of `ml` and `map` gains and costs, measured with and without it; `all` takes each in turn
+    #[arg(long, value_name = "RULE", value_delimiter = ',')]
+    without: Vec<String>,
     /// Folder of trained networks with their cards: `network` and `hybrid` are measured with each where it was trained
     #[arg(long)]
     networks: Option<PathBuf>,
     /// The same seed gives the same frames
     #[arg(long)]
     seed: Option<u64>,
+    /// Print instead how far `map` is from the most probable hypothesis: its search against one that starts from the truth
+    #[arg(long, conflicts_with_all = ["rungs", "networks"])]
+    oracle: bool,
 }
 
+/// Frames per cell and seed of `--oracle`, unless given.
+const ORACLE_FRAMES: usize = 1000;
+const ORACLE_QUICK_FRAMES: usize = 20;
+const ORACLE_SEED: u64 = 2;
+
 pub fn run(args: Args) -> Outcome {
+    if args.oracle {
+        return oracle(&args);
+    }
     let mut plan = if args.quick { Plan::quick() } else { Plan::full() };
     if let Some(frames) = args.frames {
         plan.frames = frames.max(1);
@@ -49,22 +70,78 @@ pub fn run(args: Args) -> Outcome {
     }
     if plan.is_empty() {
         return Err(Failure::input(anyhow::anyhow!(
-            "nothing to measure: no such cell or rung; a run without --cells and --rungs names them all"
+            "nothing to measure: no such cell or estimator; a run without --cells and --rungs names them all"
         )));
     }
-    let style =
-        ProgressStyle::with_template("{bar:40} {pos}/{len} {elapsed} (left {eta}) {msg}").map_err(Failure::other)?;
-    let bar = ProgressBar::new(plan.len() as u64).with_style(style);
+    if !args.without.is_empty() {
+        return ablate(&plan, &args);
+    }
+    let mut steps = Steps::new(plan.len() as u64);
     study(&plan, &args.out, &mut |row| {
-        bar.set_message(format!("{} {}", row.cell.name(), row.rung));
-        bar.inc(1);
+        steps.next(&format!("{} {}", row.cell.name(), row.rung));
     })
     .map_err(Failure::other)?;
-    bar.finish_and_clear();
-    print!(
-        "{}",
-        std::fs::read_to_string(args.out.join("tradeoff.md")).map_err(Failure::other)?
-    );
+    steps.finish();
+    let table = std::fs::read_to_string(args.out.join("tradeoff.md")).map_err(Failure::other)?;
+    std::io::stdout().write_all(table.as_bytes()).map_err(Failure::other)?;
     eprintln!("written to {}", args.out.display());
     Ok(())
+}
+
+/// Prints one row per cell as soon as it is measured.
+fn oracle(args: &Args) -> Outcome {
+    let mut cells = Oracle::cells();
+    if !args.cells.is_empty() {
+        cells.retain(|c| args.cells.contains(&c.name()));
+    }
+    if cells.is_empty() {
+        let names: Vec<String> = Oracle::cells().iter().map(|c| c.name()).collect();
+        return Err(Failure::input(anyhow::anyhow!(
+            "--cells: expected some of {}, found {}",
+            names.join(", "),
+            args.cells.join(", ")
+        )));
+    }
+    let frames = args
+        .frames
+        .map_or(if args.quick { ORACLE_QUICK_FRAMES } else { ORACLE_FRAMES }, |n| {
+            n.max(1)
+        });
+    let mut steps = Steps::new(cells.len() as u64);
+    let mut out = std::io::stdout().lock();
+    writeln!(out, "{}", Oracle::HEAD).map_err(Failure::other)?;
+    for cell in cells {
+        let row = Oracle::measure(cell, frames, args.seed.unwrap_or(ORACLE_SEED)).map_err(Failure::other)?;
+        steps.suspend(|| writeln!(out, "{row}")).map_err(Failure::other)?;
+        steps.next(&cell.name());
+    }
+    steps.finish();
+    Ok(())
+}
+
+/// Estimators with rules to leave out.
+const RULED: [&str; 2] = ["ml", "map"];
+
+fn ablate(plan: &Plan, args: &Args) -> Outcome {
+    let is_wanted = |rule: &&&str| args.without.iter().any(|name| name == "all" || name == **rule);
+    let without: Vec<&'static str> = Rules::NAMES.iter().filter(is_wanted).copied().collect();
+    let known = |name: &&String| *name == "all" || Rules::NAMES.contains(&name.as_str());
+    if let Some(unknown) = args.without.iter().find(|name| !known(name)) {
+        return Err(Failure::input(anyhow::anyhow!(
+            "--without: expected all or one of {}, found {unknown:?}",
+            Rules::NAMES.join(", ")
+        )));
+    }
+    let plan = ablation::Plan {
+        cells: plan.cells.clone(),
+        estimators: plan.rungs.iter().copied().filter(|name| RULED.contains(name)).collect(),
+        without,
+        frames: plan.frames,
+        seed: plan.seed,
+    };
+    let mut steps = Steps::new(plan.cells.len() as u64);
+    let effects = ablation::run(&plan, &mut |cell| steps.next(&cell.name())).map_err(Failure::other)?;
+    steps.finish();
+    let table = ablation::markdown(&effects, &plan);
+    std::io::stdout().write_all(table.as_bytes()).map_err(Failure::other)
 }

@@ -1,3 +1,5 @@
+//! `oapwatch training-data`: streams simulated frames with their truth.
+
 use std::io::{BufWriter, IsTerminal};
 use std::path::PathBuf;
 
@@ -6,6 +8,9 @@ use crate::scene::{Plan, Scene};
 use crate::study::samples;
 
 #[derive(Debug, clap::Args)]
+#[command(
+    after_help = "Examples:\n  oapwatch training-data --scene config/scenes/paper.toml --samples 1000 > samples.bin"
+)]
 pub struct Args {
     /// A scene file
     #[arg(long)]
@@ -13,7 +18,7 @@ pub struct Args {
     /// How many samples
     #[arg(long)]
     samples: u64,
-    /// Number of the first one: a stream can be taken up where it was left
+    /// Number of the first sample, to continue a stream
     #[arg(long, default_value_t = 0)]
     first: u64,
     /// The same seed gives the same samples

@@ -1,4 +1,4 @@
-//! The compute thread: alone owns the pipeline; takes the latest frame, then what came in beside it.
+//! The compute thread: owns the pipeline, takes the latest frame and handles commands between frames.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -25,24 +25,24 @@ use crate::notify;
 use crate::optics::Camera;
 use crate::pipeline::{Pipeline, Step};
 
-/// How long commands may wait while no frame comes.
+/// Longest wait of a command while no frame comes.
 const PATIENCE: Duration = Duration::from_millis(50);
-/// And claims by POST of which some are placed already.
+/// The same while posted claims wait to be placed.
 const POSTING: Duration = Duration::from_millis(1);
-/// Claims that wait for a recorder that takes nothing.
+/// Most claims kept for a recorder that accepts nothing.
 const MOST_UNRECORDED: usize = 100_000;
-/// A source that gives nothing at all, not even word of a failure, for this long is taken for dead.
+/// A source that gives neither a frame nor a failure for this long is reported as failed.
 const SILENCE: Duration = Duration::from_secs(2);
 
-/// What the thread works with.
+/// State of the compute thread.
 pub struct Compute {
     pub pipeline: Pipeline,
     pub capture: Capture,
     pub recorder: Option<Recorder>,
-    /// Claims of the log, which stand with the next frame: what a recording of them gives again.
+    /// Claims of the log that take effect with the next frame, so that a recording reproduces them.
     pub inbox: Inbox,
     pub posts: Posts,
-    /// Claims that the recorder has not got yet.
+    /// Claims that the recorder does not have yet.
     pub unrecorded: Vec<Claim>,
     pub commands: mpsc::Receiver<Command>,
     pub follower: Option<ClaimsLog>,
@@ -53,7 +53,7 @@ pub struct Compute {
     pub camera: Arc<Camera>,
     pub claims_log: Option<String>,
     pub source: String,
-    /// A recording's clock is its own; everything else runs on the wall's.
+    /// A replay runs on the clock of its recording, every other source on the wall clock.
     pub is_replay: bool,
     pub stop: Arc<AtomicBool>,
     pub ready: Arc<AtomicBool>,
@@ -61,9 +61,9 @@ pub struct Compute {
 }
 
 impl Compute {
-    /// Runs until told to stop.
+    /// Runs until `stop` is set.
     pub fn run(mut self) {
-        let mut heard = Instant::now();
+        let mut last_event = Instant::now();
         while !self.stop.load(Ordering::Relaxed) {
             self.follow_log();
             self.handle_commands();
@@ -72,8 +72,8 @@ impl Compute {
             let arrived = Instant::now();
             match captured.next {
                 Next::Frame(frame, claims) => {
-                    heard = arrived;
-                    // A live frame is as old as its capture; a recording's has waited for us to ask.
+                    last_event = arrived;
+                    // The latency of a live frame counts from its capture; a recording's frame has waited for this thread.
                     let since = if self.is_replay { arrived } else { captured.at };
                     self.take_claims(claims, frame.time);
                     self.handle_commands();
@@ -87,12 +87,12 @@ impl Compute {
                     reason,
                     claims,
                 } => {
-                    heard = arrived;
+                    last_event = arrived;
                     self.take_claims(claims, time);
                     self.unusable(index, time, reason, captured.file);
                 }
-                Next::Nothing if !self.is_replay && heard.elapsed() > SILENCE => {
-                    heard = arrived;
+                Next::Nothing if !self.is_replay && last_event.elapsed() > SILENCE => {
+                    last_event = arrived;
                     self.silence();
                 }
                 Next::Nothing => {}
@@ -103,7 +103,7 @@ impl Compute {
         self.outlet.close();
     }
 
-    /// Claims that came with a frame, and those of the log that it has time for.
+    /// Takes the claims that came with a frame and those of the log that it has time for.
     fn take_claims(&mut self, claims: Vec<Claim>, now: Timestamp) {
         let batch = self.inbox.take();
         metrics::counter!(metric::CLAIMS, "outcome" => "shed").increment(batch.shed.shed_new + batch.shed.shed_known);
@@ -117,9 +117,9 @@ impl Compute {
         self.pipeline.claim(claims, now);
     }
 
-    /// Lets alerts name the file that holds their frame: the recorder's, or the one being replayed.
+    /// Sets the file that alerts name as holding their frame: the recorder's, or the one being replayed.
     fn recorded(&mut self, recorded: Option<Taken>, replayed: Option<Arc<Path>>) {
-        // What the recorder could not take goes with the next frame, unless the disk hangs for good.
+        // Claims that the recorder could not accept go with the next frame, unless the disk never recovers.
         if recorded.is_some() || self.unrecorded.len() > MOST_UNRECORDED {
             self.unrecorded.clear();
         }
@@ -144,6 +144,9 @@ impl Compute {
         match &estimate {
             Ok(estimate) => {
                 metrics::counter!(metric::FRAMES_CUT_SHORT).increment(u64::from(estimate.is_cut_short));
+                if s.last_good.is_none() {
+                    tracing::info!(frame = frame.index, "the first usable frame was processed");
+                }
                 s.last_good = Some(frame.time);
                 s.fault = None;
                 s.source = SourceState::Running;
@@ -183,12 +186,17 @@ impl Compute {
         self.publish(report, None);
     }
 
-    /// The source does not even report a failure.
+    /// The source gives neither a frame nor a failure.
     fn silence(&mut self) {
         let index = self.state.counts.captured;
         let now = Timestamp::now();
         self.take_claims(Vec::new(), now);
-        self.unusable(index, now, "the source gives no sign of life".to_owned(), None);
+        self.unusable(
+            index,
+            now,
+            "the source gives neither frames nor errors".to_owned(),
+            None,
+        );
     }
 
     fn ended(&mut self) {
@@ -204,7 +212,7 @@ impl Compute {
             }
         }
         self.alive();
-        // The capture has nothing to wait for any more.
+        // The ended capture returns at once; the pause avoids a busy loop.
         std::thread::sleep(PATIENCE);
     }
 
@@ -222,10 +230,7 @@ impl Compute {
         let at = report.time;
         self.outlet.events(std::mem::take(&mut report.events), at);
         let status = self.status(&report);
-        let is_first = !self.ready.swap(true, Ordering::Relaxed);
-        if is_first {
-            tracing::info!(frame = report.frame, "the first frame is through");
-        }
+        self.ready.store(true, Ordering::Relaxed);
         let camera = self.camera.clone();
         let snapshot = Snapshot {
             report,
@@ -304,7 +309,7 @@ impl Compute {
         }
     }
 
-    /// The frames' clock: a recording's own, else the wall's.
+    /// The clock of the frames: a recording's own, else the wall clock.
     pub(super) fn now(&self) -> Timestamp {
         if self.is_replay {
             self.state.clock
@@ -314,7 +319,7 @@ impl Compute {
     }
 }
 
-/// The frames' clock before the first frame: nothing is late yet.
+/// The clock of the frames before the first frame, at which no claim is late.
 pub fn first_clock(is_replay: bool, start: Option<Timestamp>) -> Timestamp {
     match (is_replay, start) {
         (true, Some(start)) => start - SignedDuration::from_nanos(1),

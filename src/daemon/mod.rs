@@ -3,6 +3,7 @@
 mod claims_log;
 mod compute;
 mod intake;
+mod process;
 mod publish;
 mod reload;
 mod status;
@@ -32,13 +33,13 @@ use publish::Outlet;
 use status::State;
 use supervisor::Supervisor;
 
-/// Requests that may wait for the compute thread; more are told to come back.
+/// Most requests that wait for the compute thread; further ones are answered 503.
 const COMMANDS: usize = 64;
-/// How often the journal is held to its limits.
+/// Interval of journal maintenance (age and size limits).
 const MAINTENANCE: Duration = Duration::from_secs(3600);
-/// How often measurements are added up: until then each one is kept, and nobody may ever ask for the metrics.
+/// Interval of aggregating histogram samples: until then each sample is kept, also where no server asks for the metrics.
 const UPKEEP: Duration = Duration::from_secs(5);
-/// Deliveries under way when the daemon stops have this long.
+/// Time that deliveries under way have when the daemon stops.
 const LAST_DELIVERIES: Duration = Duration::from_millis(800);
 
 /// A daemon whose config has been checked and whose files have been opened; no port is bound yet.
@@ -52,6 +53,7 @@ pub struct Daemon {
     server: api::Server,
     endpoints: Vec<notify::Endpoint>,
     journal: Journal,
+    metrics: PrometheusHandle,
 }
 
 impl Daemon {
@@ -59,6 +61,16 @@ impl Daemon {
     pub fn new(config: Config, path: Option<PathBuf>) -> Result<Self> {
         let camera = config.camera()?;
         let pipeline = Pipeline::new(&config, &camera)?;
+        config.journal.validate()?;
+        // Before anything is opened, so that what is counted while opening is not lost.
+        let recorder = metric::recorder()?;
+        let metrics = recorder.handle();
+        // A second daemon in one process (a test) counts into the first one's recorder.
+        let _ = metrics::set_global_recorder(recorder);
+        metric::describe();
+        for warning in config.warnings(&camera) {
+            tracing::warn!("{warning}");
+        }
         let server = api::Server::new(config.api.clone())?;
         let endpoints = notify::load(&config.webhook)?;
         let source = frames::open(&config.source, &camera)?;
@@ -75,6 +87,7 @@ impl Daemon {
             server,
             endpoints,
             journal,
+            metrics,
         })
     }
 
@@ -82,12 +95,7 @@ impl Daemon {
     pub async fn run(mut self, logging: logging::Handle) -> Result<()> {
         let listen = &self.config.api.listen;
         let listener = api::Listener::bind(listen).with_context(|| format!("api.listen: cannot listen on {listen}"))?;
-        let recorder = metric::recorder()?;
-        let metrics = recorder.handle();
-        // A second daemon in one process (a test) counts into the first one's recorder.
-        let _ = metrics::set_global_recorder(recorder);
-        metric::describe();
-
+        let metrics = self.metrics.clone();
         let started_at = Timestamp::now();
         let open = self.journal.open_alerts()?;
         let known: Vec<_> = open.iter().map(|a| (a.id.clone(), a.kind)).collect();
@@ -167,7 +175,7 @@ impl Daemon {
         };
         let mut compute = tokio::task::spawn_blocking(move || compute.run());
         let mut serving = tokio::spawn(self.server.serve(listener, state, stops()));
-        let upkeep = tokio::spawn(maintain(self.journal.clone(), metrics));
+        let upkeep = tokio::spawn(maintain(self.journal.clone(), metrics, started_at));
 
         let outcome = tokio::select! {
             signal = reload::until_stopped(&self.config, self.path.as_deref(), &logging) => signal,
@@ -182,7 +190,7 @@ impl Daemon {
             },
         };
 
-        // First the intake, then those who live on it; the journal, dropped last, writes what is left.
+        // The compute thread stops first, then its readers; the journal is dropped last and writes what is left.
         halt.store(true, Ordering::Relaxed);
         if !compute.is_finished() {
             compute.await?;
@@ -201,13 +209,16 @@ impl Daemon {
     }
 }
 
-async fn maintain(journal: Journal, metrics: PrometheusHandle) {
+async fn maintain(journal: Journal, metrics: PrometheusHandle, started_at: Timestamp) {
     let mut maintenance = tokio::time::interval(MAINTENANCE);
     let mut upkeep = tokio::time::interval(UPKEEP);
     loop {
         tokio::select! {
             _ = maintenance.tick() => journal.maintain(Timestamp::now()),
-            _ = upkeep.tick() => metrics.run_upkeep(),
+            _ = upkeep.tick() => {
+                metrics.run_upkeep();
+                process::measure(started_at);
+            }
         }
     }
 }

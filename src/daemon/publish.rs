@@ -1,4 +1,4 @@
-//! From the compute thread to everybody else: events to the journal first, then to readers; positions after them.
+//! Publishes the results of the compute thread: events to the journal, then to readers, then positions.
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
@@ -10,11 +10,11 @@ use crate::api::{Acknowledged, Feed, Snapshot};
 use crate::journal::Journal;
 use crate::monitor::{Alert, AlertEvent, AlertEventKind};
 
-/// A disk that hangs may hold back what readers hear for this long, no longer.
-const PATIENCE: Duration = Duration::from_secs(2);
+/// Longest time that a hanging disk delays the publication of an event.
+const JOURNAL_TIMEOUT: Duration = Duration::from_secs(2);
 
-/// Where the compute thread leaves things. It never waits: a newer snapshot takes an older one's place, events add up
-/// (they are few, and the journal's backlog bounds what becomes of them).
+/// Hands results from the compute thread to the publisher. It never waits: a newer snapshot replaces an older one, and events
+/// are queued (they are few, and the journal bounds its backlog).
 #[derive(Clone, Default)]
 pub struct Outlet(Arc<Shared>);
 
@@ -67,7 +67,7 @@ impl Outlet {
         self.0.changed.notify_one();
     }
 
-    /// Nothing more will come; `publish` ends when all is out.
+    /// Marks the end of the results; `publish` ends once all are published.
     pub fn close(&self) {
         self.lock().closed = true;
         self.0.changed.notify_one();
@@ -103,7 +103,7 @@ impl Outlet {
                 if let Err(error) = journal.record_numbered(&numbered, Timestamp::now()) {
                     tracing::error!(%error, "alert events are lost to the journal");
                 }
-                if tokio::time::timeout(PATIENCE, journal.settled()).await.is_err() {
+                if tokio::time::timeout(JOURNAL_TIMEOUT, journal.settled()).await.is_err() {
                     tracing::error!("the journal's disk hangs; alerts are published before they are on it");
                 }
                 feed.publish_events(numbered);

@@ -1,4 +1,4 @@
-//! Signals: stop, and re-read the config.
+//! Signals: stop the daemon, or reload the config.
 
 use std::path::Path;
 
@@ -9,7 +9,7 @@ use super::supervisor::Supervisor;
 use crate::config::Config;
 use crate::logging;
 
-/// Waits for SIGTERM or SIGINT; on SIGHUP what can change live does, and what cannot is named.
+/// Waits for SIGTERM or SIGINT. On SIGHUP the config is reloaded; tables that only a restart can change are logged.
 pub async fn until_stopped(config: &Config, path: Option<&Path>, logging: &logging::Handle) -> Result<()> {
     let mut terminate = signal(SignalKind::terminate())?;
     let mut interrupt = signal(SignalKind::interrupt())?;
@@ -32,7 +32,7 @@ pub async fn until_stopped(config: &Config, path: Option<&Path>, logging: &loggi
     }
 }
 
-/// A bad file changes nothing.
+/// Applies a changed config; an invalid file changes nothing.
 fn reload(current: &mut Config, path: &Path, logging: &logging::Handle) {
     let new = match Config::load(path) {
         Ok(new) => new,

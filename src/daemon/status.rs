@@ -1,4 +1,4 @@
-//! What the compute thread remembers from frame to frame, and what it tells of it.
+//! Counters and windows that the compute thread keeps from frame to frame, and the gauges that follow from them.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::path::Path;
@@ -13,12 +13,12 @@ use crate::claim::escape_undisplayable;
 use crate::metric;
 use crate::monitor::{Alert, AlertEvent, AlertEventKind, AlertKind, AlertState, PositionStatus, Report};
 
-/// Frames over which rate and latency are told.
+/// Frames over which rate and latency are computed.
 const WINDOW: usize = 128;
-/// Without a frame for this long the rate is nought.
+/// Without a frame for this long the rate is 0.
 const STALE: Duration = Duration::from_secs(2);
 
-/// What the thread remembers from frame to frame for the status.
+/// State of the compute thread that the status shows.
 pub(super) struct State {
     pub started_at: Timestamp,
     pub clock: Timestamp,
@@ -41,6 +41,9 @@ pub(super) struct State {
 
 impl State {
     pub fn new(started_at: Timestamp, clock: Timestamp, open: impl IntoIterator<Item = (String, AlertKind)>) -> Self {
+        for kind in AlertKind::ALL {
+            counter!(metric::ALERTS_RAISED, "kind" => word(kind)).increment(0);
+        }
         Self {
             started_at,
             clock,
@@ -151,7 +154,7 @@ fn push<T>(window: &mut VecDeque<T>, value: T) {
     window.push_back(value);
 }
 
-/// The word that JSON uses for a value, for labels.
+/// The JSON string of a unit variant, used as a label.
 fn word(value: impl serde::Serialize) -> String {
     match serde_json::to_value(value) {
         Ok(serde_json::Value::String(word)) => word,

@@ -1,8 +1,8 @@
-//! What the service manager hears: ready after the first frame, a watchdog fed by results only, a status line.
+//! Notifies the service manager (systemd): ready after the first frame, a watchdog fed by results only, a status line.
 
 use sd_notify::NotifyState;
 
-/// Speaks to systemd; silent where there is none.
+/// Sends notifications to systemd; does nothing where there is none.
 #[derive(Default)]
 pub struct Supervisor {
     ready: bool,
@@ -36,6 +36,6 @@ impl Supervisor {
 
 fn send(states: &[NotifyState]) {
     if let Err(error) = sd_notify::notify(states) {
-        tracing::debug!(%error, "the service manager did not hear us");
+        tracing::debug!(%error, "the service manager was not notified");
     }
 }

@@ -16,6 +16,7 @@ mod fit;
 mod model;
 mod model_order;
 mod preprocess;
+mod rules;
 #[doc(hidden)]
 pub mod stages;
 mod uncertainty;
@@ -27,4 +28,5 @@ pub use error::Error;
 pub use estimator::Estimator;
 pub use estimators::build::build;
 pub use estimators::list::{DEFAULT, ESTIMATORS, EstimatorSpec, Learned, find};
+pub use rules::Rules;
 pub use uncertainty::cramer_rao::{BoundAssumptions, PsfShape, position_bound, position_bound_with};

@@ -8,6 +8,7 @@ use crate::estimate::model::hypothesis::{Hypothesis, Nuisances, PointSource};
 use crate::estimate::model_order::power_prior::PowerPrior;
 use crate::estimate::model_order::search::Search;
 use crate::estimate::preprocess::screening::PreprocessedFrame;
+use crate::estimate::rules::Rules;
 use crate::estimate::uncertainty::localise;
 use crate::frame::Frame;
 use crate::optics::Camera;
@@ -27,7 +28,7 @@ pub struct Stages {
 impl Stages {
     pub fn new(camera: &Camera) -> Self {
         Self {
-            search: Search::new(crate::estimate::estimators::analytic::bases(camera).0),
+            search: Search::new(crate::estimate::estimators::analytic::bases(camera).0, Rules::default()),
             camera: camera.clone(),
             frame: PreprocessedFrame::default(),
             compressed: CompressedFrame::default(),

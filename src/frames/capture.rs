@@ -1,4 +1,4 @@
-//! The capture thread: blocks in a source so that nobody else has to.
+//! The capture thread: waits for frames of a source and passes them to the slot.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -10,7 +10,7 @@ use super::slot::{Captured, Slot, Taken};
 use super::source::{FrameSource, Next};
 use crate::metric;
 
-/// How long a closing capture may go unnoticed.
+/// Longest wait before the thread checks whether it must stop.
 const PATIENCE: Duration = Duration::from_millis(100);
 
 /// A running source. Dropping it stops the thread and waits for it.
@@ -42,7 +42,7 @@ impl Capture {
         })
     }
 
-    /// Frames that gave way to newer ones so far.
+    /// Frames replaced by newer ones so far.
     pub fn dropped(&self) -> u64 {
         self.dropped.load(Ordering::Relaxed)
     }
@@ -75,7 +75,7 @@ impl Drop for Capture {
     }
 }
 
-/// Closes the slot however the thread ends, so that the reader never waits for a dead one.
+/// Closes the slot when the thread ends, also by a panic, so that the reader does not wait for it.
 struct CloseOnExit<'a>(&'a Slot);
 
 impl Drop for CloseOnExit<'_> {

@@ -1,4 +1,4 @@
-//! Why frames cannot be had.
+//! Errors of opening a source of frames.
 
 use std::path::PathBuf;
 
@@ -22,6 +22,10 @@ pub enum Error {
         found_x: usize,
         found_y: usize,
     },
+    #[error(
+        "source.rate_hz: expected {scene}, the rate of the scene, or nothing, since a simulator runs at its scene's rate; found {given}"
+    )]
+    SceneRate { given: f64, scene: f64 },
     #[error(transparent)]
     Scene(#[from] scene::Error),
     #[error("optics.joules_per_count: needed for source.kind = \"v4l2\", whose frames are counts; found nothing")]
@@ -43,7 +47,7 @@ pub enum Error {
 }
 
 impl Error {
-    /// Whether the config is at fault, not what it points at.
+    /// Whether the config is wrong, rather than a file that it names.
     pub fn is_config(&self) -> bool {
         !matches!(
             self,
@@ -51,7 +55,7 @@ impl Error {
         )
     }
 
-    /// Whether there was no room to write.
+    /// Whether the disk or quota is full.
     pub fn is_full_disk(&self) -> bool {
         use std::io::ErrorKind::{QuotaExceeded, StorageFull};
         match self {

@@ -1,4 +1,4 @@
-//! Where frames come from: the built-in simulator, a V4L2 device, a recording.
+//! Layer 2: sources of frames (simulator, V4L2 device, recording), the `.npy` format and the recorder.
 
 mod capture;
 mod config;
@@ -20,7 +20,7 @@ pub use source::{FrameSource, Next};
 
 use crate::optics::Camera;
 
-/// Opens the configured source. A device that is not there yet is no error: it is waited for.
+/// Opens the configured source. An absent device is not an error: the source waits for it.
 pub fn open(config: &Config, camera: &Camera) -> Result<Box<dyn FrameSource>, Error> {
     match config.kind {
         SourceKind::Replay => replay::open(config, camera.joules_per_count),

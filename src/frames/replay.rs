@@ -1,4 +1,4 @@
-//! A recording as a source: at its own speed, n times it, or as fast as its reader takes it.
+//! Replays a recording at its own speed, a multiple of it, or as fast as the reader accepts frames.
 
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -11,8 +11,8 @@ use super::{Config, Error, FrameSource, Next};
 use crate::frame::Frame;
 use crate::toml_file::Key;
 
-/// Opens `source.frames`: a folder of our own recordings, or one of them, whose times and claims are replayed as
-/// they were; or, where `source.start` gives the times, any .npy file.
+/// Opens `source.frames`: a folder of recordings of `[record]`, or one of them, with its own times and claims; or any .npy
+/// file, whose times follow from `source.start` and `source.rate_hz`.
 pub(super) fn open(config: &Config, joules_per_count: Option<f64>) -> Result<Box<dyn FrameSource>, Error> {
     let path = config.frames.as_ref().ok_or(Error::Missing {
         field: "frames",
@@ -41,14 +41,14 @@ pub(super) fn open(config: &Config, joules_per_count: Option<f64>) -> Result<Box
     }))
 }
 
-/// Our own recording, as the monitor saw it.
+/// A recording of `[record]`: frames, gaps and claims as the monitor received them.
 struct Playback {
     player: Player,
     pace: Pace,
-    /// What comes next, until its time has come.
+    /// The next event, held until it is due.
     waiting: Option<(Timestamp, Next)>,
     ended: bool,
-    /// Index and time of what was given last.
+    /// Index and time of the last event given.
     last: (u64, Timestamp),
 }
 
@@ -95,7 +95,7 @@ impl FrameSource for Playback {
     }
 }
 
-/// Frames of one .npy file. Frame k is at start + k/rate_hz whatever the speed; a loop goes on counting.
+/// Frames of one .npy file. Frame k is at start + k/rate_hz at any speed; frame numbers continue over a loop.
 struct Replay {
     reader: Reader,
     start: Timestamp,
@@ -103,13 +103,14 @@ struct Replay {
     looped: bool,
     pace: Pace,
     next: u64,
-    /// A file that was cut short has said so, once.
+    /// A truncated file was reported; the source has ended.
     ended: bool,
 }
 
 impl Replay {
     fn open(path: &Path, config: &Config, joules_per_count: Option<f64>) -> Result<Self, Error> {
-        Key::new("source.rate_hz").positive(config.rate_hz)?;
+        let rate_hz = config.rate_hz.unwrap_or(Config::DEFAULT_RATE_HZ);
+        Key::new("source.rate_hz").positive(rate_hz)?;
         let start = config.start.unwrap_or_else(|| {
             tracing::warn!(frames = %path.display(), "source.start is not set: frame 0 is taken to be at 1970-01-01T00:00:00Z");
             Timestamp::UNIX_EPOCH
@@ -117,7 +118,7 @@ impl Replay {
         Ok(Self {
             reader: Reader::open(path, joules_per_count)?,
             start,
-            rate_hz: config.rate_hz,
+            rate_hz,
             looped: config.r#loop,
             pace: Pace::new(config.speed)?,
             next: 0,
@@ -180,7 +181,7 @@ impl FrameSource for Replay {
     }
 }
 
-/// Holds recorded times against the clock on the wall.
+/// Delays events until their recorded times are due on the wall clock.
 #[derive(Debug)]
 pub(super) struct Pace {
     speed: f64,
@@ -188,7 +189,7 @@ pub(super) struct Pace {
 }
 
 impl Pace {
-    /// `speed` times the original; 0 is as fast as possible.
+    /// `speed` is a multiple of the original speed; 0 is as fast as possible.
     pub fn new(speed: f64) -> Result<Self, Error> {
         match speed.is_finite() && speed >= 0.0 {
             true => Ok(Self { speed, origin: None }),
@@ -198,15 +199,14 @@ impl Pace {
         }
     }
 
-    /// Waits until `time` is due, `patience` at most; `false` when it is not due yet. The first time asked
-    /// for is due at once.
+    /// Waits until `time` is due, at most `patience`; `false` when it is not due yet. The first time asked for is due at once.
     pub fn wait(&mut self, time: Timestamp, patience: Duration) -> bool {
         if self.speed == 0.0 {
             return true;
         }
         let (first, began) = *self.origin.get_or_insert_with(|| (time, Instant::now()));
         let offset = time.duration_since(first).as_secs_f64().max(0.0) / self.speed;
-        // A speed close to zero reaches past what the clock can hold: never due.
+        // With a speed close to zero the due time may overflow the clock: never due.
         let due = Duration::try_from_secs_f64(offset)
             .ok()
             .and_then(|d| began.checked_add(d));

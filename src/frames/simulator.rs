@@ -1,5 +1,4 @@
-//! The built-in simulator as a source: keeps a device's pace on the clock on the wall and drops what it cannot
-//! make in time.
+//! The simulator as a source: gives frames at the scene's rate on the wall clock and skips those that it cannot make in time.
 
 use std::time::{Duration, Instant};
 
@@ -11,22 +10,22 @@ use crate::metric;
 use crate::optics::Camera;
 use crate::scene::{Fate, Plan, Scene};
 
-/// Frames whose claims are still handed on when many were passed over at once (a suspended machine).
+/// Most skipped frames whose claims are still delivered, for a machine that was suspended.
 const MOST_CAUGHT_UP: u64 = 10_000;
-/// Without a frame for this long (two intervals of a slower scene), the monitor is told; and again after as long.
+/// Without a frame for this long (two intervals of a slower scene) the source reports an unusable frame, and again after as long.
 const SILENCE: Duration = Duration::from_secs(1);
 
-/// Frames of a scene. Frame k is exposed at start + k/rate; one that is late by a whole interval is passed over,
-/// one that the scene drops never arrives, and its claims come with the next. One that the scene repeats arrives
-/// under a number and a time of its own, with the pixels of the last that was delivered.
+/// Frames of a scene. Frame k is exposed at start + k/rate. A frame that is late by a whole interval is skipped; one that the
+/// scene drops never arrives, and its claims come with the next. One that the scene repeats has its own number and time and the
+/// pixels of the last delivered frame.
 pub struct Simulator {
     plan: Plan,
     began: Instant,
     next: u64,
-    /// Claims that came with frames that did not arrive.
+    /// Claims of frames that did not arrive.
     waiting: Vec<Claim>,
-    /// The frame after the last that arrived, or of whose absence the monitor was told.
-    untold: u64,
+    /// The frame after the last one that arrived or was reported missing.
+    unreported: u64,
 }
 
 impl Simulator {
@@ -35,6 +34,7 @@ impl Simulator {
             Some(path) => Scene::load(path)?,
             None => Scene::builtin(),
         };
+        config.rate_of(&scene)?;
         let plan = Plan::compile(&scene, config.seed)?;
         let (found, expected) = (plan.camera().shape(), camera.shape());
         if found != expected {
@@ -50,7 +50,7 @@ impl Simulator {
             began: Instant::now(),
             next: 0,
             waiting: Vec::new(),
-            untold: 0,
+            unreported: 0,
         })
     }
 
@@ -58,14 +58,14 @@ impl Simulator {
         Duration::try_from_secs_f64(k as f64 / self.plan.rate_hz()).unwrap_or(Duration::MAX)
     }
 
-    /// Frame `index` was lost on its way: a gap in the numbers, as with a device.
+    /// Frame `index` was lost: a gap in the numbers, as with a device.
     fn lost(&mut self, index: u64) -> Next {
         metrics::counter!(metric::SOURCE_FRAMES_LOST).increment(1);
-        let silent = self.due(self.next - self.untold);
+        let silent = self.due(self.next - self.unreported);
         if silent < SILENCE.max(self.due(2)) {
             return Next::Nothing;
         }
-        self.untold = self.next;
+        self.unreported = self.next;
         Next::Unusable {
             index,
             time: self.plan.time(index),
@@ -94,7 +94,7 @@ impl FrameSource for Simulator {
         if made.fate == Fate::Dropped {
             return self.lost(index);
         }
-        self.untold = self.next;
+        self.unreported = self.next;
         Next::Frame(made.frame, std::mem::take(&mut self.waiting))
     }
 }
@@ -144,7 +144,7 @@ mod tests {
         assert_eq!(claims, all);
     }
 
-    /// What comes of the scene's first `count` frames, each asked for when it is due.
+    /// Events of the scene's first `count` frames, each asked for when it is due.
     fn arrivals(frame_loss: FrameLoss, count: u64) -> (Plan, Vec<Next>) {
         let mut scene = Scene::builtin();
         scene.rate_hz = 1.0;
@@ -154,11 +154,11 @@ mod tests {
             began: Instant::now(),
             next: 0,
             waiting: Vec::new(),
-            untold: 0,
+            unreported: 0,
         };
         let mut came = Vec::new();
         for k in 0..count {
-            // Half an interval, 0.5 s, after frame k was due: leeway for a busy host.
+            // Half an interval, 0.5 s, after frame k was due: tolerance for a busy host.
             source.began = Instant::now()
                 .checked_sub(source.due(k) + source.due(1) / 2)
                 .expect("a clock that started earlier");
@@ -179,14 +179,14 @@ mod tests {
             assert!((0..60).filter(|k| fate(*k) == wanted).count() > 5, "{wanted:?}");
         }
         let mut last: Option<crate::frame::Frame> = None;
-        let mut heard = Vec::new();
+        let mut received = Vec::new();
         let mut until = 0;
         for next in came {
             let (frame, claims) = match next {
                 Next::Frame(frame, claims) => (frame, claims),
                 Next::Unusable { index, claims, .. } => {
                     assert_eq!(fate(index), Fate::Dropped);
-                    heard.extend(claims);
+                    received.extend(claims);
                     until = index;
                     continue;
                 }
@@ -204,22 +204,22 @@ mod tests {
                     assert_eq!(frame.digest() == last.digest(), is_repeated, "frame {}", frame.index);
                 }
             }
-            heard.extend(claims);
+            received.extend(claims);
             until = frame.index;
             last = Some(frame);
         }
         let all: Vec<Claim> = (0..=until).flat_map(|k| plan.claims(k)).collect();
-        assert_eq!(heard, all);
+        assert_eq!(received, all);
     }
 
     #[test]
-    fn the_monitor_is_told_when_nothing_arrives() {
+    fn missing_frames_are_reported() {
         let loss = FrameLoss {
             dropped: 1.0 - 1e-12,
             repeated: 0.0,
         };
         let (_, came) = arrivals(loss, 7);
-        let told: Vec<u64> = came
+        let reported: Vec<u64> = came
             .iter()
             .filter_map(|next| match next {
                 Next::Unusable { index, reason, .. } => {
@@ -233,7 +233,25 @@ mod tests {
             })
             .collect();
         // Two intervals of one second.
-        assert_eq!(told, [1, 3, 5]);
+        assert_eq!(reported, [1, 3, 5]);
+    }
+
+    #[test]
+    fn a_rate_that_is_not_the_scene_s_is_refused() {
+        let camera = Scene::builtin().optics.camera().unwrap();
+        let open = |rate_hz| {
+            let config = Config {
+                rate_hz: Some(rate_hz),
+                ..Config::default()
+            };
+            Simulator::open(&config, &camera)
+        };
+        assert!(open(Scene::builtin().rate_hz).is_ok());
+        let message = open(25.0).err().expect("another rate").to_string();
+        assert!(
+            message.contains("expected 10, the rate of the scene") && message.ends_with("found 25"),
+            "{message}"
+        );
     }
 
     #[test]

@@ -1,4 +1,4 @@
-//! Where the capture thread leaves what it has and the compute thread finds the latest.
+//! The latest-wins slot between the capture thread and the compute thread.
 
 use std::collections::VecDeque;
 use std::path::Path;
@@ -7,10 +7,10 @@ use std::time::{Duration, Instant};
 
 use super::source::Next;
 
-/// Events other than frames that wait at most; more than this and the oldest goes.
+/// Most waiting events other than frames; beyond it the oldest is dropped.
 const MOST_UNUSABLE: usize = 64;
 
-/// What a source gave, and the recording it stands in.
+/// An event of a source, and the recording that holds it.
 #[derive(Clone, Debug)]
 pub struct Captured {
     pub next: Next,
@@ -29,7 +29,7 @@ impl Captured {
     }
 }
 
-/// Holds at most one frame. A newer frame takes its place and inherits its claims; the drop is counted.
+/// Holds at most one frame. A newer frame replaces it and inherits its claims; the drop is counted.
 #[derive(Debug, Default)]
 pub struct Slot {
     state: Mutex<State>,
@@ -43,11 +43,11 @@ struct State {
     closed: bool,
 }
 
-/// What waiting on the slot ended with.
+/// Result of waiting on the slot.
 #[derive(Debug)]
 #[allow(clippy::large_enum_variant, reason = "taken apart where it is given")]
 pub enum Taken {
-    /// The oldest thing that is still of interest, and the number of frames dropped since the last one.
+    /// The oldest waiting event, and the number of frames dropped since the last one.
     Captured(Captured, u64),
     Nothing,
     Closed,
@@ -55,11 +55,11 @@ pub enum Taken {
 
 impl Slot {
     fn lock(&self) -> MutexGuard<'_, State> {
-        // Nothing in here panics while it holds the lock; a poisoned state is still whole.
+        // No code panics while it holds the lock, so a poisoned state is still consistent.
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Leaves something; the latest frame wins. `false` when the slot is closed.
+    /// Puts an event; a newer frame replaces an older one. `false` when the slot is closed.
     pub fn put(&self, mut captured: Captured) -> bool {
         let mut state = self.lock();
         if let Next::Frame(_, claims) = &mut captured.next {
@@ -87,7 +87,7 @@ impl Slot {
         !state.closed
     }
 
-    /// Leaves something as soon as the slot is empty. `false` when the slot is closed.
+    /// Puts an event once the slot is empty. `false` when the slot is closed.
     pub fn put_when_empty(&self, captured: Captured) -> bool {
         let state = self.lock();
         let mut state = self
@@ -101,7 +101,7 @@ impl Slot {
         !state.closed
     }
 
-    /// Waits up to `patience` for something. What was left before the slot was closed is still given.
+    /// Waits up to `patience` for an event. Events put before the slot was closed are still given.
     pub fn take(&self, patience: Duration) -> Taken {
         let deadline = Instant::now() + patience;
         let mut state = self.lock();
@@ -125,7 +125,7 @@ impl Slot {
         }
     }
 
-    /// Wakes both sides; nothing more is accepted.
+    /// Wakes both threads; no further event is accepted.
     pub fn close(&self) {
         self.lock().closed = true;
         self.changed.notify_all();

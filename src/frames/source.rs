@@ -1,4 +1,4 @@
-//! What every source of frames gives.
+//! The interface of a source of frames.
 
 use std::path::Path;
 use std::time::Duration;
@@ -8,30 +8,29 @@ use jiff::Timestamp;
 use crate::claim::Claim;
 use crate::frame::Frame;
 
-/// A supply of frames with a thread of its own to block in.
+/// A source of frames. It runs on a thread of its own, so `next` may block.
 pub trait FrameSource: Send {
     /// Waits up to `patience` for the next frame.
     fn next(&mut self, patience: Duration) -> Next;
 
-    /// The recording that holds the frame last given, where there is one.
+    /// The recording that holds the last frame given, where there is one.
     fn file(&self) -> Option<&Path> {
         None
     }
 
-    /// Whether the source waits for its reader (a recording), or frames come and go (a device).
+    /// Whether the source waits for its reader (a recording) instead of dropping frames (a device).
     fn waits(&self) -> bool {
         false
     }
 }
 
-/// What a wait for a frame ended with.
+/// Result of waiting for a frame.
 #[derive(Clone, Debug)]
 pub enum Next {
     /// A frame, with the claims that came with it (simulator, our own recordings; otherwise none).
     Frame(Frame, Vec<Claim>),
-    /// No usable frame at `time`: it was short or error-flagged, or none came for a whole second. All that
-    /// the monitor needs to know about a failing sensor comes as one of these, so that a recording of them
-    /// gives the same alerts.
+    /// No usable frame at `time`: it was short or flagged as corrupt, or none came for a whole second. Every failure of the
+    /// sensor reaches the monitor as one of these, so that a recording of them gives the same alerts.
     Unusable {
         index: u64,
         time: Timestamp,
@@ -41,6 +40,6 @@ pub enum Next {
     },
     /// Nothing yet; ask again.
     Nothing,
-    /// A recording came to its end.
+    /// The recording has ended.
     End,
 }

@@ -13,17 +13,17 @@ use super::store::{Store, Write};
 use super::{Error, Subscription, health};
 use crate::metric;
 
-/// How often old alerts are looked for.
-const ROUND: SignedDuration = SignedDuration::from_hours(1);
+/// Time between two retention rounds.
+const RETENTION_EVERY: SignedDuration = SignedDuration::from_hours(1);
 
-/// After a gap longer than this one round is left out: the wall clock may have been set, and one that is wrong for
-/// a while, as after a start without a network, must not make everything old.
-const JUMP: SignedDuration = SignedDuration::from_hours(25);
+/// After a gap longer than this one retention round is skipped: the wall clock may have been set, and a clock that is wrong
+/// for a while, as after a start without a network, must not make every alert old.
+const CLOCK_JUMP: SignedDuration = SignedDuration::from_hours(25);
 
-/// Writes between two looks at a journal that is too large.
-const PAUSE: usize = 1_000;
+/// Writes between two retention rounds of a journal that is too large.
+const WRITES_BETWEEN_ROUNDS: usize = 1_000;
 
-/// The thread that waits for the disk, so that nobody else has to. It answers every batch.
+/// State of the disk thread. It answers every batch.
 pub(super) struct Disk {
     path: PathBuf,
     subscriptions: Arc<[Subscription]>,
@@ -51,7 +51,7 @@ impl Disk {
             retention,
             store,
             last_round: None,
-            since_round: PAUSE,
+            since_round: WRITES_BETWEEN_ROUNDS,
         }
     }
 
@@ -76,7 +76,7 @@ impl Disk {
             tracing::error!(path = %self.path.display(), "the journal was moved or deleted while in use; a new one is begun");
             self.store = None;
         }
-        // Taken, and put back when all went well: a fresh connection also gets over faults that stick to an open file.
+        // Put back only on success: a fresh connection also clears faults that stick to an open file.
         let mut store = match self.store.take() {
             Some(store) => store,
             None => {
@@ -102,11 +102,11 @@ impl Disk {
             .last_round
             .or_else(|| self.store.as_ref()?.newest_recorded().ok().flatten());
         let age = now.duration_since(earlier.unwrap_or(now));
-        let due = (asked || age >= ROUND) && age < JUMP;
-        if self.last_round.is_none() || age >= ROUND || age < SignedDuration::ZERO {
+        let due = (asked || age >= RETENTION_EVERY) && age < CLOCK_JUMP;
+        if self.last_round.is_none() || age >= RETENTION_EVERY || age < SignedDuration::ZERO {
             self.last_round = Some(now);
         }
-        let large = self.retention.exceeded_by(size) && self.since_round >= PAUSE;
+        let large = self.retention.exceeded_by(size) && self.since_round >= WRITES_BETWEEN_ROUNDS;
         let Some(store) = self.store.as_mut().filter(|_| due || large) else {
             return;
         };
@@ -131,7 +131,7 @@ impl Disk {
     }
 }
 
-/// Tells a file from another that took its name.
+/// Identifies a file, so that another of the same name is recognised.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 struct FileId {
     device: u64,

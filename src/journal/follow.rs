@@ -15,11 +15,18 @@ pub struct Follower {
     after: u64,
 }
 
-impl Follower {
-    pub(super) fn new(journal: Journal, heard: watch::Receiver<u64>, after: u64) -> Self {
-        Self { journal, heard, after }
+impl Journal {
+    /// Alert events after the one numbered `after`, as they become durable; none is left out however slowly they are taken.
+    pub fn follow(&self, after: u64) -> Follower {
+        Follower {
+            journal: self.clone(),
+            heard: self.heard(),
+            after,
+        }
     }
+}
 
+impl Follower {
     /// Waits for the next events; at least one, in order. May be dropped while it waits without losing any.
     pub async fn next(&mut self) -> Result<Vec<Recorded>, Error> {
         loop {

@@ -1,9 +1,9 @@
-//! Layer 4: alerts and webhook deliveries on disk, before anyone hears of them.
+//! Layer 4: alerts and webhook deliveries on disk before they are published.
 //!
 //! One thread writes ([`Journal::record`] hands over the events and returns at once, so that a slow disk never
 //! delays a frame); any thread reads, over its own read-only connection. SQLite in WAL mode with
 //! `synchronous=FULL`: what [`Follower`] gives out survives a kill -9 and a power cut. While the disk refuses
-//! writes or hangs, events wait in memory, in order, are heard of all the same, and [`Health`] says so.
+//! writes or hangs, events wait in memory, in order, are published all the same, and [`Health`] reports it.
 
 mod audit;
 mod config;
@@ -35,7 +35,7 @@ use store::{Store, Write};
 use writer::{Link, Shared, Writer, lock};
 
 pub use audit::{AuditAction, AuditEntry, AuditRecord};
-pub use config::Config;
+pub use config::{Config, ConfigError};
 pub use error::Error;
 pub use follow::Follower;
 pub use health::Health;
@@ -59,7 +59,7 @@ pub struct Journal {
     _thread: Arc<Thread>,
 }
 
-/// Ends the writer thread with the last handle, then gives the file free.
+/// Ends the writer thread with the last handle, then releases the lock.
 struct Thread {
     shared: Arc<Shared>,
     join: Option<JoinHandle<()>>,
@@ -187,12 +187,7 @@ impl Journal {
         let _ = watch.wait_for(|&n| n >= done).await;
     }
 
-    /// Alert events from `after` on, as they become durable; none is left out however slowly they are taken.
-    pub fn follow(&self, after: u64) -> Follower {
-        Follower::new(self.clone(), self.shared.heard.subscribe(), after)
-    }
-
-    /// Sequence number of the last event that may be heard of.
+    /// Sequence number of the last event that is published.
     pub fn last_seq(&self) -> u64 {
         *self.shared.heard.borrow()
     }
@@ -258,7 +253,7 @@ fn thread(name: &str, config: &Config, run: impl FnOnce() + Send + 'static) -> R
     })
 }
 
-/// Claims the journal for this process. On a disk where no lock file can be made, nobody else can write either.
+/// Locks the journal for this process. On a disk where no lock file can be made, no other process can write either.
 fn claim_file(path: &Path) -> Result<Option<File>, Error> {
     let mut name = path.as_os_str().to_owned();
     name.push(".lock");

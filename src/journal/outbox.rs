@@ -4,7 +4,7 @@ use jiff::Timestamp;
 
 use crate::monitor::{AlertEvent, AlertKind};
 
-/// What one webhook endpoint wants to hear; the outbox gets a row for each event that matches.
+/// Which events one webhook endpoint receives; the outbox gets a row for each event that matches.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Subscription {
     /// The endpoint's name in the journal; stable over restarts.

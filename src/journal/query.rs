@@ -5,7 +5,7 @@ use rusqlite::types::Value;
 use rusqlite::{OptionalExtension, Row, params};
 
 use super::store::{Store, word};
-use super::{DeadLetter, EndpointRecord, Error, Waiting};
+use super::{AuditEntry, AuditRecord, DeadLetter, EndpointRecord, Error, Waiting};
 use crate::monitor::{Alert, AlertEvent, AlertKind, AlertState};
 
 /// Which alerts to list; the newest raised come first.
@@ -119,6 +119,17 @@ impl Store {
         rows.collect()
     }
 
+    /// Newest first, older than `before` where it is given.
+    pub(super) fn audit(&self, before: Option<u64>, limit: usize) -> Result<Vec<AuditRecord>, rusqlite::Error> {
+        let before = before.and_then(|id| i64::try_from(id).ok()).unwrap_or(i64::MAX);
+        let mut statement = self.db.prepare_cached(
+            "SELECT id, at_us, action, actor, client, target, detail, count FROM audit
+             WHERE id < ?1 ORDER BY id DESC LIMIT ?2",
+        )?;
+        let rows = statement.query_map(params![before, limit as i64], audit_record)?;
+        rows.filter_map(Result::transpose).collect()
+    }
+
     pub(super) fn events_of(&self, alert: &str, limit: usize) -> Result<Vec<Recorded>, rusqlite::Error> {
         let mut statement = self
             .db
@@ -224,7 +235,27 @@ fn recorded(row: &Row) -> Result<Option<Recorded>, rusqlite::Error> {
     Ok(body(row, 2)?.map(|event| Recorded { seq, at, event }))
 }
 
+fn audit_record(row: &Row) -> Result<Option<AuditRecord>, rusqlite::Error> {
+    let action: String = row.get(2)?;
+    // A row that another version wrote must not hide the others.
+    let Ok(action) = serde_json::from_value(action.into()) else {
+        return Ok(None);
+    };
+    Ok(Some(AuditRecord {
+        id: row.get(0)?,
+        at: time(row.get(1)?),
+        entry: AuditEntry {
+            action,
+            actor: row.get(3)?,
+            client: row.get(4)?,
+            target: row.get(5)?,
+            detail: row.get(6)?,
+            count: row.get(7)?,
+        },
+    }))
+}
+
 /// Microseconds since 1970, held to what a calendar can show: a damaged file must not be a panic.
-pub(super) fn time(us: i64) -> Timestamp {
+fn time(us: i64) -> Timestamp {
     Timestamp::from_microsecond(us).unwrap_or(if us < 0 { Timestamp::MIN } else { Timestamp::MAX })
 }

@@ -132,8 +132,8 @@ impl Journal {
         }
     }
 
-    /// As [`Journal::read`], for what came after an event. Memory answers alone where it holds all of that: a disk that
-    /// hangs keeps nobody from hearing of it. Elsewhere a disk that cannot be read is an error, not a gap.
+    /// As [`Journal::read`], for what came after an event. Memory answers alone where it holds all of that, so that a disk that
+    /// hangs delays no reader. Elsewhere a disk that cannot be read is an error, not a gap.
     fn read_after<T>(
         &self,
         seq: u64,

@@ -9,6 +9,11 @@ use super::store::Store;
 /// Alerts removed in one transaction: bounds how long a write may have to wait.
 const CHUNK: usize = 500;
 
+/// Rows of the audit log kept on disk. At about 150 bytes each they take some 15 MB; older ones go, so that no flood of requests fills it.
+const MOST_AUDIT_ROWS: usize = 100_000;
+/// And by a journal in memory.
+const MOST_AUDIT_ROWS_IN_MEMORY: usize = 2_000;
+
 /// Alerts are kept in memory up to this size, MB.
 const MEMORY_MB: u32 = 16;
 
@@ -64,7 +69,7 @@ impl Store {
                 break;
             }
         }
-        // Some room is made at once, so that not every later write makes its own.
+        // A tenth is freed at once, so that not every later write has to free its own.
         let target = retention.max_bytes - retention.max_bytes / 10;
         if self.used_bytes()? > retention.max_bytes {
             while self.used_bytes()? > target {
@@ -83,6 +88,19 @@ impl Store {
             while rows.next()?.is_some() {}
         }
         Ok(removed)
+    }
+
+    /// Removes rows from before `cutoff_us` and all but the newest.
+    fn trim_audit(&self, cutoff_us: i64, in_memory: bool) -> Result<usize, rusqlite::Error> {
+        let most = if in_memory {
+            MOST_AUDIT_ROWS_IN_MEMORY
+        } else {
+            MOST_AUDIT_ROWS
+        };
+        self.db.execute(
+            "DELETE FROM audit WHERE at_us < ?1 OR id <= (SELECT id FROM audit ORDER BY id DESC LIMIT 1 OFFSET ?2)",
+            params![cutoff_us, most as i64],
+        )
     }
 
     pub(super) fn newest_recorded(&self) -> Result<Option<Timestamp>, rusqlite::Error> {

@@ -9,7 +9,7 @@ use rusqlite::{Connection, OpenFlags, TransactionBehavior};
 
 use super::Error;
 
-/// "OAPW", so that `file` and we ourselves can tell a journal from any other SQLite file.
+/// "OAPW": distinguishes a journal from any other SQLite file, here and for `file`.
 const APPLICATION_ID: i64 = 0x4F41_5057;
 
 /// Longest wait for another process (a backup, a shell) that holds the file.
@@ -120,7 +120,7 @@ fn create_private(path: &Path) {
     let _ = OpenOptions::new().write(true).create_new(true).mode(PRIVATE).open(path);
 }
 
-/// Takes away what an earlier version, or a copy, gave to other users.
+/// Removes permissions that an earlier version, or a copy, gave to other users.
 fn make_private(path: &Path) {
     for suffix in ["", "-wal", "-shm", ".lock"] {
         let mut name = path.as_os_str().to_owned();

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use jiff::Timestamp;
 use rusqlite::{Connection, TransactionBehavior, params};
 
-use super::{Attempt, AuditRecord, Error, Outcome, Subscription, audit, schema};
+use super::{Attempt, AuditRecord, Error, Outcome, Subscription, schema};
 use crate::monitor::{AlertEvent, AlertEventKind};
 
 /// One change of the journal. Applying it must never fail for what it holds, only for the disk: a write
@@ -114,7 +114,7 @@ impl Store {
                         params![endpoint, seq, at.as_microsecond()],
                     )?;
                 }
-                Write::Audit(record) => audit::put(&tx, record)?,
+                Write::Audit(record) => put_audit(&tx, record)?,
                 Write::Maintain { .. } => {}
             }
         }
@@ -155,6 +155,23 @@ fn put_event(
         ])?;
     tx.prepare_cached("UPDATE journal SET last_seq = max(last_seq, ?1)")?
         .execute([seq])?;
+    Ok(())
+}
+
+fn put_audit(tx: &Connection, record: &AuditRecord) -> Result<(), rusqlite::Error> {
+    // A write that is repeated after a failure finds its row in place.
+    let entry = &record.entry;
+    tx.prepare_cached("INSERT OR IGNORE INTO audit VALUES (?1, ?2, ?3, ?4, ?5, ?6, ?7, ?8)")?
+        .execute(params![
+            record.id,
+            record.at.as_microsecond(),
+            word(&entry.action),
+            entry.actor,
+            entry.client,
+            entry.target,
+            entry.detail,
+            entry.count,
+        ])?;
     Ok(())
 }
 

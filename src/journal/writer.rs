@@ -1,4 +1,4 @@
-//! The writer thread: decides whether events are on disk or in memory and when readers hear of them.
+//! The writer thread: decides whether events are held on disk or in memory, and publishes them to readers.
 
 use std::collections::VecDeque;
 use std::path::PathBuf;
@@ -24,10 +24,11 @@ pub(super) const MOST_AUDIT_ROWS: usize = 2_000;
 /// Writes in one transaction: bounds how long it takes.
 const BATCH: usize = 2_000;
 
-/// How long an alarm waits for the disk before it is heard without it.
-const PATIENCE: Duration = Duration::from_millis(500);
+/// How long an event waits for the disk before it is published without it: half a second is short beside the time that a
+/// person takes to react, and longer than a healthy disk takes to sync.
+const DISK_TIMEOUT: Duration = Duration::from_millis(500);
 
-/// How soon a disk that refused a write is tried again.
+/// Time after which a disk that refused a write is tried again.
 const RETRY: Duration = Duration::from_secs(1);
 
 /// What the writer thread, the readers and those who record share.
@@ -39,7 +40,7 @@ pub(super) struct Shared {
     wake: Condvar,
     /// The journal itself when there is no path; otherwise what the disk has not taken yet.
     pub(super) overlay: Mutex<Overlay>,
-    /// Sequence number of the last event that may be heard of.
+    /// Sequence number of the last event that is published.
     pub(super) heard: watch::Sender<u64>,
     /// How many writes are done with, on disk or in the overlay.
     pub(super) done: watch::Sender<u64>,
@@ -173,10 +174,10 @@ impl Shared {
         self.wake.notify_one();
     }
 
-    fn take(&self, patience: Option<Duration>) -> (Vec<Write>, bool) {
+    fn take(&self, timeout: Option<Duration>) -> (Vec<Write>, bool) {
         let queue = lock(&self.queue);
         let idle = |queue: &mut Queue| queue.writes.is_empty() && !queue.closing;
-        let mut queue = match patience {
+        let mut queue = match timeout {
             None => self
                 .wake
                 .wait_while(queue, idle)
@@ -199,9 +200,8 @@ impl Shared {
     }
 }
 
-/// Decides what is heard when. Events are heard of once they are on disk; where the disk refuses them or takes
-/// too long they are held in memory and heard of all the same, because a full or hung disk must not silence an
-/// alarm.
+/// State of the writer thread. Events are published once they are on disk; where the disk refuses them or takes too long they
+/// are held in memory and published all the same, because a full or hung disk must not suppress an alert.
 pub(super) struct Writer {
     shared: Arc<Shared>,
     /// `None` for a journal in memory.
@@ -235,12 +235,12 @@ impl Writer {
     pub(super) fn run(mut self) {
         let mut behind = false;
         loop {
-            let patience = match (behind, self.deferred.is_empty()) {
+            let timeout = match (behind, self.deferred.is_empty()) {
                 (true, _) => Some(Duration::ZERO),
                 (false, false) => Some(RETRY),
                 (false, true) => None,
             };
-            let (writes, closing) = self.shared.take(patience);
+            let (writes, closing) = self.shared.take(timeout);
             behind = self.write(&writes);
             self.publish(&writes);
             if closing && !behind {
@@ -250,7 +250,7 @@ impl Writer {
         self.end();
     }
 
-    /// Gives a disk that has not answered a last chance, then lets go of it.
+    /// Waits once more for a disk that has not answered, then gives up on it.
     fn end(mut self) {
         if self.disk.as_ref().is_some_and(|link| link.pending > 0) {
             self.try_disk();
@@ -304,7 +304,7 @@ impl Writer {
                 link.pending = 0;
             }
         }
-        match link.answers.recv_timeout(PATIENCE) {
+        match link.answers.recv_timeout(DISK_TIMEOUT) {
             Ok(Ok(size)) => {
                 let written: Vec<Write> = self.deferred.drain(..link.pending).collect();
                 link.pending = 0;

@@ -5,30 +5,18 @@ use std::time::Duration;
 
 use jiff::Timestamp;
 use jiff::fmt::rfc2822::DateTimeParser;
+use reqwest::StatusCode;
 use reqwest::header::{CONTENT_TYPE, HeaderMap, RETRY_AFTER};
-use reqwest::{Certificate, Client, StatusCode, redirect};
 
-use super::endpoint::{Endpoint, Error};
-use super::{Config, payload};
+use super::endpoint::Endpoint;
+use super::payload;
 use crate::journal::{self, Recorded};
 
 /// Read of an answer so that its connection can be used again; a longer one costs the connection.
 const ANSWER: usize = 4 << 10;
 
-/// A receiver that asks for more patience than this is asked again all the same: nobody may put off alerts
-/// for good.
+/// Upper limit of `Retry-After`: no receiver may put off alerts indefinitely.
 const LONGEST_RETRY_AFTER: Duration = Duration::from_secs(3600);
-
-/// Why a `ca_file` cannot be used.
-#[derive(Debug, thiserror::Error)]
-pub enum AuthorityError {
-    #[error(transparent)]
-    Unreadable(#[from] std::io::Error),
-    #[error("not PEM certificates: {0}")]
-    Malformed(#[from] reqwest::Error),
-    #[error("holds no certificate")]
-    Empty,
-}
 
 /// How a request ended.
 #[derive(Debug)]
@@ -81,35 +69,6 @@ impl std::fmt::Display for Cause {
             [.., outer, inner] => write!(f, "{outer}: {inner}"),
         }
     }
-}
-
-pub(super) fn build(index: usize, config: &Config, timeout: Duration, loopback: bool) -> Result<Client, Error> {
-    // Any earlier choice of the process stands.
-    let _ = rustls::crypto::ring::default_provider().install_default();
-    let mut builder = Client::builder()
-        .user_agent(concat!("oapwatch/", env!("CARGO_PKG_VERSION")))
-        .redirect(redirect::Policy::none())
-        .referer(false)
-        .connect_timeout(timeout.min(Duration::from_secs(10)))
-        .timeout(timeout)
-        .pool_idle_timeout(Duration::from_secs(60));
-    if loopback {
-        builder = builder.no_proxy();
-    }
-    if let Some(path) = &config.ca_file {
-        let authority = |cause| Error::Authority {
-            index,
-            path: path.clone(),
-            cause,
-        };
-        let pem = std::fs::read(path).map_err(|e| authority(e.into()))?;
-        let certificates = Certificate::from_pem_bundle(&pem).map_err(|e| authority(e.into()))?;
-        if certificates.is_empty() {
-            return Err(authority(AuthorityError::Empty));
-        }
-        builder = builder.tls_certs_merge(certificates);
-    }
-    builder.build().map_err(|cause| Error::Client { index, cause })
 }
 
 /// Makes one signed request and judges the answer.

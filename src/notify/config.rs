@@ -27,8 +27,8 @@ pub struct Config {
     /// Certificates (PEM) of a private authority that the receiver's certificate may come from.
     #[serde(default)]
     pub ca_file: Option<PathBuf>,
-    /// A cause that came back within this of the time it was last told of is told of again only once this is over, if it
-    /// is still there then, or at once if it has grown worse, s. 0 tells of every event.
+    /// A cause that returns within this time of its last notification is notified again only when the time is over, if it is
+    /// still there then, or at once if it has grown worse, s. 0 sends every event.
     #[serde(default)]
     pub cool_down_s: f64,
     /// Longest wait for an answer, s.

@@ -1,4 +1,4 @@
-//! One alert a cause within the cool-down: whether a receiver hears of an event now, later or never. Pure: times are
+//! One alert a cause within the cool-down: decides whether an event is sent now, later or never. Pure: times are
 //! [`Duration`]s on a clock that never jumps.
 
 use std::collections::BTreeMap;
@@ -18,17 +18,17 @@ pub(super) enum Ruling {
     Withhold(Vec<Waiting>),
 }
 
-/// A cause the receiver was told of.
+/// A cause that the receiver was notified of.
 #[derive(Debug)]
 struct Told {
     alert: Alert,
     at: Duration,
-    /// The worst that was told of it since.
+    /// The highest severity sent for it since.
     severity: Severity,
     has_cleared: bool,
 }
 
-/// An alert for a cause that the receiver was told of lately.
+/// An alert whose cause the receiver was notified of within the cool-down.
 #[derive(Debug)]
 struct Held {
     before: Told,

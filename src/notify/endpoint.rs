@@ -1,13 +1,13 @@
 //! Validates a `[[webhook]]` table and reads its secrets.
 
-use std::path::PathBuf;
 use std::time::Duration;
 
 use sha2::{Digest, Sha256};
 use url::{Host, Url};
 
-use super::signature::{SecretError, Signer};
-use super::{Config, client};
+use super::error::Error;
+use super::signature::Signer;
+use super::{Config, http};
 use crate::journal::Subscription;
 
 /// A `[[webhook]]` that can be sent to.
@@ -19,50 +19,6 @@ pub struct Endpoint {
     pub(super) client: reqwest::Client,
     pub(super) cool_down: Duration,
     subscription: Subscription,
-}
-
-/// Why a `[[webhook]]` cannot be used. `index` counts the tables from 1.
-#[derive(Debug, thiserror::Error)]
-pub enum Error {
-    #[error("[[webhook]] {index}: url: {cause}")]
-    Url { index: usize, cause: url::ParseError },
-    #[error("[[webhook]] {index}: url: expected https:// or http://, found {scheme}://")]
-    Scheme { index: usize, scheme: String },
-    #[error(
-        "[[webhook]] {index}: url: http:// to {host} would show alerts to anyone on the way; use https://, or set allow_http = true"
-    )]
-    Plain { index: usize, host: String },
-    #[error("[[webhook]] {index}: secret_file: {path}: {cause}")]
-    Unreadable {
-        index: usize,
-        path: PathBuf,
-        cause: std::io::Error,
-    },
-    #[error("[[webhook]] {index}: secret_file: {path}: line {line}: {cause}")]
-    Secret {
-        index: usize,
-        path: PathBuf,
-        line: usize,
-        cause: SecretError,
-    },
-    #[error("[[webhook]] {index}: ca_file: {path}: {cause}")]
-    Authority {
-        index: usize,
-        path: PathBuf,
-        cause: client::AuthorityError,
-    },
-    #[error("[[webhook]] {index}: timeout_s: expected 1 to 120, found {found}")]
-    Timeout { index: usize, found: f64 },
-    #[error("[[webhook]] {index}: cool_down_s: expected 0 to 86400, found {found}")]
-    CoolDown { index: usize, found: f64 },
-    #[error("[[webhook]] {index}: name: expected 1 to 64 letters, digits, '-' or '_', found `{found}`")]
-    Name { index: usize, found: String },
-    #[error("[[webhook]] {index}: `{name}` is taken by [[webhook]] {earlier}; give one of them another name")]
-    Twice { index: usize, earlier: usize, name: String },
-    #[error("[[webhook]] {index}: kinds: an empty list would send nothing; leave it out to send all")]
-    NoKinds { index: usize },
-    #[error("[[webhook]] {index}: {cause}")]
-    Client { index: usize, cause: reqwest::Error },
 }
 
 /// Validates all `[[webhook]]` tables and reads their secrets.
@@ -130,7 +86,7 @@ impl Endpoint {
         let timeout = Duration::from_secs_f64(config.timeout_s);
         Ok(Self {
             signer: read_secrets(index, config)?,
-            client: client::build(index, config, timeout, loopback)?,
+            client: http::build(index, config, timeout, loopback)?,
             cool_down: Duration::from_secs_f64(config.cool_down_s),
             subscription: Subscription {
                 endpoint: name.clone(),
@@ -201,7 +157,7 @@ fn is_name(name: &str) -> bool {
     (1..=64).contains(&name.len()) && name.chars().all(allowed)
 }
 
-/// The host, for people, and a hash of the whole URL, which is different for each and gives nothing away.
+/// The host, for readers, and a hash of the whole URL, which is unique and reveals nothing of it.
 fn name_of(url: &Url) -> String {
     let host: String = url
         .host_str()

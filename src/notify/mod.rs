@@ -8,6 +8,8 @@ mod clock;
 mod config;
 mod cooling;
 mod endpoint;
+mod error;
+mod http;
 mod payload;
 mod queue;
 mod schedule;
@@ -28,12 +30,13 @@ use worker::{Command, Worker};
 
 pub use clock::Clock;
 pub use config::Config;
-pub use endpoint::{Endpoint, Error, load};
+pub use endpoint::{Endpoint, load};
+pub use error::Error;
 pub use status::{EndpointState, EndpointStatus};
 
-/// How long a request of the operator waits for a busy disk, and in which steps.
-const PATIENCE: Duration = Duration::from_secs(3);
-const STEP: Duration = Duration::from_millis(100);
+/// How long a replay waits for a busy disk, and how often it looks.
+const REPLAY_TIMEOUT: Duration = Duration::from_secs(3);
+const REPLAY_POLL: Duration = Duration::from_millis(100);
 
 /// Why a request of the operator cannot be met.
 #[derive(Debug, thiserror::Error)]
@@ -83,7 +86,7 @@ pub fn spawn(
 }
 
 impl Notifier {
-    /// How each endpoint fares, in the order of the config.
+    /// Status of each endpoint, in the order of the config.
     pub fn status(&self) -> Vec<EndpointStatus> {
         self.shown.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
@@ -107,11 +110,11 @@ impl Notifier {
         // A disk that is only busy is back within a moment.
         let mut waited = Duration::ZERO;
         while !self.journal.health().writable {
-            if waited >= PATIENCE {
+            if waited >= REPLAY_TIMEOUT {
                 return Err(AskError::ReadOnly);
             }
-            tokio::time::sleep(STEP).await;
-            waited += STEP;
+            tokio::time::sleep(REPLAY_POLL).await;
+            waited += REPLAY_POLL;
         }
         self.ask(|done| Command::Replay { endpoint, seq, done }).await
     }

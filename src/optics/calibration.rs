@@ -1,4 +1,4 @@
-//! What a calibration knows about one device beyond its data sheet.
+//! The calibration of one device: geometry, spot, noise and pixel maps.
 
 use std::sync::Arc;
 
@@ -21,7 +21,7 @@ pub struct Calibration {
 }
 
 impl Calibration {
-    /// What an uncalibrated camera assumes.
+    /// The calibration that an uncalibrated camera assumes.
     pub fn of(camera: &Camera) -> Self {
         Self {
             distortion: camera.distortion,

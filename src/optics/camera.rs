@@ -1,3 +1,5 @@
+//! The camera: photodetector array, lens, and the maps between sensor and ground.
+
 use std::sync::Arc;
 
 use super::distortion::Distortion;

@@ -1,4 +1,4 @@
-//! Why a camera or its calibration cannot be used.
+//! Errors of a camera and its calibration.
 
 use std::path::PathBuf;
 

@@ -1,4 +1,4 @@
-//! The optics as pure functions. No IO, no clock, no randomness.
+//! Layer 0: the optics as pure functions, without IO, clock or randomness.
 
 pub mod blur;
 mod calibration;

@@ -1,4 +1,4 @@
-//! Per-pixel corrections of one device, and how they are undone in a frame.
+//! Per-pixel corrections of one device, and their application to frames.
 
 use ndarray::{Array2, Zip};
 
@@ -67,7 +67,7 @@ impl PixelMaps {
             .and(&self.dark_j)
             .for_each(|y, &gain, &dark| {
                 let corrected = (*y - dark) / gain;
-                // Just below the ceiling a low gain could lift a sound pixel to it.
+                // Division by a low gain could raise an unsaturated pixel to the saturation level.
                 *y = if *y >= ceiling {
                     corrected.max(ceiling)
                 } else {

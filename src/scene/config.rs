@@ -1,3 +1,5 @@
+//! The scene file.
+
 use std::collections::HashSet;
 use std::path::Path;
 
@@ -10,12 +12,12 @@ use super::motion::{Motion, Schedule};
 use crate::toml_file::{Key, OutOfRange};
 use crate::{optics, toml_file};
 
-/// A scene file. Only `optics` and `link` have defaults that do something (the paper's); everything else is there
-/// because the file names it.
+/// A scene file. Only `optics` and `link` have default values (the paper's); every other table has an effect only where the file
+/// names it.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Scene {
-    /// What the scene is for, in a sentence.
+    /// Purpose of the scene, one sentence.
     pub about: String,
     pub rate_hz: f64,
     /// Effects that change no pixel by more than this share of σ_n may be left out.
@@ -29,7 +31,7 @@ pub struct Scene {
     pub effects: Effects,
 }
 
-/// What every beam has in common; the paper's values when left out.
+/// Parameters common to all beams; the paper's values when left out.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct LinkConfig {
@@ -43,11 +45,11 @@ pub struct LinkConfig {
     pub efficiency: f64,
     /// T_int.
     pub integration_time_s: f64,
-    /// T_coh, over which fading and pointing offset stay what they are.
+    /// T_coh, over which fading and pointing offset are constant.
     pub coherence_time_s: f64,
 }
 
-/// Emitters drawn anew for every frame: how many, and where, both uniform.
+/// Emitters drawn anew for every frame: number and positions, both uniform.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RandomEmittersConfig {
@@ -63,7 +65,7 @@ pub struct RandomEmittersConfig {
 pub struct UserConfig {
     pub name: String,
     pub motion: Motion,
-    /// Where the network's log says it is, when that is not the truth.
+    /// Claimed position, where it differs from the true one.
     pub claimed: Option<Motion>,
     #[serde(default)]
     pub present: Schedule,
@@ -73,7 +75,7 @@ pub struct UserConfig {
     pub power_w: Option<f64>,
 }
 
-/// A beam that nobody claims.
+/// A beam without a claim.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct IntruderConfig {
@@ -165,7 +167,7 @@ impl Scene {
         }
     }
 
-    /// The scene that the program runs on when nothing is configured.
+    /// The built-in scene, used when none is configured.
     pub fn builtin() -> Self {
         toml::from_str(include_str!("../../config/scenes/builtin.toml")).expect("a test reads the embedded scene")
     }
@@ -235,7 +237,7 @@ impl UserConfig {
             let Some(motion) = motion else { continue };
             let field = field.at(name);
             if let Motion::Beside(_) | Motion::AtClaimOf(_) = motion {
-                return Err(field.refuse("a motion of its own (only an intruder follows somebody)", motion));
+                return Err(field.refuse("a motion of its own (only an intruder can follow a user)", motion));
             }
             motion.validate(&field)?;
         }

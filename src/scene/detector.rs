@@ -1,4 +1,4 @@
-//! From the light on the array to the energies that are read out.
+//! The detector: converts light on the array to the energies read out.
 
 use ndarray::Array2;
 
@@ -17,7 +17,7 @@ use crate::toml_file::{Key, OutOfRange};
 /// The array and its read-out.
 #[derive(Debug)]
 pub(super) struct Detector {
-    /// Blots of light that come and go.
+    /// Glints that vary with time.
     glints: Vec<(Glint, Spot)>,
     gain: Option<Vec<f64>>,
     /// Background, steady glints and dark current in one image: every pixel's energy without a beam, J.
@@ -163,12 +163,12 @@ impl Detector {
             (None, Some(_)) => decisions.note(
                 Effect::Saturation,
                 Status::On,
-                "optics.saturation_j says so: every pixel is clipped",
+                "optics.saturation_j is set: every pixel is clipped",
             ),
             (Some(_), Some(_)) => decisions.note(
                 Effect::Saturation,
                 Status::On,
-                "full pixels spill; every pixel is clipped",
+                "full pixels spill over; every pixel is clipped",
             ),
             (Some(_), None) => {
                 let field = field.at("saturation").at("level_j");

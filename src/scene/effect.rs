@@ -1,6 +1,6 @@
 //! The effects by name, and the numbers that key their random streams.
 
-/// Calls a macro with every effect that has a table under `[effects]`: its number, name, key and table, in the order of the light's way.
+/// Calls a macro with every effect that has a table under `[effects]`: its number, name, key and table, in the order in which light passes them.
 macro_rules! effect_list {
     ($declare:ident) => {
         $declare! {
@@ -32,7 +32,7 @@ pub(super) use effect_list;
 
 macro_rules! declare_effect {
     ($($number:literal $effect:ident $field:ident: $table:ty,)*) => {
-        /// Everything that a scene can switch on. The numbers key the random streams: they never change.
+        /// Every effect that a scene can enable. The numbers key the random streams and never change.
         #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
         #[repr(usize)]
         pub enum Effect {
@@ -49,10 +49,10 @@ macro_rules! declare_effect {
         }
 
         impl Effect {
-            /// Every effect that has a table under `[effects]`, in the order of the light's way.
+            /// Every effect that has a table under `[effects]`, in the order in which light passes them.
             pub const TABLES: &[Self] = &[$(Self::$effect,)*];
 
-            /// The key of its table under `[effects]`, or what else the scene calls it.
+            /// The key of its table under `[effects]`, or its other name in the scene.
             pub fn name(self) -> &'static str {
                 match self {
                     $(Self::$effect => stringify!($field),)*
@@ -71,6 +71,6 @@ macro_rules! declare_effect {
 effect_list!(declare_effect);
 
 impl Effect {
-    /// Room for every number.
-    pub(super) const ROOM: usize = 31;
+    /// Length of an array indexed by effect number.
+    pub(super) const SLOTS: usize = 31;
 }

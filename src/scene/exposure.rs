@@ -1,4 +1,4 @@
-//! How a spot moves while the shutter is open.
+//! Motion of a spot during an exposure, as sub-frames.
 
 use super::config::Scene;
 use super::effect::Effect;

@@ -1,4 +1,4 @@
-//! From a beam to the spots that it leaves on the sensor during one exposure.
+//! Converts a beam to its spots on the sensor during one exposure.
 
 use super::average::Average;
 use super::config::Scene;
@@ -14,10 +14,10 @@ use super::report::{Decisions, Status};
 use super::stream::{Ledger, Streams};
 use crate::optics::{Camera, geometry, psf};
 
-/// Everything between a beam and its spots.
+/// The optical path between a beam and its spots.
 #[derive(Debug)]
 pub(super) struct Light {
-    /// The camera as it is, not as its data sheet has it.
+    /// The true camera, which may differ from its data sheet.
     pub lens: Camera,
     /// T_int · η_s · τ · (2/(π w_z²)) · π r_a²: energy per watt of a beam straight below that does not miss, J/W.
     straight_j_per_w: f64,
@@ -29,7 +29,7 @@ pub(super) struct Light {
     exposure: Exposure,
 }
 
-/// What the beams of one frame share, and room to work in.
+/// Values that all beams of a frame share, and buffers.
 #[derive(Debug, Default)]
 pub(super) struct Shot {
     rotation: attitude::Rotation,
@@ -167,7 +167,7 @@ impl Light {
         std::array::from_fn(|k| (sensor[k] - axis[k]) / corner)
     }
 
-    /// Prepares what all beams of a frame share.
+    /// Computes the values that all beams of a frame share.
     pub fn open(&self, at: Moment<'_>, shot: &mut Shot) {
         if let Some(pose) = &self.pose {
             shot.rotation = pose.at(at.k, at.t, at.streams, at.ledger);

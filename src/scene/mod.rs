@@ -1,5 +1,5 @@
-//! Floor 1: scene file → plan (only the effects it calls for) → frames with truth. Never uses `estimate`: the simulator
-//! must stay an independent judge of the estimator.
+//! Layer 1: scene file → plan (only the effects it calls for) → frames with truth. Never uses `estimate`: the simulator must stay
+//! an independent reference for the estimator.
 
 mod average;
 mod config;

@@ -1,8 +1,8 @@
-//! One frame's place in time and in the random streams.
+//! Number, time and random streams of one frame.
 
 use super::stream::{Ledger, Streams};
 
-/// Frame number, time and where its randomness comes from.
+/// Frame number, time and random streams.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Moment<'a> {
     pub k: u64,

@@ -1,4 +1,4 @@
-//! Where an emitter is at a time, computed from the time alone, and when it is there at all.
+//! Position and presence of an emitter as functions of time alone.
 
 use serde::{Deserialize, Serialize};
 
@@ -8,17 +8,17 @@ use crate::toml_file::{Key, OutOfRange};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Motion {
-    /// Stays here.
+    /// Stays at one place.
     Still([f64; 2]),
-    /// Walks round a closed course at a steady pace.
+    /// Walks a closed course at constant speed.
     Walk(Walk),
-    /// Stands, then leaves in a straight line.
+    /// Stands, then moves away in a straight line.
     Drift(Drift),
-    /// Wanders about a home: a stationary Gaussian process per axis.
+    /// Moves about a centre: a stationary Gaussian process per axis.
     Roam(Roam),
-    /// Keeps beside a user's true position.
+    /// Stays at an offset from a user's true position.
     Beside(Beside),
-    /// Is where a user claims to be.
+    /// Is at a user's claimed position.
     AtClaimOf(Beside),
 }
 
@@ -44,7 +44,7 @@ pub struct Roam {
     pub home_m: [f64; 2],
     /// Standard deviation per axis.
     pub spread_m: f64,
-    /// Time over which the position forgets itself: autocovariance spread²·exp(−τ²/2T²), speed spread/T per axis.
+    /// Correlation time: autocovariance spread²·exp(−τ²/2T²), speed spread/T per axis.
     pub time_s: f64,
 }
 
@@ -124,7 +124,7 @@ impl Drift {
     }
 }
 
-/// When something is there: from `from_s` until `until_s`, and again every `every_s`.
+/// When an emitter is present: from `from_s` until `until_s`, and again every `every_s`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Schedule {
@@ -157,7 +157,7 @@ impl Schedule {
         }
     }
 
-    /// Whether it is there at `t` seconds.
+    /// Whether it is present at `t` seconds.
     pub fn on(&self, t: f64) -> bool {
         self.session(t).is_some()
     }

@@ -1,4 +1,4 @@
-//! What the access network logs about its users: late, lost, noisy or plainly false, as the scene has it.
+//! The access network's log of its users: claims that are late, lost, noisy or false as the scene specifies.
 
 use rand::RngExt;
 use rand_distr::{Distribution, StandardNormal};
@@ -11,7 +11,7 @@ use super::stream::{Ledger, Streams};
 use super::truth::Role;
 use crate::claim::ClaimState;
 
-/// A claim before it has a calendar date.
+/// A claim on the clock of the scene.
 #[derive(Clone, Debug)]
 pub(super) struct Statement {
     /// The time that it states, s.
@@ -36,7 +36,7 @@ impl Network {
         ] {
             match (on, has_users) {
                 (true, true) => decisions.note(effect, Status::On, "one draw a claim"),
-                (true, false) => decisions.note(effect, Status::Off, "nobody claims"),
+                (true, false) => decisions.note(effect, Status::Off, "no user claims a position"),
                 (false, _) => decisions.note(effect, Status::Off, "not in the scene"),
             }
         }
@@ -47,7 +47,7 @@ impl Network {
         self.config.sigma_m
     }
 
-    /// Statements that arrive after `after` and not after `until` (s), in the order of their arrival.
+    /// Statements that arrive in (`after`, `until`], s, in the order of their arrival.
     pub fn arrivals(
         &self,
         population: &Population,
@@ -67,7 +67,7 @@ impl Network {
                     continue;
                 };
                 if arrival > after && arrival <= until {
-                    let at_m = self.heard(actor, population.claimed(index, stated), stated, streams, ledger);
+                    let at_m = self.logged_position(actor, population.claimed(index, stated), stated, streams, ledger);
                     let statement = Statement {
                         stated,
                         actor: index,
@@ -82,7 +82,7 @@ impl Network {
         found.into_iter().map(|(_, statement)| statement).collect()
     }
 
-    /// What a user states after `after` and not after `until`: where it is, from the start of each session on, and the end.
+    /// Statements of a user in (`after`, `until`], s: positions from the start of each session on, and its end.
     fn statements(&self, actor: &Actor, after: f64, until: f64) -> Vec<(f64, ClaimState)> {
         let period = self.config.period_s;
         let mut found = Vec::new();
@@ -98,7 +98,7 @@ impl Network {
         found
     }
 
-    /// When a statement reaches the log, if ever.
+    /// Time at which a statement reaches the log, s; none when it is lost.
     fn arrival(&self, actor: &Actor, stated: f64, streams: Streams, ledger: &Ledger) -> Option<f64> {
         let open = |effect| streams.open(effect, actor.entity, stated.to_bits(), ledger);
         if self.config.lost > 0.0 && open(Effect::ClaimLoss).random::<f64>() < self.config.lost {
@@ -111,8 +111,15 @@ impl Network {
         Some(arrival)
     }
 
-    /// The position that the log gets for the one that was stated, m.
-    fn heard(&self, actor: &Actor, at_m: [f64; 2], stated: f64, streams: Streams, ledger: &Ledger) -> [f64; 2] {
+    /// Logged position for a stated one, m.
+    fn logged_position(
+        &self,
+        actor: &Actor,
+        at_m: [f64; 2],
+        stated: f64,
+        streams: Streams,
+        ledger: &Ledger,
+    ) -> [f64; 2] {
         if self.config.noise_m == 0.0 {
             return at_m;
         }

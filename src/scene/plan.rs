@@ -1,3 +1,5 @@
+//! The compiled scene, which makes frames.
+
 use std::sync::Arc;
 
 use jiff::{SignedDuration, Timestamp};
@@ -22,7 +24,7 @@ use crate::claim::Claim;
 use crate::frame::Frame;
 use crate::optics::{Calibration, Camera};
 
-/// A scene compiled, with a seed, into the cheapest chain that makes its frames.
+/// A scene compiled with a seed into the cheapest chain that makes its frames.
 #[derive(Debug)]
 pub struct Plan {
     camera: Camera,
@@ -37,7 +39,7 @@ pub struct Plan {
     decisions: Vec<Decision>,
 }
 
-/// Makes frames of a plan one after the other, keeping its room to work in.
+/// Makes frames of a plan one after the other and reuses its buffers.
 #[derive(Debug)]
 pub struct Maker<'p> {
     plan: &'p Plan,
@@ -48,7 +50,7 @@ pub struct Maker<'p> {
     renderer: Renderer,
 }
 
-/// Frames that a repeated frame looks back for one that was delivered.
+/// Most earlier frames that are searched for the delivered one that a repeated frame shows.
 const LOOK_BACK: u64 = 1000;
 
 impl Plan {
@@ -95,12 +97,12 @@ impl Plan {
         Self { start, ..self }
     }
 
-    /// The camera as its data sheet, `[optics]`, has it.
+    /// The camera of the data sheet, `[optics]`.
     pub fn camera(&self) -> &Camera {
         &self.camera
     }
 
-    /// What a perfect calibration of the camera would find.
+    /// The result of a perfect calibration of the camera.
     pub fn calibration(&self) -> Calibration {
         let lens = &self.light.lens;
         Calibration {
@@ -116,7 +118,7 @@ impl Plan {
         self.rate_hz
     }
 
-    /// What is simulated, what is not, and why.
+    /// The decision about each effect, with its reason.
     pub fn decisions(&self) -> &[report::Decision] {
         &self.decisions
     }
@@ -155,7 +157,7 @@ impl Plan {
     }
 
     fn claims_counting(&self, k: u64, ledger: &Ledger) -> Vec<Claim> {
-        // Sessions that began before frame 0 say where they are with their next claim.
+        // Sessions that began before frame 0 state their position with their next claim.
         let after = if k == 0 {
             -1.0 / self.rate_hz
         } else {
@@ -176,7 +178,7 @@ impl Plan {
         arrivals.into_iter().map(claim).collect()
     }
 
-    /// What became of frame `k`, and the frame whose pixels arrive in its place.
+    /// The fate of frame `k`, and the frame whose pixels arrive in its place.
     fn fate(&self, k: u64, ledger: &Ledger) -> (Fate, u64) {
         let Some(loss) = &self.frame_loss else {
             return (Fate::Delivered, k);
@@ -261,7 +263,7 @@ impl Maker<'_> {
         emitters
     }
 
-    /// Fills `self.spots` for frame `k`; gives who is there.
+    /// Fills `self.spots` for frame `k`; returns its emitters.
     fn cast(&mut self, k: u64) -> Vec<EmitterTruth> {
         let plan = self.plan;
         let at = Moment {

@@ -1,4 +1,4 @@
-//! Who is there, and where, at a time.
+//! The emitters present at a time, and their positions.
 
 use rand::RngExt;
 
@@ -9,6 +9,7 @@ use super::process::GaussianProcess;
 use super::report::{Decisions, Status};
 use super::stream::{Ledger, Streams};
 use super::truth::Role;
+use crate::hash::fnv1a;
 
 /// One beam in one frame.
 #[derive(Clone, Copy, Debug)]
@@ -34,7 +35,7 @@ pub(super) struct Actor {
     pub entity: u64,
 }
 
-/// A motion ready to be evaluated at any time.
+/// A motion prepared for evaluation at any time.
 #[derive(Debug)]
 enum Path {
     Own(Motion),
@@ -122,7 +123,7 @@ impl Population {
         }
     }
 
-    /// Says who is there.
+    /// Notes who is simulated in the plan.
     pub fn explain(&self, decisions: &mut Decisions) {
         match &self.random {
             Some(random) => {
@@ -139,11 +140,11 @@ impl Population {
             .count();
         let moving = self.actors.iter().filter(|a| self.speed(&a.path) > 0.0).count();
         match (moving, roaming) {
-            (0, _) => decisions.note(Effect::Motion, Status::Off, "nobody moves"),
+            (0, _) => decisions.note(Effect::Motion, Status::Off, "no emitter moves"),
             (_, 0) => decisions.note(
                 Effect::Motion,
                 Status::On,
-                format!("{moving} move, each where its time says"),
+                format!("{moving} move, each a function of time"),
             ),
             _ => {
                 let reason = format!("{moving} move, {roaming} of them at random, drawn once");
@@ -176,7 +177,7 @@ impl Population {
         self.along(&self.actors[actor].path, t)
     }
 
-    /// Where the network's log says a user is at `t` seconds, m.
+    /// Claimed position of a user at `t` seconds, m.
     pub fn claimed(&self, actor: usize, t: f64) -> [f64; 2] {
         match &self.actors[actor].claimed {
             Some(path) => self.along(path, t),
@@ -227,9 +228,7 @@ impl Population {
     }
 }
 
-/// Keys an actor's streams by its name (FNV-1a, 64 bit), so that adding another leaves them as they are.
+/// Keys an actor's streams by its name, so that adding another leaves them unchanged.
 fn entity(name: &str) -> u64 {
-    name.bytes().fold(0xcbf2_9ce4_8422_2325, |hash, byte| {
-        (hash ^ u64::from(byte)).wrapping_mul(0x0000_0100_0000_01b3)
-    })
+    fnv1a(name.bytes())
 }

@@ -1,4 +1,4 @@
-//! A stationary Gaussian process that can be evaluated at any time without its past.
+//! A stationary Gaussian process that can be evaluated at any time without earlier values.
 
 use std::f64::consts::TAU;
 

@@ -1,4 +1,4 @@
-//! Spots onto pixels, separably and only as far out as their tails matter.
+//! Renders spots onto pixels, separably and only where their tails are significant.
 
 use std::sync::LazyLock;
 
@@ -38,7 +38,7 @@ impl Renderer {
     }
 }
 
-/// Fills `out` with what the pixels within reach collect along one axis; gives the first of them.
+/// Fills `out` with the fractions that the pixels within reach collect along one axis; returns the first of them.
 fn window(axis: &Axis, centre: f64, sigma: f64, out: &mut Vec<f64>) -> usize {
     let n = axis.n as f64;
     let pixel = |x: f64| ((x - axis.min_m) / axis.pitch_m).clamp(0.0, n);
@@ -62,7 +62,7 @@ fn window(axis: &Axis, centre: f64, sigma: f64, out: &mut Vec<f64>) -> usize {
 
 /// Φ by Taylor's polynomial of degree 6 about the nearest of these nodes: its error, φ·He₆·d⁷/5040 at |d| ≤ 1/128, is below
 /// 10⁻¹⁷, so that rounding, below 4·10⁻¹⁶, is all of it. The difference of two is then good to 10⁻¹⁵ of the whole spot, far
-/// below any noise; the relative error in the tail, which an estimator's derivatives ask for, is `optics::psf`'s business.
+/// below any noise. The relative accuracy in the tails that an estimator's derivatives need is provided by `optics::psf`.
 struct NormalTable {
     /// (Φ, φ) at −REACH_LIMIT + k/64.
     nodes: Vec<(f64, f64)>,

@@ -1,6 +1,8 @@
+//! Which effects a plan simulates, and why.
+
 use super::effect::Effect;
 
-/// What a plan does about one effect.
+/// Decision of a plan about one effect.
 #[derive(Clone, Debug)]
 pub struct Decision {
     pub effect: Effect,
@@ -12,11 +14,11 @@ pub struct Decision {
 pub enum Status {
     /// Simulated in every frame.
     On,
-    /// The scene does not call for it.
+    /// Not in the scene.
     Off,
     /// Simulated exactly by something that was computed once, when the scene was compiled.
     Folded,
-    /// Left out, because the scene tolerates what that changes.
+    /// Left out, because its change is within the tolerance of the scene.
     BelowTolerance,
 }
 
@@ -31,7 +33,7 @@ impl Status {
     }
 }
 
-/// Weighs each effect against the noise while a plan is compiled.
+/// Decides for each effect whether it is simulated, while a plan is compiled.
 #[derive(Debug)]
 pub(super) struct Decisions {
     noise_std_j: f64,

@@ -13,7 +13,7 @@ use super::effect::Effect;
 
 /// How many 32-bit words each effect has drawn.
 #[derive(Debug, Default)]
-pub struct Ledger([Cell<u64>; Effect::ROOM]);
+pub struct Ledger([Cell<u64>; Effect::SLOTS]);
 
 impl Ledger {
     /// 32-bit random words that `effect` has drawn.
@@ -44,7 +44,7 @@ impl Streams {
     }
 }
 
-/// A random generator that enters what it drew in the ledger when it is done.
+/// A random generator that records its number of draws in the ledger when dropped.
 pub(super) struct Stream<'a> {
     rng: ChaCha8Rng,
     drawn: &'a Cell<u64>,

@@ -1,3 +1,5 @@
+//! The truth of a frame: which emitter was where.
+
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 
@@ -5,18 +7,18 @@ use super::Fate;
 use crate::claim::Claim;
 use crate::frame::Frame;
 
-/// What a plan makes of one frame number.
+/// A simulated frame with its truth and claims.
 #[derive(Clone, Debug)]
 pub struct SimulatedFrame {
     pub frame: Frame,
     pub truth: Truth,
     /// The claims that reached the network's log since the frame before, in the order of their arrival.
     pub claims: Vec<Claim>,
-    /// Whether the frame arrived; a live source hands on only the claims of one that did not.
+    /// Whether the frame arrived; a live source passes on only the claims of a lost one.
     pub fate: Fate,
 }
 
-/// Who was where in a frame.
+/// Emitters of a frame.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Truth {
     pub frame: u64,
@@ -43,7 +45,7 @@ pub struct EmitterTruth {
 pub enum Role {
     /// A legitimate user of the network.
     User,
-    /// A beam that the network knows nothing of.
+    /// A beam that the network does not know.
     Intruder,
     /// Drawn anew for this frame.
     Random,

@@ -1,5 +1,6 @@
-//! Floor 4: studies: what accuracy costs in time, numerical stability, training data.
+//! Layer 4: studies of accuracy against time and of numerical stability, and training data.
 
+pub mod ablation;
 pub mod golden;
 pub mod samples;
 pub mod stability;

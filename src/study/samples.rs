@@ -1,4 +1,4 @@
-//! Training samples as a byte stream, so that a trainer needs neither a forward model nor a disk of its own.
+//! Writes training samples as a byte stream, so that a trainer needs neither a forward model nor stored data.
 //!
 //! One JSON line describes the stream (`Layout`); then each sample is `slots` × (column, row, energy) followed by
 //! ny × nx pixels, all little-endian f4. Columns and rows count pixels, a pixel's centre at its integer; unused slots are
@@ -33,7 +33,7 @@ struct Layout {
 /// Why the stream ended early.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
-    #[error("frame {frame} holds {found} emitters, a sample has room for {SLOTS}")]
+    #[error("frame {frame} holds {found} emitters, a sample can hold {SLOTS}")]
     TooManyEmitters { frame: u64, found: usize },
     #[error(transparent)]
     Io(#[from] std::io::Error),

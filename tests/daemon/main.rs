@@ -85,6 +85,14 @@ fn a_bad_config_ends_the_program_before_a_port_is_bound() {
             "monitor.tolerated_distance_m",
         ),
         (
+            "[monitor]\ndecision_s = 1e9\n",
+            "monitor.decision_s: expected 0.001 to 3600",
+        ),
+        ("[source]\nrate_hz = 25.0\n", "expected 10, the rate of the scene"),
+        ("[log]\nlevel = \"loud\"\n", "log.level: expected off, error"),
+        ("[record]\n", "record.folder: expected a folder"),
+        ("[journal]\npath = \"absent/oapwatch.db\"\n", "found no folder"),
+        (
             "[[webhook]]\nurl = \"http://127.0.0.1:1\"\nsecret_file = \"absent\"\n",
             "absent",
         ),
@@ -133,13 +141,23 @@ fn what_the_daemon_records_is_reviewed_to_the_same_alert() {
     daemon.wait_for("/v1/positions", "frames after the alert", |v| {
         v["frame"].as_u64() > raised["source"]["frame"].as_u64().map(|k| k + 10)
     });
+    let id = raised["id"].as_str().unwrap();
+    let told = daemon.wait_for(&format!("/v1/alerts/{id}/evidence.json"), "evidence", |v| {
+        v["position"].is_u64()
+    });
+    let position = told["position"].as_u64().unwrap() as usize;
+    assert_eq!(told["frames"][position]["index"], raised["source"]["frame"]);
     daemon.signal("-TERM");
     assert_eq!(daemon.end().0, Some(0));
 
     let file = Path::new(raised["source"]["file"].as_str().unwrap());
     assert!(file.is_file(), "the alert names {}", file.display());
-    let id = raised["id"].as_str().unwrap();
-    assert!(dir.path().join(format!("recordings/evidence/{id}.npy")).is_file());
+    let evidence = format!("recordings/evidence/{id}.npy");
+    assert!(
+        file.ends_with(&evidence),
+        "the ring's own segment is deleted in time, {evidence} is not: {}",
+        file.display()
+    );
     let config = dir.path().join("review.toml");
     for recording in ["recordings".to_owned(), format!("recordings/evidence/{id}.npy")] {
         std::fs::write(
@@ -210,5 +228,8 @@ fn a_flood_of_invented_names_hides_no_eavesdropper() {
     let flooded: Value = serde_json::from_str(&flooded).unwrap();
     assert_eq!(alerts(&flooded).len(), 1, "{flooded}");
     let evidence = &alerts(&flooded)[0]["evidence"];
-    assert!(evidence["users"].as_u64() <= evidence["max_users"].as_u64(), "{evidence}");
+    assert!(
+        evidence["users"].as_u64() <= evidence["max_users"].as_u64(),
+        "{evidence}"
+    );
 }

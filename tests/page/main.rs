@@ -90,10 +90,54 @@ async fn an_eavesdropper_comes_is_acknowledged_and_goes_and_a_restart_is_survive
     .await;
     page.screenshot("eavesdropper").await;
 
-    page.eval(&format!("document.querySelector('{card} .acts button').click()"))
-        .await;
+    until(
+        &mut page,
+        "its severity is said in a word",
+        &format!("document.querySelector('{card} .severity').textContent.length > 3"),
+    )
+    .await;
+    until(
+        &mut page,
+        "and its evidence in sentences",
+        &format!("/seen for .* without a claim/.test(document.querySelector('{card} .evidence').textContent)"),
+    )
+    .await;
+    until(
+        &mut page,
+        "with a picture",
+        &format!("document.querySelector('{card} .thumbnail img').naturalWidth >= 256"),
+    )
+    .await;
+    until(
+        &mut page,
+        "the reader is warned of the simulator",
+        "document.getElementById('notices').textContent.includes('no camera is watched')",
+    )
+    .await;
+    page.eval(&format!(
+        "document.querySelector('{card} .note').value = 'unit 3 goes'; document.querySelector('{card} .acts button').click()"
+    ))
+    .await;
     let acknowledged = "!!document.querySelector('#list li.unclaimed_emitter.acknowledged')";
     until(&mut page, "the acknowledgement is shown", acknowledged).await;
+    until(
+        &mut page,
+        "with its note",
+        "document.querySelector('#list .acknowledgement').textContent.includes('unit 3 goes')",
+    )
+    .await;
+    page.eval("document.querySelector('#list li.acknowledged .acts button').click()")
+        .await;
+    until(&mut page, "and undone", &format!("!!document.querySelector('{card}')")).await;
+    page.eval("const r = document.getElementById('moment'); r.value = 1; r.dispatchEvent(new Event('input'))")
+        .await;
+    until(
+        &mut page,
+        "the past is named",
+        "document.getElementById('link').textContent === 'looking back' && !document.getElementById('past-banner').hidden",
+    )
+    .await;
+    page.eval("document.getElementById('present').click()").await;
     until(
         &mut page,
         "the eavesdropper goes",

@@ -1,6 +1,7 @@
 //! Every fault that the virtual camera offers: it must be counted, and frames must come again.
 
 use std::fs;
+use std::io::Read;
 use std::process::Command;
 use std::time::{Duration, Instant};
 
@@ -259,9 +260,11 @@ fn busy(metrics: &PrometheusHandle) -> Outcome {
     let mut other = Command::new("v4l2-ctl")
         .args(["-d", CAPTURE, "--stream-mmap", "--stream-count=100000"])
         .stdout(std::process::Stdio::null())
-        .stderr(std::process::Stdio::null())
+        .stderr(std::process::Stdio::piped())
         .spawn()?;
-    std::thread::sleep(Duration::from_secs(1));
+    // The tool writes to stderr with every frame: from the first on, it holds the device.
+    let mut frames = other.stderr.take().ok_or("v4l2-ctl without stderr")?;
+    frames.read_exact(&mut [0])?;
     let config = source(|v4l2| v4l2.roi = Some([0, 0, 320, 320]));
     let capture = start(&config, &camera([32, 32], 1e-9))?;
     let counted = provoke(metrics, &capture, "busy", || Ok(()));

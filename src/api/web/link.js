@@ -1,15 +1,11 @@
 // The connection to the daemon: one WebSocket that is resumed where it broke, and requests with the same token.
 
-const SILENCE_MS = 8000;
-
 export class Link {
   constructor(on) {
     this.on = on; // { state(name), message(object), ask(why) }
     this.seq = null;
     this.tries = 0;
-    this.heard = 0;
     this.open();
-    setInterval(() => this.watch(), 1000);
     addEventListener("online", () => this.again(0));
   }
 
@@ -65,7 +61,6 @@ export class Link {
     const socket = new WebSocket(`${scheme}//${location.host}/v1/stream${after}`, protocols);
     this.socket = socket;
     socket.onmessage = (e) => {
-      this.heard = Date.now();
       const message = JSON.parse(e.data);
       this.seq = message.seq;
       if (message.type === "snapshot") {
@@ -91,12 +86,6 @@ export class Link {
     this.on.state("lost");
     clearTimeout(this.timer);
     this.timer = setTimeout(() => this.open(), wait);
-  }
-
-  // A cable that was pulled says nothing.
-  watch() {
-    const open = this.socket?.readyState === WebSocket.OPEN;
-    if (open && this.heard && Date.now() - this.heard > SILENCE_MS) this.on.quiet(Date.now() - this.heard);
   }
 }
 

@@ -1,9 +1,13 @@
+// Puts the page together: messages of the stream go to the map, the tables and the list of alerts.
+
 import { Alerts } from "./alerts.js";
+import { Beams } from "./beams.js";
+import { Bell } from "./bell.js";
 import { Link } from "./link.js";
 import { GroundMap } from "./map.js";
 import { claimIcon, icon } from "./marks.js";
 import { Timeline } from "./timeline.js";
-import { STATUS, clock, el, lasting, metres, micros } from "./words.js";
+import { el, fullStamp, lasting, micros, shown, zone } from "./words.js";
 
 const $ = (id) => document.getElementById(id);
 const FRAME_EVERY_MS = 500;
@@ -13,11 +17,20 @@ let arrived = 0; // when it came, by our clock
 let linkState = "connecting";
 let wanted = false; // whether a redraw is due
 
-const map = new GroundMap($("map"));
+const bell = new Bell();
+const map = new GroundMap($("map"), { pick: (key) => beams.pick(key) });
+const beams = new Beams({
+  point: (key) => map.point(key),
+  pick(key, place) {
+    beams.pick(key);
+    map.pick(place, key);
+  },
+});
 const timeline = new Timeline({ changed: redraw });
-const link = new Link({ state: onState, message: onMessage, ask, quiet: banner });
+const link = new Link({ state: onState, message: onMessage, ask });
 const alerts = new Alerts(link, {
   changed: redraw,
+  raised: (alert) => bell.raised(alert),
   pick(place, alert) {
     const raised = Date.parse(alert.raised_at);
     if (alert.cleared_at && timeline.moments.length && raised >= Date.parse(timeline.moments[0].time)) timeline.go(raised + 1000);
@@ -31,7 +44,7 @@ for (const [id, act] of [["zoom-in", () => map.zoomBy(1.5)], ["zoom-out", () => 
   $(id).addEventListener("click", act);
 }
 addEventListener("keydown", (e) => {
-  if (e.ctrlKey || e.metaKey || e.altKey || e.target.matches("input:not([type=range])")) return;
+  if (e.ctrlKey || e.metaKey || e.altKey || e.target.matches("input:not([type=range]), select, textarea")) return;
   const acts = { "+": () => map.zoomBy(1.5), "=": () => map.zoomBy(1.5), "-": () => map.zoomBy(1 / 1.5), 0: () => map.all(), l: () => timeline.present(), a: () => $("alerts").focus() };
   acts[e.key]?.();
 });
@@ -41,6 +54,11 @@ setInterval(() => {
   if (latest) alerts.tick(Date.parse(latest.time) + (stalled() ? Date.now() - arrived : 0));
 }, 500);
 setInterval(frame, FRAME_EVERY_MS);
+$("present").addEventListener("click", () => timeline.present());
+$("find-beam").addEventListener("input", () => {
+  map.search = beams.words();
+  map.redraw();
+});
 history();
 
 async function history() {
@@ -54,19 +72,20 @@ async function history() {
 
 function onState(state) {
   const before = linkState;
-  linkState = state;
-  const [words, tone] = {
-    connecting: ["connecting", ""],
-    live: ["live", "ok"],
-    lost: ["disconnected", "bad"],
-    refused: ["token needed", "bad"],
-  }[state];
   // While a connection is tried again it is still lost.
   if (state === "connecting" && before === "lost") return;
-  $("link").textContent = words;
-  $("link").className = `pill ${tone}`;
+  linkState = state;
   if (state === "live" && before !== "live") history();
   banner();
+}
+
+// The state of the connection in a word: green only while something comes.
+function pill() {
+  let [words, tone] = { connecting: ["connecting", ""], live: ["live", "ok"], lost: ["disconnected", "bad"], refused: ["token needed", "bad"] }[linkState];
+  if (linkState === "live" && arrived && stalled()) [words, tone] = [`silent for ${lasting(Date.now() - arrived)}`, "bad"];
+  else if (linkState === "live" && timeline.at !== null) [words, tone] = ["looking back", ""];
+  if ($("link").textContent !== words) $("link").textContent = words;
+  $("link").className = `pill ${tone}`;
 }
 
 function onMessage(message) {
@@ -87,6 +106,7 @@ const stalled = () => linkState !== "live" || Date.now() - arrived > 3000;
 
 // What must not be overlooked: that what is shown is old, or that the sensor sees nothing.
 function banner() {
+  pill();
   const text = trouble();
   document.body.classList.toggle("stale", Boolean(text));
   $("banner").hidden = !text;
@@ -99,7 +119,7 @@ function trouble() {
   if (linkState === "lost" || (linkState === "connecting" && arrived)) return `Disconnected from the monitor${age}. Trying again.`;
   if (!latest) return linkState === "live" ? "The monitor runs but has not looked at a frame yet." : "";
   const { source } = latest.status;
-  const fault = source.fault ? ` (${source.fault})` : "";
+  const fault = source.fault ? ` (${shown(source.fault)})` : "";
   switch (source.state) {
     case "blind":
       return `The sensor is blind: frames arrive but none can be used${fault}. Nothing on this page can be trusted to be there, or not to be.`;
@@ -135,45 +155,52 @@ function draw() {
     half: latest.status.field_of_view_m,
   };
   map.show(scene);
-  $("clock").textContent = live ? clock(Date.parse(moment.time)) : `${clock(Date.parse(moment.time))} · the past`;
+  const time = Date.parse(moment.time);
+  $("clock").textContent = `${fullStamp(time)}${live ? "" : " · the past"}`;
+  $("clock").title = zone(time);
   timeline.render(alerts.known.values());
-  beams(scene);
+  beams.show(scene);
+  past(live ? null : time);
 }
 
-let beamsDrawn = 0;
-function beams({ emitters, claims, unseen }) {
-  if (Date.now() - beamsDrawn < 400) return;
-  beamsDrawn = Date.now();
-  const said = new Map(claims.map((c) => [c.user, c]));
-  const order = { unclaimed: 0, mismatch: 1, pending: 2, verified: 3 };
-  const rows = [...emitters].sort((a, b) => order[a.status] - order[b.status] || a.track - b.track).map((e) => {
-    const claim = said.get(e.user);
-    const off = claim ? metres(Math.hypot(claim.x_m - e.x_m, claim.y_m - e.y_m)) : "";
-    const sigma = e.cov_m2 ? metres(Math.sqrt(e.cov_m2[0][0] + e.cov_m2[1][1])) : "";
-    const cells = [[`${e.track}`], [e.user ?? "nobody"], [STATUS[e.status], e.status], [metres(e.x_m), "n"], [metres(e.y_m), "n"], [sigma, "n"], [off, "n"]];
-    return el("tr", {}, ...cells.map(([text, kind = ""]) => el("td", { className: kind }, text)));
-  });
-  for (const user of unseen) {
-    const cells = ["–", user, "not seen", "", "", "", ""];
-    rows.push(el("tr", { className: "quiet" }, ...cells.map((text) => el("td", {}, text))));
-  }
-  $("rows").replaceChildren(...rows);
-  $("beam-count").textContent = `${emitters.length} seen${unseen.length ? `, ${unseen.length} claimed and not seen` : ""}`;
+// Looking back, everything on the page is of that time, or says that it is not.
+function past(time) {
+  alerts.moment(time);
+  pill();
+  document.body.classList.toggle("past", time !== null);
+  $("past-banner").hidden = time === null;
+  if (time === null) return;
+  const words = `You are looking at ${fullStamp(time)}. Map, beams and alerts are of that time, without the claims of then; the figures above and the sensor's picture are stopped. What you acknowledge counts now.`;
+  if ($("past-words").textContent !== words) $("past-words").textContent = words;
+}
+
+// What a reader must know of this monitor before trusting it.
+function notices() {
+  const { source, journal } = latest.status;
+  const texts = [];
+  if (source.kind === "simulator") texts.push("Simulation: these frames are computed, no camera is watched.");
+  if (source.kind === "replay") texts.push("Replay: these frames come from a recording.");
+  if (journal.place === "memory") texts.push("Journal in memory: a restart of the monitor forgets all alerts. [journal] path in its config keeps them.");
+  const list = $("notices");
+  list.hidden = !texts.length;
+  if (list.textContent !== texts.join("")) list.replaceChildren(...texts.map((text) => el("li", {}, text)));
 }
 
 function facts() {
   if (!latest) return;
+  notices();
+  if (timeline.at !== null) return;
   const s = latest.status;
   const claimAge = s.claims.last_at ? Math.max(0, Date.parse(latest.time) - Date.parse(s.claims.last_at)) : null;
   const queued = s.webhooks.reduce((n, w) => n + w.queued, 0);
   const failing = s.webhooks.filter((w) => w.state !== "working").length;
   const rows = [
-    ["Source", `${s.source.kind}, ${s.source.state}`, s.source.state === "running" ? "" : "bad"],
+    ["Source", `${s.source.kind}, ${stalled() ? "silent" : s.source.state}`, s.source.state !== "running" || stalled() ? "bad" : s.source.kind === "v4l2" ? "" : "warn"],
     ["Frames", `${s.source.rate_hz.toFixed(1)} /s`],
     ["Latency", `${micros(s.latency.median_us)}`, "", `99 % within ${micros(s.latency.p99_us)}`],
     ["Dropped", `${s.frames.dropped}`, "", `${s.frames.captured} captured, ${s.frames.unusable} unusable`],
     ["Claims", s.claims.users || claimAge !== null ? `${s.claims.users} users${claimAge === null ? "" : `, ${lasting(claimAge)} ago`}` : "none", "", `${s.claims.accepted} accepted, ${s.claims.malformed} malformed${s.claims.log ? `, from ${s.claims.log}` : ""}`],
-    ["Journal", s.journal.healthy ? (s.journal.place === "memory" ? "memory" : "on disk") : "failing", s.journal.healthy ? "" : "bad", s.journal.fault ?? s.journal.place],
+    ["Journal", s.journal.healthy ? (s.journal.place === "memory" ? "memory" : "on disk") : "failing", s.journal.healthy ? (s.journal.place === "memory" ? "warn" : "") : "bad", s.journal.fault ?? s.journal.place],
     ["Webhooks", s.webhooks.length ? (failing ? `${failing} failing, ${queued} queued` : `${queued} queued`) : "none", failing ? "warn" : ""],
   ];
   $("facts").replaceChildren(...rows.map(([name, value, tone = "", title = ""]) => el("div", { title }, el("dt", {}, name), el("dd", { className: tone }, value))));
@@ -181,7 +208,7 @@ function facts() {
   $("endpoints").replaceChildren(...s.webhooks.map((w) => {
     const tone = w.state === "working" ? "quiet" : "warn";
     const error = w.last_error && w.state !== "working" ? ` — ${w.last_error}` : "";
-    return el("li", {}, el("strong", {}, w.name), ` ${w.url} `, el("span", { className: tone }, `${w.state}: ${w.sent} sent, ${w.queued} queued, ${w.withheld ? `${w.withheld} withheld, ` : ""}${w.failed} given up${error}`));
+    return el("li", {}, el("strong", {}, w.name), " ", el("bdi", {}, w.url), " ", el("span", { className: tone }, `${w.state}: ${w.sent} sent, ${w.queued} queued, ${w.withheld ? `${w.withheld} withheld, ` : ""}${w.failed} given up${error}`));
   }));
 }
 

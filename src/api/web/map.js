@@ -1,6 +1,7 @@
 // The ground in metres: x to the right, y up, the UAV's nadir in the middle.
 
-import { metres, svg } from "./words.js";
+import { metres, shown, svg } from "./words.js";
+import { place } from "./labels.js";
 import { shape } from "./marks.js";
 
 // 95 % of a two-dimensional normal distribution lies within this many standard deviations.
@@ -8,8 +9,11 @@ const NINETY_FIVE = Math.sqrt(5.991);
 const STEPS = [0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000];
 
 export class GroundMap {
-  constructor(node) {
+  constructor(node, on) {
     this.node = node;
+    this.on = on; // { pick(key or null) }
+    this.pointed = null; // the beam or user that is pointed at elsewhere
+    this.search = "";
     this.half = [125, 125];
     this.zoom = 1;
     this.centre = [0, 0];
@@ -20,7 +24,8 @@ export class GroundMap {
     this.trails = svg("g");
     this.claims = svg("g");
     this.marks = svg("g");
-    node.append(this.back, this.trails, this.claims, this.marks);
+    this.names = svg("g");
+    node.append(this.back, this.trails, this.claims, this.marks, this.names);
     new ResizeObserver(() => this.redraw()).observe(node);
     this.listen();
   }
@@ -32,7 +37,9 @@ export class GroundMap {
       e.preventDefault();
       this.zoomBy(Math.exp(-e.deltaY * 0.0015), this.place(e));
     }, { passive: false });
+    let moved = 0;
     node.addEventListener("pointerdown", (e) => {
+      moved = 0;
       node.setPointerCapture(e.pointerId);
       pointers.set(e.pointerId, [e.clientX, e.clientY]);
       node.classList.add("drag");
@@ -46,6 +53,7 @@ export class GroundMap {
         const now = [e.clientX, e.clientY];
         this.zoomBy(gap(now) / Math.max(1, gap(before)), this.place(e));
       } else {
+        moved += Math.hypot(e.clientX - before[0], e.clientY - before[1]);
         this.centre[0] -= (e.clientX - before[0]) / this.scale;
         this.centre[1] += (e.clientY - before[1]) / this.scale;
       }
@@ -56,7 +64,10 @@ export class GroundMap {
       pointers.delete(e.pointerId);
       if (!pointers.size) node.classList.remove("drag");
     };
-    node.addEventListener("pointerup", end);
+    node.addEventListener("pointerup", (e) => {
+      end(e);
+      if (moved < 4) this.touch(e);
+    });
     node.addEventListener("pointercancel", end);
     node.addEventListener("keydown", (e) => {
       const step = 40 / this.scale;
@@ -68,6 +79,30 @@ export class GroundMap {
         this.redraw();
       }
     });
+  }
+
+  // A beam or an unseen user was clicked, or the ground beside them.
+  touch(e) {
+    if (!this.scene) return;
+    const box = this.node.getBoundingClientRect();
+    const at = [e.clientX - box.left, e.clientY - box.top];
+    const claims = new Map(this.scene.claims.map((c) => [c.user, c]));
+    const unseen = this.scene.unseen.flatMap((user) => (claims.has(user) ? [{ key: `u${user}`, x_m: claims.get(user).x_m, y_m: claims.get(user).y_m }] : []));
+    const marks = [...this.scene.emitters.map((b) => ({ key: `b${b.track}`, x_m: b.x_m, y_m: b.y_m })), ...unseen].map((m) => {
+      const [x, y] = this.px([m.x_m, m.y_m]);
+      return { ...m, far: Math.hypot(x - at[0], y - at[1]) };
+    });
+    const near = marks.filter((m) => m.far < 20).sort((a, b) => a.far - b.far)[0];
+    this.pickedKey = near?.key ?? null;
+    this.picked = null;
+    this.on.pick(this.pickedKey);
+    this.redraw();
+  }
+
+  // The beam or user `key` is pointed at; null when none is any more.
+  point(key) {
+    this.pointed = key;
+    this.redraw();
   }
 
   // Ground position under a pointer.
@@ -90,11 +125,14 @@ export class GroundMap {
     this.zoom = 1;
     this.centre = [0, 0];
     this.picked = null;
+    this.pickedKey = null;
     this.redraw();
   }
 
-  pick(place) {
+  // Marks a place; with `key` the mark follows that beam.
+  pick(place, key = null) {
     this.picked = place;
+    this.pickedKey = key;
     const inside = place.every((p, k) => Math.abs(p - this.centre[k]) < (0.45 * [this.width, this.height][k]) / this.scale);
     if (!inside) this.centre = [...place];
     this.redraw();
@@ -119,8 +157,14 @@ export class GroundMap {
     this.scale = room * this.zoom;
     this.drawBack();
     this.drawTrails();
+    this.labels = [];
     this.drawClaims();
     this.drawBeams();
+    this.drawLabels();
+  }
+
+  isFound(text) {
+    return this.search !== "" && String(text ?? "").toLowerCase().includes(this.search);
   }
 
   drawBack() {
@@ -181,8 +225,9 @@ export class GroundMap {
         if (off > 12) nodes.push(svg("line", { class: `tie ${beam.status}`, x1: at[0], y1: at[1], x2: to[0], y2: to[1] }));
       }
       nodes.push(svg("circle", { class: beam ? "claim" : "claim unseen-user", cx: at[0], cy: at[1], r: 10.5 }));
-      if (!beam) nodes.push(svg("text", { class: "claim-name", x: at[0] + 15, y: at[1] + 4 }, `${claim.user} not seen`));
-      else if (beam.status === "mismatch") nodes.push(svg("text", { class: "claim-name", x: at[0] + 15, y: at[1] + 4 }, `${claim.user} says here`));
+      const found = this.isFound(claim.user);
+      if (!beam) this.labels.push({ x: at[0], y: at[1], key: `u${claim.user}`, rank: 2, parts: [claim.user, " not seen"], className: "claim-name", found });
+      else if (beam.status === "mismatch") this.labels.push({ x: at[0], y: at[1], key: null, rank: 1.5, parts: [claim.user, " says here"], className: "claim-name", found: false });
     }
     this.claims.replaceChildren(...nodes);
   }
@@ -209,37 +254,57 @@ export class GroundMap {
       }
       const claim = claims.get(e.user);
       const off = claim ? Math.hypot(claim.x_m - e.x_m, claim.y_m - e.y_m) : null;
-      const label = {
-        unclaimed: `nobody claims beam ${e.track}`,
-        mismatch: `${e.user} · ${off === null ? "" : `${metres(off)} m off`}`,
-        pending: e.user ?? `beam ${e.track}`,
-        verified: e.user,
+      const parts = {
+        unclaimed: [null, `nobody claims beam ${e.track}`],
+        mismatch: [e.user, off === null ? "" : ` · ${metres(off)} m off`],
+        pending: [e.user, e.user ? "" : `beam ${e.track}`],
+        verified: [e.user, ""],
       }[e.status];
-      if (g.text.textContent !== label) g.text.textContent = label;
-      const flip = x > this.width - 170;
-      g.text.setAttribute("x", flip ? -16 : 16);
-      g.text.setAttribute("text-anchor", flip ? "end" : "start");
+      const found = this.isFound(`${e.user ?? ""} ${e.track}`);
+      this.labels.push({ x, y, key: `b${e.track}`, rank: { unclaimed: 0, mismatch: 1, pending: 3, verified: 4 }[e.status], parts, className: `beam-name ${e.status}`, found, left: Boolean(claim) && claim.x_m > e.x_m });
+      g.node.classList.toggle("found", found);
     }
     for (const track of gone) {
       this.beams.get(track).node.remove();
       this.beams.delete(track);
     }
     this.pickMark?.remove();
-    if (this.picked) {
-      const [cx, cy] = this.px(this.picked);
-      this.pickMark = svg("circle", { class: "pick", cx, cy, r: 20 });
+    const follow = this.labels.find((l) => l.key && (l.key === this.pointed || l.key === this.pickedKey));
+    const at = follow ? [follow.x, follow.y] : this.picked ? this.px(this.picked) : null;
+    if (at) {
+      this.pickMark = svg("circle", { class: "pick", cx: at[0], cy: at[1], r: 20 });
       this.marks.append(this.pickMark);
     }
   }
 
+  // Names beside the marks: those that matter, are sought or are pointed at always, the others where there is room.
+  drawLabels() {
+    const wanted = this.labels.map((label) => {
+      const text = label.parts.map((p) => (p === null ? "" : shown(p))).join("");
+      const isChosen = label.key !== null && (label.key === this.pointed || label.key === this.pickedKey);
+      const must = isChosen || label.found || label.rank <= 1;
+      return { ...label, text, rank: isChosen || label.found ? -1 : label.rank, must, width: 7.4 * text.length + 4 };
+    });
+    const places = place(wanted, { width: this.width, height: this.height });
+    const nodes = wanted.flatMap((label, k) => {
+      if (!places[k] || !label.text) return [];
+      const { dx, dy, anchor } = places[k];
+      const [name, rest] = label.parts;
+      const node = svg("text", { class: label.className, x: label.x + dx, y: label.y + dy, "text-anchor": anchor });
+      if (name !== null) node.append(svg("tspan", { class: "name" }, shown(name)));
+      if (rest) node.append(rest);
+      return [node];
+    });
+    this.names.replaceChildren(...nodes);
+  }
+
   makeBeam(e) {
     const ellipse = svg("ellipse", { class: "ellipse fill edge" });
-    const text = svg("text", { y: 4.5 });
     const node = svg("g", { class: `beam ${e.status}` }, ellipse);
     if (e.status === "unclaimed") node.append(svg("circle", { class: "ping", r: 18 }));
-    node.append(...shape(e.status), text);
+    node.append(...shape(e.status));
     this.marks.append(node);
-    return { node, ellipse, text, status: e.status };
+    return { node, ellipse, status: e.status };
   }
 }
 

@@ -1,6 +1,6 @@
 // The last hour: a moment a second, kept by the daemon so that it outlives a reload, and gone on with here.
 
-import { clock, svg } from "./words.js";
+import { clock, stamp, svg, zone } from "./words.js";
 
 const KEPT = 3600;
 const STEP_MS = 1000;
@@ -13,7 +13,7 @@ export class Timeline {
     this.moments = [];
     this.at = null; // null is the present
     const $ = (id) => document.getElementById(id);
-    [this.range, this.spans, this.from, this.to, this.live] = ["moment", "spans", "from", "to", "live"].map($);
+    [this.range, this.spans, this.from, this.to, this.live, this.zone] = ["moment", "spans", "from", "to", "live", "zone"].map($);
     this.range.addEventListener("input", () => {
       const last = this.moments.length - 1;
       this.at = +this.range.value >= last ? null : Date.parse(this.moments[+this.range.value].time);
@@ -80,7 +80,8 @@ export class Timeline {
     this.range.value = this.index();
     const [start, end] = [Date.parse(this.moments[0].time), Date.parse(this.moments[n - 1].time)];
     this.range.setAttribute("aria-valuetext", clock(Date.parse(this.moment().time)));
-    this.from.textContent = clock(start);
+    this.from.textContent = stamp(start, end);
+    this.zone.textContent = `times in ${zone(end)}`;
     this.to.textContent = this.at === null ? "now" : clock(end);
     const width = this.spans.getBoundingClientRect().width;
     const x = (t) => (Math.min(Math.max(t, start), end) - start) / (end - start) * width;

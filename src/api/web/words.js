@@ -8,13 +8,37 @@ export const KIND = {
   user_unseen: "A claimed user is not seen",
   sensor_lost: "The sensor is lost",
   claims_stale: "The claims log is quiet",
-  claims_flooded: "More is claimed than there is room for",
+  claims_flooded: "The claims log is flooded",
   pose_inconsistent: "Our own pose is off",
 };
 
+export const SEVERITIES = ["critical", "warning", "info"];
+
+export const kindName = (kind) => KIND[kind] ?? kind.replaceAll("_", " ");
+
 export const metres = (v) => (v === null || v === undefined ? "" : v.toFixed(Math.abs(v) < 100 ? 2 : 1));
 
+// Metres in a sentence: no more digits than a reader wants.
+export const roughly = (v) => `${+v.toPrecision(v < 1 ? 1 : 2)} m`;
+
 export const clock = (ms) => new Date(ms).toLocaleTimeString([], { hour: "2-digit", minute: "2-digit", second: "2-digit", hourCycle: "h23" });
+
+const day = (ms) => new Date(ms).toLocaleDateString([], { year: "numeric", month: "short", day: "numeric" });
+
+// Time of day, with the date where it is not the day of `now`.
+export const stamp = (ms, now = Date.now()) => (day(ms) === day(now) ? clock(ms) : `${day(ms)}, ${clock(ms)}`);
+
+// Always with the date.
+export const fullStamp = (ms) => `${day(ms)}, ${clock(ms)}`;
+
+// The reader's time zone with its offset at that time.
+export function zone(ms = Date.now()) {
+  const name = Intl.DateTimeFormat().resolvedOptions().timeZone;
+  const minutes = -new Date(ms).getTimezoneOffset();
+  const two = (n) => String(n).padStart(2, "0");
+  const offset = `UTC${minutes < 0 ? "−" : "+"}${two(Math.floor(Math.abs(minutes) / 60))}:${two(Math.abs(minutes) % 60)}`;
+  return !name || name === "UTC" ? offset.replace("+00:00", "") : `${name}, ${offset}`;
+}
 
 export function lasting(ms) {
   const s = Math.max(0, Math.round(ms / 1000));
@@ -27,6 +51,14 @@ export function lasting(ms) {
 export function micros(us) {
   return us < 1000 ? `${us} µs` : `${(us / 1000).toFixed(us < 10000 ? 2 : 1)} ms`;
 }
+
+// A name that comes from outside: characters that are not seen, or that turn a line round, are spelled out.
+export function shown(name) {
+  return String(name).replace(/[\p{Cc}\p{Cf}\p{Zl}\p{Zp}\p{Co}]/gu, (c) => `\\u{${c.codePointAt(0).toString(16)}}`);
+}
+
+// The same, isolated, so that its direction does not reach the text around it.
+export const named = (name) => el("bdi", {}, shown(name));
 
 const UNITS = { m: "m", m2: "m²", s: "s", j: "J", us: "µs", hz: "Hz" };
 
@@ -56,7 +88,7 @@ function said(value) {
   if (Array.isArray(value)) return value.length ? value.map(said).join(", ") : "none";
   if (typeof value === "object") return Object.entries(value).map(([k, v]) => fact(k, v).join(" ")).join(", ");
   const time = /^\d{4}-\d\d-\d\dT/.test(value) ? Date.parse(value) : NaN;
-  return Number.isNaN(time) ? String(value).replaceAll("_", " ") : clock(time);
+  return Number.isNaN(time) ? shown(value) : stamp(time);
 }
 
 // Element with properties and children; text is never read as markup.

@@ -16,6 +16,7 @@ use crate::estimate::model_order::reweighting::Reweighting;
 use crate::estimate::model_order::search::Search;
 use crate::estimate::preprocess::outliers::NoiseInspection;
 use crate::estimate::preprocess::screening::PreprocessedFrame;
+use crate::estimate::rules::Rules;
 use crate::estimate::uncertainty::localise;
 use crate::frame::Frame;
 use crate::optics::Camera;
@@ -72,12 +73,15 @@ impl AnalyticEstimator {
         camera: &Camera,
         budget: Option<Duration>,
         known: Option<&KnownPower>,
+        rules: Rules,
     ) -> Self {
         let (bases, noise_bases) = bases(camera);
-        let pencil = spec
-            .chooses_order()
-            .then(|| Search::for_pencil_start(noise_bases.as_ref().unwrap_or(&bases).clone()));
-        let search = Search::new(bases);
+        let pencil = if rules.pencil_start && spec.chooses_order() {
+            Search::for_pencil_start(noise_bases.as_ref().unwrap_or(&bases).clone(), rules)
+        } else {
+            None
+        };
+        let search = Search::new(bases, rules);
         let noise_bases = noise_bases.map(|bases| (bases, CompressedFrame::default()));
         Self {
             spec,
@@ -85,11 +89,11 @@ impl AnalyticEstimator {
             frame: PreprocessedFrame::default(),
             inspection: NoiseInspection::default(),
             noise_bases,
-            pencil: pencil.flatten(),
+            pencil,
             budget,
             search,
             compressed: CompressedFrame::default(),
-            reweighting: Reweighting::new(camera),
+            reweighting: Reweighting::new(camera, rules),
             prior: known
                 .filter(|_| spec.method == Method::MaximumPosterior)
                 .map(|k| PowerPrior::new(k, camera)),
@@ -147,7 +151,7 @@ impl AnalyticEstimator {
     /// Maximum likelihood from an initial hypothesis, with isolated outliers masked. Where the part outside the basis is white noise,
     /// outliers are more likely a misfit: they are masked only if that explains the frame at once or nothing else does.
     fn search_with_outliers(&mut self, initial: Hypothesis) -> Hypothesis {
-        let is_white = self.inspection.is_white;
+        let is_white = self.search.rules().keep_outliers && self.inspection.is_white;
         let kept = is_white.then(|| (self.frame.clone(), self.compressed.clone()));
         let limit = self
             .search
@@ -245,6 +249,7 @@ impl Estimator for AnalyticEstimator {
             .suspected_variance
             .or((!compressed.variance.is_constant()).then_some(compressed.variance));
         let is_weighted = is_ml
+            && search.rules().reweighting
             && (known.is_some() || !compressed.is_explained_by(&hypothesis))
             && self.reweighting.run(&self.frame, known, &mut hypothesis);
         let (search, compressed) = if is_weighted {
@@ -260,7 +265,9 @@ impl Estimator for AnalyticEstimator {
             search.prior = Some(prior);
             search.maximum_posterior(compressed, &mut hypothesis);
             self.prior = search.prior.take();
-            posterior_moments = search.posterior_moments(compressed, &mut hypothesis);
+            if search.rules().posterior_mean {
+                posterior_moments = search.posterior_moments(compressed, &mut hypothesis);
+            }
         }
         let is_exhausted = search.is_exhausted();
         let mut estimate = localise::localise(

@@ -11,6 +11,7 @@ use crate::estimate::model::hypothesis::{Hypothesis, Nuisances, PointSource};
 use crate::estimate::model::svd_basis::Basis;
 use crate::estimate::model_order::search::Search;
 use crate::estimate::preprocess::screening::PreprocessedFrame;
+use crate::estimate::rules::Rules;
 use crate::estimate::uncertainty::localise;
 use crate::frame::Frame;
 use crate::optics::{Camera, psf};
@@ -29,7 +30,12 @@ pub(crate) struct NetworkEstimator {
 }
 
 impl NetworkEstimator {
-    pub fn new(spec: Learned, network: Option<&std::path::Path>, camera: &Camera) -> Result<Self, NetworkError> {
+    pub fn new(
+        spec: Learned,
+        network: Option<&std::path::Path>,
+        camera: &Camera,
+        rules: Rules,
+    ) -> Result<Self, NetworkError> {
         let bx = Basis::new(&camera.x, camera.spot_sigma_m);
         let by = Basis::new(&camera.y, camera.spot_sigma_m);
         Ok(Self {
@@ -38,7 +44,7 @@ impl NetworkEstimator {
             camera: camera.clone(),
             frame: PreprocessedFrame::default(),
             compressed: CompressedFrame::default(),
-            search: Search::new([bx, by]),
+            search: Search::new([bx, by], rules),
         })
     }
 }

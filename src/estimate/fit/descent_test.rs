@@ -11,6 +11,7 @@ use crate::estimate::model::compressed_frame::CompressedFrame;
 use crate::estimate::model::hypothesis::{Hypothesis, Nuisances, PointSource, Width};
 use crate::estimate::model::svd_basis::Basis;
 use crate::estimate::preprocess::screening::PreprocessedFrame;
+use crate::estimate::rules::Rules;
 use crate::frame::Frame;
 use crate::optics::{Config, psf};
 
@@ -49,7 +50,7 @@ proptest! {
         let [bx, by] = [&camera.x, &camera.y].map(|axis| Basis::new(axis, sigma));
         let mut compressed = CompressedFrame::default();
         compressed.load(&preprocessed, &bx, &by);
-        let mut fitter = Fitter::new(bx, by);
+        let mut fitter = Fitter::new(bx, by, Rules::default());
         let mut hypothesis = Hypothesis::empty(Nuisances {
             background,
             width: [Width::Known, Width::Common, Width::PerAxis, Width::RotatedEllipse][usize::from(width)],

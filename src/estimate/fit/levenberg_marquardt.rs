@@ -16,6 +16,7 @@ use crate::estimate::model::compressed_frame::CompressedFrame;
 use crate::estimate::model::hypothesis::{Hypothesis, Nuisances, prior_penalty};
 use crate::estimate::model::separable_model::{self, SeparableModel};
 use crate::estimate::model::svd_basis::Basis;
+use crate::estimate::rules::Rules;
 use crate::estimate::uncertainty::posterior_mean::ProfileConstraint;
 
 /// Damping λ: first value, and range.
@@ -46,6 +47,7 @@ const MAX_REGROUPINGS: usize = 2;
 pub(crate) struct Fitter {
     pub bx: Basis,
     pub by: Basis,
+    pub rules: Rules,
     pub(crate) backgrounds: [[Vec<f64>; 2]; 2],
     pub(crate) current: SeparableModel,
     pub(crate) trial: SeparableModel,
@@ -79,12 +81,13 @@ pub(crate) struct Fitter {
 }
 
 impl Fitter {
-    pub fn new(bx: Basis, by: Basis) -> Self {
+    pub fn new(bx: Basis, by: Basis, rules: Rules) -> Self {
         let scratch = vec![0.0; 3 * bx.n.max(by.n)];
         Self {
             backgrounds: [separable_model::background(&bx), separable_model::background(&by)],
             bx,
             by,
+            rules,
             current: SeparableModel::default(),
             trial: SeparableModel::default(),
             residual: Vec::new(),
@@ -125,7 +128,8 @@ impl Fitter {
     ) {
         let last = self.steps + steps as u64;
         for _ in 0..MAX_REGROUPINGS {
-            if self.profile_constraint.is_some() || self.steps + JOINT_STEPS as u64 >= last {
+            if !self.rules.source_groups || self.profile_constraint.is_some() || self.steps + JOINT_STEPS as u64 >= last
+            {
                 break;
             }
             let Some(groups) = hypothesis.source_groups() else {
@@ -254,7 +258,10 @@ impl Fitter {
                 }
                 let is_unreachable = |decrease: f64| deviance - ABORT_FACTOR * decrease > acceptance_threshold;
                 // Damping hides the decrease along ill-determined directions.
-                if is_unreachable(expected) && is_unreachable(self.predicted_decrease(parameters)) {
+                if self.rules.abort_fits
+                    && is_unreachable(expected)
+                    && is_unreachable(self.predicted_decrease(parameters))
+                {
                     is_completed = false;
                     break;
                 }
@@ -268,8 +275,8 @@ impl Fitter {
                     } else {
                         0
                     };
-                    let is_poor_fit = next > POOR_FIT_FACTOR * compressed.data_count;
-                    is_fast = decrease > FAST_SHARE * deviance;
+                    let is_poor_fit = self.rules.stop_stalled_fits && next > POOR_FIT_FACTOR * compressed.data_count;
+                    is_fast = self.rules.extend_fast_fits && decrease > FAST_SHARE * deviance;
                     stalled = if is_poor_fit && decrease < STALLED_SHARE * deviance {
                         stalled + 1
                     } else {

@@ -31,12 +31,21 @@ impl Search {
         self.fit_with_prior(compressed, hypothesis, f64::INFINITY, 0.0);
         let known = hypothesis.clone();
         self.try_accept_map(compressed, hypothesis, known);
+        let rules = self.rules();
         for _ in 0..ROUNDS {
             let before = self.score(hypothesis);
-            self.explore_ill_determined(compressed, hypothesis);
-            self.propose_divisions(compressed, hypothesis);
-            self.propose_balanced_pairs(compressed, hypothesis);
-            self.propose_unions(compressed, hypothesis);
+            if rules.explore_ill_determined {
+                self.explore_ill_determined(compressed, hypothesis);
+            }
+            if rules.divide {
+                self.propose_divisions(compressed, hypothesis);
+            }
+            if rules.balance_pairs {
+                self.propose_balanced_pairs(compressed, hypothesis);
+            }
+            if rules.unite {
+                self.propose_unions(compressed, hypothesis);
+            }
             self.propose_shrinkage(compressed, hypothesis);
             self.propose_growth(compressed, hypothesis);
             if before - self.score(hypothesis) < 0.1 || self.is_exhausted() {

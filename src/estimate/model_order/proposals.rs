@@ -92,20 +92,26 @@ impl Search {
 
     /// Proposes births, splits and relocations.
     pub(crate) fn propose_growth(&mut self, compressed: &CompressedFrame, hypothesis: &mut Hypothesis) {
+        let rules = self.rules();
         let peaks: Vec<_> = self
             .residual_peaks(compressed, hypothesis)
             .iter()
             .take(2)
             .copied()
             .collect();
-        for peak in &peaks {
+        for peak in peaks.iter().filter(|_| rules.birth) {
             let mut next = hypothesis.clone();
             next.sources.push(PointSource::new(peak.u, peak.a));
             if self.try_accept(compressed, hypothesis, next) {
                 break;
             }
         }
-        for split in self.split_proposals(compressed, hypothesis).into_iter().take(3) {
+        let splits = if rules.split {
+            self.split_proposals(compressed, hypothesis)
+        } else {
+            Vec::new()
+        };
+        for split in splits.into_iter().take(3) {
             let is_likely = split.gain > LIKELY_SPLIT * self.noise_inflation * self.source_penalty;
             if compressed.is_explained_by(hypothesis) && !is_likely {
                 break;
@@ -114,7 +120,7 @@ impl Search {
                 return;
             }
         }
-        if compressed.is_explained_by(hypothesis) {
+        if !rules.relocate || compressed.is_explained_by(hypothesis) {
             return;
         }
         let Some(peak) = peaks.first() else { return };
@@ -131,9 +137,10 @@ impl Search {
 
     /// Proposes merges, deaths and relocations inside.
     pub fn propose_shrinkage(&mut self, compressed: &CompressedFrame, hypothesis: &mut Hypothesis) {
-        while self.merge_all_unresolved(compressed, hypothesis) {}
+        let rules = self.rules();
+        while rules.merge_all && self.merge_all_unresolved(compressed, hypothesis) {}
         let pitch = self.fitter.bx.pitch().max(self.fitter.by.pitch());
-        let is_wide = pitch > WIDE_PIXEL;
+        let is_wide = rules.merge_wide_pixels && pitch > WIDE_PIXEL;
         let limit = if is_wide {
             MERGE_DISTANCE.max(MERGE_PIXELS * pitch)
         } else {
@@ -144,6 +151,7 @@ impl Search {
             let mut has_shrunk = false;
             for (d, i, j) in close_pairs(hypothesis, limit)
                 .into_iter()
+                .filter(|_| rules.merge)
                 .take(MAX_MERGES[usize::from(is_wide)])
             {
                 if !is_wide
@@ -159,7 +167,7 @@ impl Search {
                     break;
                 }
             }
-            if !has_shrunk {
+            if rules.death && !has_shrunk {
                 // The least significant source may be one of an unresolved pair, and needed.
                 let significance = self.wald_statistics(compressed, hypothesis);
                 let mut faint: Vec<usize> = (0..n).collect();
@@ -183,7 +191,7 @@ impl Search {
     /// Proposes to remove a source and relocate one from beyond the sensor's edge to the inside: two sources at the edge may fit the tail
     /// of one that the edge cuts.
     fn relocate_inside(&mut self, compressed: &CompressedFrame, hypothesis: &mut Hypothesis) -> bool {
-        if !compressed.is_explained_by(hypothesis) {
+        if !self.rules().relocate_inside || !compressed.is_explained_by(hypothesis) {
             return false;
         }
         let axes = [&self.fitter.bx, &self.fitter.by];

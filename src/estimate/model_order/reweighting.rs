@@ -7,6 +7,7 @@ use crate::estimate::model::svd_basis::Basis;
 use crate::estimate::model_order::search::Search;
 use crate::estimate::preprocess::noise_variance::VarianceFunction;
 use crate::estimate::preprocess::screening::PreprocessedFrame;
+use crate::estimate::rules::Rules;
 use crate::optics::Camera;
 
 /// Alternations of weighting and fitting.
@@ -21,10 +22,10 @@ pub(crate) struct Reweighting {
 }
 
 impl Reweighting {
-    pub fn new(camera: &Camera) -> Self {
+    pub fn new(camera: &Camera, rules: Rules) -> Self {
         let basis = |axis| Basis::pixels(axis, camera.spot_sigma_m);
         Self {
-            search: Search::new([&camera.x, &camera.y].map(basis)),
+            search: Search::new([&camera.x, &camera.y].map(basis), rules),
             compressed: CompressedFrame::default(),
         }
     }

@@ -13,6 +13,7 @@ use crate::estimate::model_order::power_prior::PowerPrior;
 use crate::estimate::model_order::proposals::CovarianceCache;
 use crate::estimate::preprocess::noise_variance::VarianceFunction;
 use crate::estimate::preprocess::screening::PreprocessedFrame;
+use crate::estimate::rules::Rules;
 
 /// Steps of a candidate's fit before it is compared.
 pub(crate) const TRIAL_STEPS: usize = 30;
@@ -53,19 +54,19 @@ pub(crate) struct Search {
 }
 
 impl Search {
-    pub fn new([bx, by]: [Basis; 2]) -> Self {
+    pub fn new([bx, by]: [Basis; 2], rules: Rules) -> Self {
         let pencil = PencilSampler::new(&bx, &by);
-        Self::with(pencil, bx, by)
+        Self::with(pencil, bx, by, rules)
     }
 
     /// For a first try by the pencil where [`Search::new`] begins with residual peaks.
-    pub fn for_pencil_start([bx, by]: [Basis; 2]) -> Option<Self> {
+    pub fn for_pencil_start([bx, by]: [Basis; 2], rules: Rules) -> Option<Self> {
         let pencil = PencilSampler::for_pencil_start(&bx, &by)?;
-        Some(Self::with(Some(pencil), bx, by))
+        Some(Self::with(Some(pencil), bx, by, rules))
     }
 
-    fn with(pencil: Option<PencilSampler>, bx: Basis, by: Basis) -> Self {
-        let fitter = Fitter::new(bx, by);
+    fn with(pencil: Option<PencilSampler>, bx: Basis, by: Basis, rules: Rules) -> Self {
+        let fitter = Fitter::new(bx, by, rules);
         let matched_filter = MatchedFilter::new(&fitter.bx, &fitter.by);
         let area = |b: &Basis| b.edges[b.n] - b.edges[0];
         // The matched filter has about area/σ² independent positions; the penalty keeps the probability that any of
@@ -90,6 +91,10 @@ impl Search {
         self.noise_inflation = 1.0;
         self.suspected_variance = None;
         self.covariance_cache = CovarianceCache::default();
+    }
+
+    pub(crate) fn rules(&self) -> Rules {
+        self.fitter.rules
     }
 
     /// Whether the frame's budget of work or time is spent.
@@ -157,7 +162,9 @@ impl Search {
             || hypothesis.nuisances != plain
             || self.has_unequal_energies(&hypothesis) && self.nuisances_can_replace_sources(compressed, &hypothesis)
         {
-            self.select_nuisances(compressed, frame, &mut hypothesis);
+            if self.rules().select_nuisances {
+                self.select_nuisances(compressed, frame, &mut hypothesis);
+            }
             is_settled = false;
         }
         // An elliptical PSF takes several sources for one emitter.
@@ -169,7 +176,8 @@ impl Search {
                     && 3 * hypothesis.sources.len() > 4 * first.sources.len()
             }
         };
-        if may_be_turned || !is_settled && !compressed.is_explained_by(&hypothesis) {
+        let is_unexplained = !is_settled && !compressed.is_explained_by(&hypothesis);
+        if self.rules().rotated_ellipse && (may_be_turned || is_unexplained) {
             self.try_rotated_ellipse(compressed, frame, first, &mut hypothesis);
             is_settled = false;
         }
@@ -178,7 +186,7 @@ impl Search {
             self.refine(compressed, &mut hypothesis, ROUNDS);
         }
         self.drop_nuisances(compressed, &mut hypothesis);
-        if !compressed.is_explained_by(&hypothesis) {
+        if self.rules().prune_spurious && !compressed.is_explained_by(&hypothesis) {
             self.prune_spurious(compressed, frame, &mut hypothesis);
         }
         self.converge(compressed, &mut hypothesis);
@@ -190,7 +198,7 @@ impl Search {
     fn reinitialise(&mut self, compressed: &CompressedFrame, hypothesis: &mut Hypothesis) {
         let first = hypothesis.clone();
         let mut wide = None;
-        if self.pencil.is_some() {
+        if self.rules().free_nuisances && self.pencil.is_some() {
             let mut free = first.clone();
             free.nuisances = BACKGROUND_AND_WIDTH;
             self.fitter.fit(compressed, &mut free, TRIAL_STEPS);
@@ -384,7 +392,7 @@ impl Search {
         rival: &Hypothesis,
     ) -> Option<VarianceFunction> {
         let is_even = self.fitter.bx.is_pixels && self.fitter.by.is_pixels && compressed.weights.is_empty();
-        if !is_even || rival.deviance < 0.5 * hypothesis.deviance {
+        if !self.rules().reweighting || !is_even || rival.deviance < 0.5 * hypothesis.deviance {
             return None;
         }
         let residual = self.fitter.weighted_residual(compressed, hypothesis).to_vec();

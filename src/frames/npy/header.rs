@@ -14,7 +14,7 @@ const MAX_HEADER: usize = 10_000;
 /// Pixels a side, as for `[optics] pixels`.
 const MAX_SIDE: u64 = 4096;
 
-/// What the header says about the frames behind it.
+/// The header: number, shape and type of the frames.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Header {
     pub dtype: Dtype,

@@ -1,3 +1,5 @@
+//! Reads frame files frame by frame.
+
 use std::fs::File;
 use std::io::{BufReader, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
@@ -63,7 +65,7 @@ impl Reader {
         &self.header
     }
 
-    /// Number of frames that the header promises.
+    /// Number of frames according to the header.
     pub fn frames(&self) -> u64 {
         self.header.frames
     }
@@ -103,7 +105,7 @@ impl Reader {
 
     fn read_frame(&mut self) -> Result<Array2<f64>, Error> {
         let expected = self.header.frame_bytes();
-        // `take` grows the buffer with what is really there, whatever the header says.
+        // `take` allocates for the bytes that exist, not for what the header claims.
         self.bytes.clear();
         let read = (&mut self.file).take(expected as u64).read_to_end(&mut self.bytes);
         read.map_err(|e| self.io(e))?;

@@ -1,3 +1,5 @@
+//! Writes frame files that are valid after every frame.
+
 use std::fs::File;
 use std::io::{Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
@@ -77,7 +79,7 @@ impl Writer {
         self.bytes.clear();
         self.bytes.extend(pixels.iter().flat_map(|v| v.to_le_bytes()));
         self.append().map_err(|source| {
-            // A part of a frame is no harm where it cannot be cut off: the header does not count it.
+            // A partial frame that cannot be truncated is harmless: the header does not count it.
             let _ = self.file.set_len(self.end_of(self.header.frames));
             Error::Io {
                 path: self.path.clone(),
@@ -86,7 +88,7 @@ impl Writer {
         })
     }
 
-    /// Sees everything on the disk.
+    /// Flushes everything to the disk.
     pub fn sync(&mut self) -> Result<(), Error> {
         self.file.sync_data().map_err(|source| Error::Io {
             path: self.path.clone(),

@@ -1,3 +1,5 @@
+//! `[record]`: how the input of the monitor is recorded.
+
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
@@ -5,20 +7,20 @@ use serde::{Deserialize, Serialize};
 use crate::frames::Error;
 use crate::toml_file::Key;
 
-/// `[record]`: what the monitor sees, kept on disk.
+/// `[record]`.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Config {
-    /// Where to record; nothing is recorded when left out.
+    /// Folder of the recordings; nothing is recorded when left out.
     pub folder: Option<PathBuf>,
-    /// Size of the ring: the oldest files make way.
+    /// Size of the ring, MB; the oldest files are removed beyond it.
     pub limit_mb: f64,
-    /// Length of one file.
+    /// Length of one file, s.
     pub segment_s: f64,
-    /// What an alert's evidence holds before and after it.
+    /// Time before and after an alert that its evidence covers, s.
     pub before_s: f64,
     pub after_s: f64,
-    /// Size of all evidence, in the folder `evidence` beside the ring: the oldest makes way.
+    /// Size of all evidence, in the folder `evidence` beside the ring, MB; the oldest is removed beyond it.
     pub evidence_limit_mb: f64,
 }
 
@@ -36,14 +38,18 @@ impl Default for Config {
 }
 
 impl Config {
-    /// Refuses what no recorder can do.
+    /// Checks every number.
     pub fn check(&self) -> Result<(), Error> {
         let key = Key::new("record");
-        key.at("limit_mb").positive(self.limit_mb)?;
-        key.at("segment_s").positive(self.segment_s)?;
-        key.at("before_s").positive(self.before_s)?;
-        key.at("after_s").positive(self.after_s)?;
-        key.at("evidence_limit_mb").positive(self.evidence_limit_mb)?;
+        let size = "MB; the largest file systems hold 1e9";
+        key.at("limit_mb").within(self.limit_mb, 1e-3..=1e9, size)?;
+        key.at("evidence_limit_mb")
+            .within(self.evidence_limit_mb, 1e-3..=1e9, size)?;
+        let segment = "a file that covers more than a day is never removed in time";
+        key.at("segment_s").within(self.segment_s, 0.01..=86_400.0, segment)?;
+        let clip = "evidence is a clip around an alert";
+        key.at("before_s").within(self.before_s, 1e-3..=3600.0, clip)?;
+        key.at("after_s").within(self.after_s, 1e-3..=3600.0, clip)?;
         Ok(())
     }
 }

@@ -1,6 +1,6 @@
-//! Keeps what the monitor was given: a ring on disk, and around each alert a copy as evidence. A thread of its
-//! own writes, so that a slow disk costs recordings and never alerts. On a full disk the oldest recordings make way,
-//! so that the ring does not take the journal's room.
+//! Records the input of the monitor: a ring of files, and a copy of the time around each alert as evidence. A separate thread
+//! writes, so that a slow disk costs recordings and never alerts. On a full disk the oldest recordings are removed, so that the
+//! ring does not take the space that the journal needs.
 
 mod config;
 mod evidence;
@@ -33,14 +33,14 @@ use tape::{Entry, Seen, TapeReader, TapeWriter};
 
 /// Folder for evidence, within the recorder's own.
 pub const EVIDENCE: &str = "evidence";
-/// Evidence that may grow at a time; an alert beyond that lies within the time of another's.
+/// Most clips of evidence recorded at a time; a further alert falls within the time of another clip.
 const MOST_CLIPS: usize = 8;
-/// Frames that may wait for the disk.
+/// Most frames that wait for the disk.
 const QUEUE: usize = 64;
-/// After this long a file that could not be written is given up for a new one.
+/// While writing fails, a new file is tried after this long.
 const RETRY: SignedDuration = SignedDuration::from_secs(1);
 
-/// Records on a thread of its own. Dropping it writes what waits and ends the thread.
+/// Handle of the recorder thread. Dropping it writes what is queued and ends the thread.
 #[derive(Debug)]
 pub struct Recorder {
     folder: PathBuf,
@@ -49,11 +49,11 @@ pub struct Recorder {
     segment_bytes: u64,
     next_number: u64,
     current: Option<Segment>,
-    /// How long evidence goes on after its alert.
+    /// Time after an alert that its evidence covers.
     after: SignedDuration,
-    /// Evidence that is still growing: the alert's time and its file.
+    /// Evidence that is still being recorded: the alert's time and its file.
     clips: Vec<(Timestamp, Arc<Path>)>,
-    /// The recorder thread could not write the latest frame it was given.
+    /// The recorder thread could not write the latest frame.
     failing: Arc<AtomicBool>,
     queue: Option<SyncSender<Order>>,
     thread: Option<JoinHandle<()>>,
@@ -62,7 +62,7 @@ pub struct Recorder {
 /// A frame that the recorder thread has taken.
 #[derive(Clone, Debug)]
 pub struct Taken {
-    /// The file that holds it; `None` while the disk fails. Claims stand in the next file's head all the same.
+    /// The file that holds it; `None` while writing fails. Its claims are still written to the head of the next file.
     pub file: Option<Arc<Path>>,
 }
 
@@ -139,7 +139,7 @@ impl Recorder {
     }
 
     /// Records a frame as it came, before any correction, with the claims taken in since the one before. `None`
-    /// when the disk cannot keep up and the frame was let go.
+    /// when the disk cannot keep up and the frame was dropped.
     pub fn frame(&mut self, frame: &Frame, claims: &[Claim]) -> Option<Taken> {
         let bytes = 8 * frame.pixels.len() as u64;
         self.write(Some(frame.pixels.dim()), bytes, Seen::frame(frame, claims))
@@ -157,8 +157,8 @@ impl Recorder {
         self.write(None, 0, Seen { entry, pixels: None })
     }
 
-    /// Keeps what lies around an alert, under its id. Gives the file that holds it: its own or, where as many are being
-    /// written as may be at a time, that of the alert before it, which covers its time too. `None` while the disk fails.
+    /// Records the time around an alert under its id. Returns the file: the alert's own or, where the most clips are already being
+    /// recorded, that of an earlier alert, which covers its time too. `None` while writing fails.
     pub fn evidence(&mut self, alert: &str, time: Timestamp) -> Option<Arc<Path>> {
         if self.failing.load(Ordering::Relaxed) {
             return None;
@@ -231,25 +231,25 @@ impl Drop for Recorder {
         if let Some(thread) = self.thread.take()
             && thread.join().is_err()
         {
-            tracing::error!("the recorder's thread ended in a panic");
+            tracing::error!("the recorder thread ended in a panic");
         }
     }
 }
 
-/// The recorder's thread.
+/// State of the recorder thread.
 struct RecorderThread {
     folder: PathBuf,
     evidence: PathBuf,
     config: Config,
     tape: Option<TapeWriter>,
-    /// The file that could not be written; the next one is tried again.
+    /// The file that could not be written; the next file is tried.
     broken: Option<Arc<Path>>,
     failing: Arc<AtomicBool>,
     standing: Standing,
     clips: Vec<Clip>,
 }
 
-/// Evidence that is still growing.
+/// Evidence that is still being recorded.
 struct Clip {
     tape: TapeWriter,
     until: Timestamp,
@@ -269,17 +269,17 @@ impl RecorderThread {
                 tracing::error!(%error, "not recorded");
             }
             if error.is_full_disk() {
-                self.make_way();
+                self.free_disk();
             }
         }
     }
 
-    /// Gives half of the ring's room back to the disk.
-    fn make_way(&self) {
+    /// Removes the older half of the ring.
+    fn free_disk(&self) {
         let half = ring::size(&self.folder).map(|bytes| bytes / 2);
         match half.and_then(|half| ring::trim(&self.folder, half, Path::new(""))) {
             Ok(0) => {}
-            Ok(removed) => tracing::warn!(removed, "the disk is full: the oldest recordings made way"),
+            Ok(removed) => tracing::warn!(removed, "the disk is full: the oldest recordings were removed"),
             Err(error) => tracing::error!(%error, "the disk is full, and the oldest recordings could not be removed"),
         }
     }
@@ -291,11 +291,11 @@ impl RecorderThread {
         let written = self.append(&path, shape, seen);
         self.standing.take(&seen.entry.claims);
         self.clips.retain(|clip| seen.entry.time <= clip.until);
-        let mut grown = Ok(());
+        let mut appended = Ok(());
         self.clips.retain_mut(|clip| match clip.tape.push(seen) {
             Ok(()) => true,
             Err(error) => {
-                grown = Err(error);
+                appended = Err(error);
                 false
             }
         });
@@ -306,7 +306,7 @@ impl RecorderThread {
         } else if was_failing {
             tracing::info!(path = %path.display(), "recording again");
         }
-        written.and(grown)
+        written.and(appended)
     }
 
     fn append(&mut self, path: &Path, shape: (usize, usize), seen: &Seen) -> Result<(), Error> {
@@ -328,7 +328,7 @@ impl RecorderThread {
         }
     }
 
-    /// Starts a clip with what the ring holds of the time before the alert.
+    /// Starts a clip with the part of the ring before the alert.
     fn keep(&mut self, path: &Path, time: Timestamp) -> Result<(), Error> {
         let from = time
             .saturating_sub(seconds(self.config.before_s))
@@ -340,7 +340,7 @@ impl RecorderThread {
             path: self.folder.clone(),
             source,
         })?;
-        // The ring's own file names tell their order; those far before the alert need not be read.
+        // File names give the order of the files; those far before the alert need not be read.
         let few = (self.config.before_s / self.config.segment_s).ceil() as usize + 2;
         files.drain(..files.len().saturating_sub(few.max(10)));
         let mut standing = Standing::default();
@@ -362,7 +362,7 @@ impl RecorderThread {
                     None => clip.insert(TapeWriter::create(path, shape, standing.claims())?),
                 };
                 match writer.push(&seen) {
-                    // A camera whose array changed its shape meanwhile: the evidence ends where it changed.
+                    // The camera changed its shape: the evidence ends there.
                     Err(Error::Npy(npy::Error::Shape { .. })) => break,
                     done => done?,
                 }

@@ -1,4 +1,4 @@
-//! Our own recordings as they were: one file, or a folder of them in order.
+//! Reads recordings of `[record]`: one file, or a folder of them in order.
 
 use std::collections::VecDeque;
 use std::path::{Path, PathBuf};
@@ -7,7 +7,7 @@ use super::tape::{Seen, TapeReader};
 use crate::claim::Claim;
 use crate::frames::Error;
 
-/// Gives what was seen, in order, over all files.
+/// Reads the events of several files in order.
 #[derive(Debug)]
 pub(in crate::frames) struct Player {
     files: VecDeque<PathBuf>,

@@ -1,4 +1,4 @@
-//! The recorder's folder: numbered files, of which the oldest make way.
+//! The folder of the recorder: numbered files, of which the oldest are removed.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -18,7 +18,7 @@ pub(in crate::frames) fn recordings(folder: &Path) -> io::Result<Vec<PathBuf>> {
     Ok(found)
 }
 
-/// The number that the next file of a folder takes.
+/// The number of the next file in a folder.
 pub(super) fn next_number(folder: &Path) -> io::Result<u64> {
     let number = |path: &PathBuf| path.file_name()?.to_str()?.split_once('-')?.0.parse::<u64>().ok();
     Ok(recordings(folder)?.iter().filter_map(number).max().map_or(0, |n| n + 1))
@@ -35,7 +35,7 @@ fn bytes(path: &Path) -> u64 {
     size(path) + size(&index_of(path))
 }
 
-/// Removes the oldest recordings until all are within `limit` bytes; `keep` stays. Gives the number removed.
+/// Removes the oldest recordings until the rest is within `limit` bytes; `keep` stays. Returns the number removed.
 pub(super) fn trim(folder: &Path, limit: u64, keep: &Path) -> io::Result<u64> {
     let mut all: Vec<(PathBuf, u64)> = recordings(folder)?
         .into_iter()
@@ -52,7 +52,7 @@ pub(super) fn trim(folder: &Path, limit: u64, keep: &Path) -> io::Result<u64> {
         if total <= limit {
             break;
         }
-        // The index last: a recording without one is not seen again, an index without frames is no harm.
+        // The index is removed last: a recording without an index would never be found again, an index without frames is harmless.
         std::fs::remove_file(path)?;
         std::fs::remove_file(index_of(path))?;
         total -= bytes;

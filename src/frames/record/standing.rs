@@ -1,15 +1,18 @@
+//! The claims in force at one time, which a new recording begins with.
+
 use std::collections::BTreeMap;
 
 use crate::claim::{Claim, ClaimState};
 
-/// Users remembered; beyond, those who have ended go first.
+/// Most users kept; beyond it those who have ended are removed first.
 const MOST_USERS: usize = 10_000;
 
-/// The claims that stand: each user's last two, between which a position is interpolated.
+/// Each user's last two claims, between which a position is interpolated.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Standing(BTreeMap<String, (Option<Claim>, Claim)>);
 
 impl Standing {
+    /// Adds claims in the order of their arrival.
     pub fn take(&mut self, claims: &[Claim]) {
         for claim in claims {
             let before = self.0.remove(&claim.user).map(|(_, last)| last);

@@ -1,5 +1,5 @@
-//! One file of a recording: frames in NAME.npy, and in NAME.frames.ndjson a line for each thing that the monitor
-//! was given, in order: times, claims, masks, and what was unusable.
+//! One file of a recording: frames in NAME.npy, and in NAME.frames.ndjson one line for each event that the monitor received, in
+//! order: times, claims, masks, and why a frame was unusable.
 
 use std::fs::File;
 use std::io::{BufRead, BufReader, Write};
@@ -19,11 +19,11 @@ use crate::frames::{Error, Next, npy};
 pub(super) struct Head {
     /// Version of the format.
     pub oapwatch_recording: u32,
-    /// The claims that stood when the file begins; for a replay that begins with it.
+    /// Claims in force when the file begins, for a replay that begins with it.
     pub claims: Vec<Claim>,
 }
 
-/// Any other line.
+/// A line of the index after the first.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub(in crate::frames) struct Entry {
     pub index: u64,
@@ -39,7 +39,7 @@ pub(in crate::frames) struct Entry {
     pub claims: Vec<Claim>,
 }
 
-/// What was seen at one time: an entry with its pixels.
+/// One event: an entry with its pixels.
 #[derive(Clone, Debug)]
 pub(in crate::frames) struct Seen {
     pub entry: Entry,
@@ -101,7 +101,7 @@ impl Seen {
     }
 }
 
-/// Where the index of a recording lies.
+/// Path of the index of a recording.
 pub(in crate::frames) fn index_of(npy: &Path) -> PathBuf {
     npy.with_extension("frames.ndjson")
 }
@@ -115,7 +115,7 @@ fn create_private(path: &Path) -> std::io::Result<File> {
     Ok(file)
 }
 
-/// Writes one file. A frame's pixels go out before its line: what the index names is there.
+/// Writes one file. A frame's pixels are written before its line, so that the index names only frames that are complete.
 #[derive(Debug)]
 pub(super) struct TapeWriter {
     frames: npy::Writer,
@@ -123,10 +123,10 @@ pub(super) struct TapeWriter {
 }
 
 impl TapeWriter {
-    /// Creates both files, or leaves neither.
+    /// Creates both files or neither.
     pub fn create(path: &Path, shape: (usize, usize), claims: Vec<Claim>) -> Result<Self, Error> {
         Self::create_both(path, shape, claims).inspect_err(|_| {
-            // What could not be written can be absent too.
+            // The first error is the one to report.
             let _ = std::fs::remove_file(path);
             let _ = std::fs::remove_file(index_of(path));
         })
@@ -167,7 +167,7 @@ impl TapeWriter {
     }
 }
 
-/// Reads one file. A last line that was cut short is what a killed recorder was writing: it is passed over.
+/// Reads one file. A truncated last line, left by a killed recorder, is skipped.
 #[derive(Debug)]
 pub(in crate::frames) struct TapeReader {
     path: PathBuf,
@@ -177,7 +177,7 @@ pub(in crate::frames) struct TapeReader {
 }
 
 impl TapeReader {
-    /// The file and the claims that stood when it begins.
+    /// Opens a file; returns the claims in force when it begins.
     pub fn open(path: &Path) -> Result<(Self, Vec<Claim>), Error> {
         let index = index_of(path);
         let file = File::open(&index).map_err(|source| Error::Recording { path: index, source })?;
@@ -220,7 +220,7 @@ impl TapeReader {
         self.line()
     }
 
-    /// The next thing that was seen.
+    /// The next event.
     pub fn next(&mut self) -> Result<Option<Seen>, Error> {
         let Some(entry) = self.line::<Entry>()? else {
             return Ok(None);

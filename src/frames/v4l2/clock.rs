@@ -1,4 +1,4 @@
-//! From a driver's time stamps and sequence numbers to UTC and a numbering without end.
+//! Converts a driver's time stamps to UTC and its 32-bit sequence numbers to frame numbers that never wrap.
 
 use std::time::Duration;
 
@@ -8,9 +8,10 @@ use v4l::v4l_sys as c;
 use super::faults::Fault;
 use super::sys;
 
-/// A time stamp older than this is not believed.
+/// A time stamp older than this is rejected.
 const OLDEST: Duration = Duration::from_secs(10);
-/// Nor is one further ahead of its own clock than this: some drivers stamp by an ideal frame interval.
+/// A time stamp further ahead of its own clock than this is rejected; a little ahead is normal, because some drivers stamp by an
+/// ideal frame interval.
 const AHEAD: Duration = Duration::from_millis(100);
 
 /// Both clocks at one moment.
@@ -34,15 +35,15 @@ pub fn is_monotonic(flags: u32) -> bool {
     flags & c::V4L2_BUF_FLAG_TIMESTAMP_MASK == c::V4L2_BUF_FLAG_TIMESTAMP_MONOTONIC
 }
 
-/// When a frame was exposed, and what was wrong with what the driver said about it.
+/// When a frame was exposed, and the fault of the driver's time stamp, if any.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Stamped {
     pub time: Timestamp,
     pub fault: Option<Fault>,
 }
 
-/// Middle of a frame's exposure. `flags` are the buffer's: they say which clock its `stamp` is on, and whether
-/// it was taken at the start or the end. A stamp that cannot be used is replaced by the time of arrival.
+/// Middle of a frame's exposure. The buffer's `flags` give the clock of its `stamp`, and whether it was taken at the start or the
+/// end of the exposure. An unusable stamp is replaced by the time of arrival.
 pub fn exposed(flags: u32, stamp: Duration, exposure: Duration, arrival: Moment) -> Stamped {
     let half = SignedDuration::try_from(exposure / 2).unwrap_or_default();
     let shifted = |time: Timestamp, by: SignedDuration| time.checked_add(by).unwrap_or(time);
@@ -68,14 +69,14 @@ pub fn exposed(flags: u32, stamp: Duration, exposure: Duration, arrival: Moment)
     }
 }
 
-/// Continues a driver's 32-bit sequence over its wrap, its restarts and the device's reopening.
+/// Continues a driver's 32-bit sequence over wraps, restarts and reopening of the device.
 #[derive(Debug, Default)]
 pub struct Numbering {
     next: u64,
     last_sequence: Option<u32>,
 }
 
-/// A jump further than this is a restart, not a loss.
+/// A larger jump is a restart, not a loss.
 const LARGEST_GAP: u32 = 1 << 20;
 
 impl Numbering {
@@ -92,7 +93,7 @@ impl Numbering {
         (index, lost)
     }
 
-    /// The device starts over; the numbering goes on.
+    /// The device restarts; the numbering continues.
     pub fn restart(&mut self) {
         self.last_sequence = None;
     }
@@ -131,7 +132,7 @@ mod tests {
     }
 
     #[test]
-    fn a_stamp_that_cannot_be_used_gives_way_to_the_arrival() {
+    fn an_unusable_stamp_is_replaced_by_the_arrival() {
         let late = |fault| ("2026-11-21T08:00:10Z".to_owned(), Some(fault));
         assert_eq!(at(0, 99_000, 0), late(Fault::TimestampUnknown));
         assert_eq!(at(MONOTONIC, 101_000, 0), late(Fault::TimestampImplausible));
@@ -140,7 +141,7 @@ mod tests {
     }
 
     #[test]
-    fn the_numbering_goes_on_over_gaps_wraps_and_restarts() {
+    fn the_numbering_continues_over_gaps_wraps_and_restarts() {
         let mut n = Numbering::default();
         assert_eq!(n.number(7), (0, 0));
         assert_eq!(n.number(8), (1, 0));

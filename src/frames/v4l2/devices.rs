@@ -1,4 +1,4 @@
-//! What is plugged in.
+//! Lists the V4L2 devices of this host with their formats.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -6,18 +6,18 @@ use std::path::{Path, PathBuf};
 use super::image::{PixelFormat, fourcc_name};
 use super::sys::{Node, Sizes};
 
-/// A V4L2 node and what it offers.
+/// A V4L2 node and its capabilities.
 #[derive(Clone, Debug)]
 pub struct Device {
     pub card: String,
     pub driver: String,
     pub bus: String,
-    /// Whether it can be a source at all: captures video, by streaming.
+    /// Whether it can be a source: it captures video by streaming.
     pub captures: bool,
     pub formats: Vec<DeviceFormat>,
 }
 
-/// A pixel format on offer.
+/// A pixel format of a device.
 #[derive(Clone, Debug)]
 pub struct DeviceFormat {
     pub name: String,
@@ -27,7 +27,7 @@ pub struct DeviceFormat {
     pub sizes: Vec<Sizes>,
 }
 
-/// Every video node, in the order of their numbers, with what it offers or why it cannot be asked.
+/// Every video node by number, with its capabilities or the error of querying it.
 pub fn devices() -> io::Result<Vec<(PathBuf, io::Result<Device>)>> {
     let mut nodes: Vec<(u32, PathBuf)> = std::fs::read_dir("/dev")?
         .filter_map(Result::ok)

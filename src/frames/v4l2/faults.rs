@@ -1,39 +1,39 @@
-//! Everything that goes wrong with a device: counted every time, logged once and then ever more rarely.
+//! Faults of a device: each is counted; the log gets the first of a kind and then fewer and fewer.
 
 use std::time::{Duration, Instant};
 
 use crate::metric;
 
-/// A way for a device to fail, as `oapwatch_source_faults_total{fault}` names it.
+/// A fault of a device; the label `fault` of `oapwatch_source_faults_total`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Fault {
     /// Frames were lost between two that arrived.
     SequenceGap,
-    /// The driver says the frame is corrupt.
+    /// The driver flags the frame as corrupt.
     ErrorFlag,
     ShortFrame,
-    /// A frame from before the stream was started, or from before the settings took hold.
+    /// A frame from before the stream was started, or from before the settings took effect.
     StaleFrame,
-    /// A time stamp on no clock we know: the time of arrival is used.
+    /// A time stamp on an unknown clock; the time of arrival is used.
     TimestampUnknown,
     /// A time stamp in the future or long past.
     TimestampImplausible,
     TimestampBackwards,
-    /// No frame for longer than the configured patience; the device is opened anew.
+    /// No frame for longer than `stall_s`; the device is reopened.
     Stalled,
     /// A signal interrupted a wait.
     Interrupted,
-    /// EACCES: after a replug the node is ours only once udev has set its group.
+    /// EACCES: after a replug, until udev has set the group of the node.
     Permission,
     /// ENODEV, ENXIO or ENOENT: the device is gone.
     Gone,
-    /// EBUSY: somebody else streams from it.
+    /// EBUSY: another process streams from it.
     Busy,
     /// EIO and every other error.
     Io,
-    /// The driver's format is not one we can use.
+    /// The format of the driver is not supported.
     FormatRefused,
-    /// The driver's format differs from the one before the device was opened anew.
+    /// The format differs from the one before the device was reopened.
     FormatChanged,
     ControlRefused,
 }
@@ -90,7 +90,7 @@ impl Fault {
     }
 }
 
-/// The first of a kind is logged at once, the next after this long, and then ever more rarely.
+/// Pause after the first log line of a kind; it grows with each line.
 const FIRST_PAUSE: Duration = Duration::from_secs(1);
 const LONGEST_PAUSE: Duration = Duration::from_secs(3600);
 
@@ -138,7 +138,7 @@ impl Faults {
 }
 
 impl Tally {
-    /// The number of faults that were passed over, when this one is to be logged.
+    /// When this fault is to be logged: the number that were not logged before it.
     fn count(&mut self, now: Instant) -> Option<u64> {
         let since = self.last_logged.map(|at| now.saturating_duration_since(at));
         match since {
@@ -146,7 +146,7 @@ impl Tally {
                 self.unlogged += 1;
                 return None;
             }
-            // A kind that has not been seen for long is news again.
+            // A kind that has not occurred for long is logged at once again.
             Some(quiet) if quiet > LONGEST_PAUSE => self.pause = FIRST_PAUSE,
             Some(_) => self.pause = (self.pause * 4).min(LONGEST_PAUSE),
             None => {}

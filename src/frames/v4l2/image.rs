@@ -1,4 +1,4 @@
-//! From the bytes of a camera image to the photodetector array: pure functions.
+//! Decodes a camera image into the photodetector array: pure functions.
 
 use ndarray::Array2;
 use serde::{Deserialize, Serialize};
@@ -52,7 +52,7 @@ impl PixelFormat {
     }
 }
 
-/// A four-character code as people write it.
+/// A four-character code as text.
 pub fn fourcc_name(fourcc: u32) -> String {
     let bytes = (fourcc & !(1 << 31)).to_le_bytes();
     let name: String = bytes
@@ -100,7 +100,7 @@ pub enum LayoutError {
         of_y: usize,
     },
     #[error(
-        "a region of {width} × {height} camera pixels is no whole multiple of the array's {nx} × {ny}: set source.v4l2.roi"
+        "a region of {width} × {height} camera pixels is not a whole multiple of the array's {nx} × {ny}: set source.v4l2.roi"
     )]
     NotDivisible {
         width: usize,
@@ -112,7 +112,7 @@ pub enum LayoutError {
     Stride { stride: usize, width: usize, bytes: usize },
 }
 
-/// What the driver granted, as far as decoding needs it.
+/// The granted image format, as far as decoding needs it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Granted {
     pub format: PixelFormat,
@@ -248,8 +248,8 @@ impl Layout {
     }
 }
 
-/// Turns counts into joules in place. A pixel with a saturated camera pixel in it carries no more than it shows:
-/// it is raised to `saturation_j`, by which the estimator knows it, or masked where the config names none.
+/// Converts counts to joules in place. A pixel with a saturated camera pixel in it is raised to `saturation_j`, the level that marks
+/// saturation for the estimator, or masked where the config names none.
 pub fn to_joules(
     counts: &mut Array2<f64>,
     saturated: Option<Array2<bool>>,

@@ -1,5 +1,5 @@
-//! A V4L2 device as a source that never gives up: whatever breaks, it is counted, the device is opened anew
-//! with back-off, and the monitor hears once a second that there is nothing to see.
+//! A V4L2 device as a source. Every fault is counted, the device is reopened with back-off, and an unusable frame is reported once
+//! a second while there is none.
 
 mod clock;
 mod config;
@@ -30,12 +30,11 @@ use faults::{Fault, Faults};
 use session::Session;
 use sys::{Format, Meta};
 
-/// Without a frame for this long (two intervals of a slower device), the monitor is told; and again after as
-/// long.
+/// Without a frame for this long (two intervals of a slower device) the source reports an unusable frame, and again after as long.
 const SILENCE: Duration = Duration::from_secs(1);
 const SHORTEST_RETRY: Duration = Duration::from_millis(20);
 const LONGEST_RETRY: Duration = Duration::from_secs(2);
-/// A clock set back by more than this is a clock that was wrong; by less, jitter.
+/// A clock set back by more than this was corrected; a smaller step is jitter.
 const CLOCK_STEP: SignedDuration = SignedDuration::from_secs(1);
 
 /// Frames of a V4L2 capture device.
@@ -56,7 +55,7 @@ pub struct V4l2 {
     last_usable: Instant,
     last_told: Instant,
     retry: Duration,
-    /// Why there is nothing to see, for the monitor.
+    /// Why there is no frame, for the report.
     trouble: String,
 }
 
@@ -66,18 +65,19 @@ enum State {
 }
 
 impl V4l2 {
-    /// Checks the config. The device itself is opened by the first wait, and waited for while it is not there.
+    /// Checks the config. The device itself is opened by the first wait; while it is absent the source waits for it.
     pub fn new(source: &super::Config, camera: &Camera) -> Result<Self, Error> {
         let missing = |field| Error::Missing { field, kind: "v4l2" };
         let positive = |name, found| Key::new("source").at(name).positive(found);
         let device = source.device.clone().ok_or(missing("device"))?;
         let config = source.v4l2.clone();
-        let rate_hz = positive("rate_hz", source.rate_hz)?;
+        let rate_hz = positive("rate_hz", source.rate_hz.unwrap_or(super::Config::DEFAULT_RATE_HZ))?;
         let seconds = |s: f64| Duration::try_from_secs_f64(s).unwrap_or(Duration::MAX);
         let stall_s = positive("v4l2.stall_s", config.stall_s)?;
         if let Some(exposure) = config.exposure_us {
             positive("v4l2.exposure_us", exposure)?;
         }
+        metrics::gauge!(metric::SOURCE_CONNECTED).set(0.0);
         let now = Instant::now();
         Ok(Self {
             faults: Faults::new(device.display().to_string()),
@@ -115,7 +115,7 @@ impl V4l2 {
             Ok(session) => {
                 let format = session.granted();
                 if self.last_format.is_none() {
-                    // The first frame is waited for from here on, however long the start took.
+                    // The wait for the first frame begins here, however long the start took.
                     self.last_told = Instant::now();
                 }
                 if let Some(before) = self.last_format.replace(format).filter(|before| *before != format) {
@@ -136,7 +136,7 @@ impl V4l2 {
         }
     }
 
-    /// One step: something to give, or nothing after at most `patience`.
+    /// One step: an event, or none after at most `patience`.
     fn step(&mut self, patience: Duration) -> Option<Next> {
         let (session, settling) = match &mut self.state {
             State::Closed { retry_at } => {
@@ -184,7 +184,7 @@ impl V4l2 {
                 }
                 Some(self.take(decoded, length, layout.bytes_needed(), meta, exposure))
             }
-            // Readable without a buffer is how a stream says that it is in error; the next dequeue tells more.
+            // A stream in error is readable without a buffer; the next dequeue gives the error.
             Ok(None) => {
                 std::thread::sleep(Duration::from_millis(1).min(patience));
                 None
@@ -251,7 +251,7 @@ impl V4l2 {
         Next::Frame(frame, Vec::new())
     }
 
-    /// The frame's time, which grows from frame to frame unless the clock itself was set back.
+    /// The time of a frame; it increases from frame to frame unless the clock was set back.
     fn time(&mut self, meta: &Meta, exposure: Duration) -> Timestamp {
         let Stamped { mut time, fault } = exposed(meta.flags, meta.timestamp, exposure, Moment::now());
         if let Some(fault) = fault {

@@ -1,4 +1,4 @@
-//! One opening of a device: negotiate, start, take frames until something breaks.
+//! One session with a device: negotiate a format, start the stream, take frames until a fault.
 
 use std::io;
 use std::path::Path;
@@ -12,7 +12,7 @@ use super::faults::{Fault, Faults};
 use super::image::{Granted, Layout, LayoutError, PixelFormat, fourcc_name};
 use super::sys::{Format, Meta, Node, Stream};
 
-/// Buffers asked for: enough to ride out a scheduling delay of a few frames.
+/// Buffers requested: enough for a scheduling delay of a few frames.
 const BUFFERS: u32 = 4;
 
 /// Why a device could not be started.

@@ -70,7 +70,7 @@ pub(super) struct Queue {
     under_way: usize,
     /// When the next probe may go; `None` while the endpoint works.
     probe_at: Option<Duration>,
-    /// The receiver asked for patience until then.
+    /// Until then the receiver asked for no request (`Retry-After`).
     not_before: Duration,
     disabled: bool,
 }

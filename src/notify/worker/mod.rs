@@ -1,8 +1,8 @@
 //! The delivery loop: takes due deliveries from every endpoint's queue, sends them and notes the outcome.
 
-mod intake;
+mod lane;
 
-use std::collections::{BTreeSet, HashMap};
+use std::collections::HashMap;
 use std::pin::pin;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
@@ -14,13 +14,12 @@ use tokio::sync::{mpsc, oneshot};
 use tokio::task::{Id, JoinError, JoinSet};
 
 use super::client::{self, Failure, Verdict};
-use super::cooling::CoolDown;
-use super::queue::{Next, Queue};
+use super::queue::Next;
 use super::status::{EndpointState, EndpointStatus};
 use super::{Clock, Endpoint};
 use crate::journal::{self, Attempt, Journal, Outcome};
 use crate::metric;
-use intake::Found;
+use lane::{Found, Lane};
 
 /// How long requests that are under way may still take when the daemon stops.
 const GRACE: Duration = Duration::from_secs(3);
@@ -41,40 +40,16 @@ pub(super) enum Command {
     },
 }
 
-/// One endpoint's deliveries.
-struct Lane {
-    endpoint: Arc<Endpoint>,
-    queue: Queue,
-    cool_down: CoolDown,
-    /// Whether what an earlier run left behind has been taken up.
-    is_known: bool,
-    /// Whether the disk has been asked and has not answered.
-    is_reading: bool,
-    /// Events up to this one are in the queue, or done with.
-    read_to: u64,
-    /// Events after that one of which the same is true, from memory while the disk does not answer.
-    ahead: BTreeSet<u64>,
-    status: EndpointStatus,
-}
-
-impl Lane {
-    fn advance(&mut self, read_to: u64) {
-        self.read_to = read_to;
-        self.ahead.retain(|&seq| seq > read_to);
-    }
-}
-
+/// All endpoints, their requests and their reads of the journal.
 pub(super) struct Worker {
     lanes: Vec<Lane>,
     journal: Journal,
-    /// The last event when this worker began.
-    begun_at: u64,
     clock: Clock,
     rng: ChaCha8Rng,
     commands: mpsc::Receiver<Command>,
     shown: Arc<Mutex<Vec<EndpointStatus>>>,
     /// Looks at the disk.
-    reads: JoinSet<Found>,
+    reads: JoinSet<(usize, Found)>,
     requests: JoinSet<Verdict>,
     /// Lane and event of each request.
     under_way: HashMap<Id, (usize, u64)>,
@@ -89,19 +64,10 @@ impl Worker {
         commands: mpsc::Receiver<Command>,
         shown: Arc<Mutex<Vec<EndpointStatus>>>,
     ) -> Self {
-        let lane = |endpoint: Arc<Endpoint>| Lane {
-            status: EndpointStatus::new(&endpoint),
-            cool_down: CoolDown::new(endpoint.cool_down),
-            endpoint,
-            queue: Queue::default(),
-            is_known: false,
-            is_reading: false,
-            read_to: 0,
-            ahead: BTreeSet::new(),
-        };
+        let begun_at = journal.last_seq();
+        let lane = |endpoint| Lane::new(endpoint, journal.clone(), clock, begun_at);
         Self {
             lanes: endpoints.into_iter().map(lane).collect(),
-            begun_at: journal.last_seq(),
             journal,
             clock,
             rng,
@@ -118,11 +84,11 @@ impl Worker {
         let mut heard = self.journal.heard();
         loop {
             heard.mark_unchanged();
-            for k in 0..self.lanes.len() {
-                self.look(k);
-            }
+            self.look();
             let now = self.clock.uptime();
-            self.release_held(now);
+            for lane in &mut self.lanes {
+                lane.release_held(now);
+            }
             self.start(now);
             self.show(now);
             let wakes = self
@@ -139,7 +105,7 @@ impl Worker {
             tokio::select! {
                 () = &mut shutdown => break,
                 Some(ended) = self.requests.join_next_with_id(), if !self.requests.is_empty() => self.settle(ended),
-                Some(Ok(found)) = self.reads.join_next(), if !self.reads.is_empty() => self.found(found),
+                Some(Ok(found)) = self.reads.join_next(), if !self.reads.is_empty() => self.lanes[found.0].found(found.1),
                 Ok(()) = heard.changed() => {}
                 Some(command) = self.commands.recv() => self.handle_command(command).await,
                 () = self.clock.sleep_until(wake) => {}
@@ -155,6 +121,15 @@ impl Worker {
             }
         }
         self.journal.settled().await;
+    }
+
+    /// Takes new events into the queues; reads of the disk run beside.
+    fn look(&mut self) {
+        for (k, lane) in self.lanes.iter_mut().enumerate() {
+            if let Some(read) = lane.look() {
+                self.reads.spawn(async move { (k, read.await) });
+            }
+        }
     }
 
     async fn ask<T: Send + 'static>(
@@ -287,7 +262,7 @@ impl Worker {
                         let read_to = self.lanes[endpoint].read_to;
                         for row in rows.iter().filter(|row| row.seq <= read_to) {
                             if !self.lanes[endpoint].cool_down.holds(row.seq) {
-                                self.push(endpoint, row);
+                                self.lanes[endpoint].push(row);
                             }
                         }
                     }

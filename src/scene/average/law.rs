@@ -1,4 +1,4 @@
-//! The mean of many independent fades and misses as one draw.
+//! Draws the mean of many independent fading and pointing factors at once.
 //!
 //! While the spot stays where it is, a frame sees the mean of T_int/T_coh values of ρ·h, ρ Gamma–Gamma and h the share
 //! captured of a beam that misses. Its distribution is computed once: the characteristic function of one value by quadrature,

@@ -1,4 +1,4 @@
-//! The mean over the exposure of what fading and pointing leave of a beam.
+//! Mean over the exposure of the factor that fading and pointing apply to a beam.
 
 mod law;
 
@@ -18,9 +18,9 @@ use crate::toml_file::Key;
 #[derive(Debug)]
 pub(super) enum Average {
     Constant(f64),
-    /// One draw from the mean's own law, from the stream of this effect.
+    /// One draw from the distribution of the mean, from the stream of this effect.
     OneDraw(Effect, MeanLaw),
-    /// Every value by itself.
+    /// Each value drawn separately.
     Drawn {
         turbulence: Option<Turbulence>,
         pointing: Option<Pointing>,
@@ -90,17 +90,18 @@ impl Average {
                 Effect::Pointing
             };
             for effect in on {
-                let reason =
-                    format!("the mean of T_int/T_coh = {count} values is one draw from its own law, tabulated once");
+                let reason = format!(
+                    "the mean of T_int/T_coh = {count} values is one draw from its distribution, tabulated once"
+                );
                 decisions.note(effect, Status::Folded, reason);
             }
             return Ok(Self::OneDraw(from, law));
         }
         for effect in on {
             let why = match (steps, fixed.is_none()) {
-                (2.., _) => "the spot moves meanwhile",
-                (_, true) => "their law depends on each emitter's range",
-                _ => "too few for a table to pay",
+                (2.., _) => "the spot moves during the exposure",
+                (_, true) => "their distribution depends on each emitter's range",
+                _ => "too few values for a table",
             };
             let reason = format!("T_int/T_coh = {count} values an emitter, averaged: {why}");
             decisions.note(effect, Status::On, reason);

@@ -1,17 +1,19 @@
+//! Spot shapes that are not Gaussian: defocus and coma.
+
 use serde::{Deserialize, Serialize};
 
 use super::table::Table;
 use crate::scene::render::Spot;
 use crate::toml_file::{Key, OutOfRange};
 
-/// A spot that is no Gaussian: the rays of a spot diagram, each blurred by what σ_eff leaves for diffraction and the
-/// sensor. Geometric optics, so valid where the aberration is wider than the diffraction.
+/// A spot that is not Gaussian: the rays of a spot diagram, each blurred by the remainder of σ_eff, which is due to diffraction and
+/// the sensor. Geometric optics, so valid where the aberration is wider than the diffraction.
 ///
 /// A ray through the pupil at (ρ, φ), ρ ≤ 1, lands beside the centre (Born and Wolf, Principles of Optics, 1999, section 5.3)
 /// - through defocus by R·ρ·(cos φ, sin φ), a disc of radius R = 2σ_eff·√share, whose variance per axis, R²/4 = d²/16 with its
 ///   diameter d, is `share` of σ_eff²: the disc that the estimator takes for part of its Gaussian;
 /// - through coma by C·ρ²·(2 + cos 2φ, sin 2φ) − (C, 0), the first axis pointing away from the array's centre, C growing in
-///   proportion to the distance from there. The mean, (C, 0), is taken out: it is the distortion's business.
+///   proportion to the distance from there. The mean, (C, 0), is removed: it belongs to the distortion.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Aberrations {
@@ -21,7 +23,7 @@ pub struct Aberrations {
     pub coma_m: f64,
 }
 
-/// The rays of one spot, ready to be cast.
+/// The rays of one spot.
 #[derive(Debug)]
 pub(in crate::scene) struct Rays {
     /// Rings over the pupil.

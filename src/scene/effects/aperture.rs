@@ -1,3 +1,5 @@
+//! The exact power through the lens.
+
 use serde::{Deserialize, Serialize};
 
 use super::table::Table;

@@ -1,3 +1,5 @@
+//! Attenuation along the path.
+
 use serde::{Deserialize, Serialize};
 
 use super::table::Table;

@@ -1,3 +1,5 @@
+//! Attitude errors of the platform.
+
 use rand_distr::{Distribution, StandardNormal};
 use serde::{Deserialize, Serialize};
 
@@ -7,7 +9,7 @@ use crate::scene::process::GaussianProcess;
 use crate::scene::stream::{Ledger, Streams};
 use crate::toml_file::{Key, OutOfRange};
 
-/// The platform's attitude differs from what is believed: every spot of a frame moves alike. Tilts about y and x shift the
+/// The platform's attitude differs from the assumed one: every spot of a frame moves alike. Tilts about y and x shift the
 /// angles θx and θy, yaw turns them about the lens's axis; each is N(bias, std²), anew for every frame, or with
 /// autocovariance std²·exp(−τ²/2T²) over the time T. Valid for rotations about the lens.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
@@ -33,7 +35,7 @@ impl Table for Attitude {
     }
 }
 
-/// An attitude ready to be evaluated in any frame.
+/// An attitude prepared for evaluation in any frame.
 #[derive(Debug)]
 pub(in crate::scene) struct Pose {
     table: Attitude,

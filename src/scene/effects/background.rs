@@ -1,3 +1,5 @@
+//! Background light of sky and ground.
+
 use serde::{Deserialize, Serialize};
 
 use super::table::Table;

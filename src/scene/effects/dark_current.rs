@@ -1,3 +1,5 @@
+//! Dark current of the pixels.
+
 use rand::Rng;
 use rand_distr::{Distribution, LogNormal};
 use serde::{Deserialize, Serialize};

@@ -1,3 +1,5 @@
+//! Dead and hot pixels.
+
 use ndarray::Array2;
 use rand::{Rng, RngExt};
 use serde::{Deserialize, Serialize};
@@ -17,7 +19,7 @@ pub struct Defects {
     pub masked: bool,
 }
 
-/// Which pixels are broken, and how.
+/// The defective pixels of an array.
 #[derive(Debug)]
 pub(in crate::scene) struct DefectMap {
     dead: Vec<usize>,

@@ -1,11 +1,13 @@
+//! Distortion of the lens.
+
 use serde::{Deserialize, Serialize};
 
 use super::table::Table;
 use crate::optics::Distortion;
 use crate::toml_file::{Key, OutOfRange};
 
-/// The lens's departure from a pinhole (Brown, 1966), in the form that a calibration has it; the data sheet in `[optics]`
-/// does not know of it.
+/// The lens's departure from a pinhole (Brown, 1966), in the parameters of a calibration; the data sheet in `[optics]` does not
+/// include it.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct DistortionTable {

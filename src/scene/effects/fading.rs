@@ -1,3 +1,5 @@
+//! Gamma–Gamma fading of the beams.
+
 use rand::Rng;
 use rand_distr::{Distribution, Gamma};
 use serde::{Deserialize, Serialize};

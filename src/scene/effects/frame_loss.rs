@@ -1,3 +1,5 @@
+//! Frames lost or repeated on the link to the camera.
+
 use rand::RngExt;
 use serde::{Deserialize, Serialize};
 
@@ -6,7 +8,7 @@ use crate::scene::effect::Effect;
 use crate::scene::stream::{Ledger, Streams};
 use crate::toml_file::{Key, OutOfRange};
 
-/// The link to the camera loses frames, or hands the last one out again, each frame with the given probability.
+/// The link to the camera drops or repeats each frame with the given probability.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct FrameLoss {
@@ -14,7 +16,7 @@ pub struct FrameLoss {
     pub repeated: f64,
 }
 
-/// What became of a frame on its way.
+/// The fate of a frame on the link.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Fate {

@@ -1,3 +1,5 @@
+//! Photo-response non-uniformity.
+
 use rand::Rng;
 use rand_distr::{Distribution, StandardNormal};
 use serde::{Deserialize, Serialize};

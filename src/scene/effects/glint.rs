@@ -1,3 +1,5 @@
+//! Light sources that are not beams: glints and lamps.
+
 use std::f64::consts::TAU;
 
 use serde::{Deserialize, Serialize};
@@ -8,8 +10,8 @@ use crate::scene::motion::Schedule;
 use crate::scene::render::Spot;
 use crate::toml_file::{Key, OutOfRange};
 
-/// A blot of light that is no beam: the sun's glint on water, or a lamp that blinds. A Gaussian of the given width and peak,
-/// where an emitter at `at_m` would be seen.
+/// Light that is not a beam: the sun's glint on water, or a dazzling lamp. A Gaussian of the given width and peak, imaged where an
+/// emitter at `at_m` would be.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Glint {

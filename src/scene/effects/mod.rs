@@ -1,4 +1,4 @@
-//! The effects: one small file each, with its equation and where it is valid.
+//! The effects: one file each, with its equation and range of validity.
 
 mod aberrations;
 mod aperture;
@@ -61,7 +61,7 @@ use table::Table;
 
 macro_rules! declare_effects {
     ($($number:literal $effect:ident $field:ident: $table:ty,)*) => {
-        /// `[effects]`: what is not named does not happen and costs nothing.
+        /// `[effects]`: an effect that is not named is not simulated and costs nothing.
         #[derive(Clone, Debug, Default, Serialize, Deserialize)]
         #[serde(deny_unknown_fields, default)]
         pub struct Effects {

@@ -1,3 +1,5 @@
+//! Motion of emitters within an exposure.
+
 use serde::{Deserialize, Serialize};
 
 use super::table::Table;

@@ -1,3 +1,5 @@
+//! Pointing error of the beams.
+
 use rand::Rng;
 use rand_distr::{Distribution, StandardNormal};
 use serde::{Deserialize, Serialize};

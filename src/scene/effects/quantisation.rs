@@ -1,3 +1,5 @@
+//! Quantisation by the converter.
+
 use serde::{Deserialize, Serialize};
 
 use super::table::Table;

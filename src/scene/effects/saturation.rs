@@ -1,3 +1,5 @@
+//! Saturation of pixels, with blooming.
+
 use serde::{Deserialize, Serialize};
 
 use super::table::Table;

@@ -1,3 +1,5 @@
+//! Shot noise of the light.
+
 use rand::Rng;
 use rand_distr::{Distribution, Poisson, StandardNormal};
 use serde::{Deserialize, Serialize};

@@ -1,4 +1,4 @@
-//! What every table of `[effects]` can do.
+//! The interface of the tables of `[effects]`.
 
 use crate::toml_file::{Key, OutOfRange};
 

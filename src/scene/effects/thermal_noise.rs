@@ -1,3 +1,5 @@
+//! Additive read-out noise.
+
 use rand::Rng;
 use rand_distr::{Distribution, StandardNormal};
 use serde::{Deserialize, Serialize};

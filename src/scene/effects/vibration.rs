@@ -1,3 +1,5 @@
+//! Vibration of the platform within an exposure.
+
 use std::f64::consts::TAU;
 
 use rand::RngExt;
@@ -8,7 +10,7 @@ use crate::scene::effect::Effect;
 use crate::scene::stream::{Ledger, Streams};
 use crate::toml_file::{Key, OutOfRange};
 
-/// The platform shakes within an exposure: every angle moves by a·sin(2πft + φ), φ drawn once. Over many periods the spot
+/// The platform vibrates within an exposure: every angle moves by a·sin(2πft + φ), φ drawn once. Over many periods the spot
 /// widens by z·a/√2 along the direction of a. Valid for a lens that turns as a whole.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]

@@ -1,3 +1,5 @@
+//! Vignetting of the lens.
+
 use serde::{Deserialize, Serialize};
 
 use super::table::Table;

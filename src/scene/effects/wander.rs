@@ -1,3 +1,5 @@
+//! Angle-of-arrival fluctuation within an exposure.
+
 use rand::Rng;
 use rand_distr::{Distribution, StandardNormal};
 use serde::{Deserialize, Serialize};

@@ -1,11 +1,12 @@
-//! A hard case, how it is tried, and what was seen.
+//! A hard case, its check and its outcome.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::time::{Duration, Instant};
 
 use crate::estimate;
+use crate::hash::fnv1a;
 
-/// How thoroughly to look.
+/// Options of a run.
 #[derive(Clone, Debug)]
 pub struct Options {
     /// Frames of each kind.
@@ -14,27 +15,27 @@ pub struct Options {
     pub estimator: estimate::Config,
 }
 
-/// Something hard, and how to see whether the program bears it.
+/// A hard case with its check.
 pub struct Case {
     pub group: &'static str,
     pub name: String,
-    /// What makes it hard.
+    /// The difficulty.
     pub hard: &'static str,
-    /// What is promised.
+    /// The requirement.
     pub expected: &'static str,
     check: Box<dyn Fn(&Options) -> Observed>,
 }
 
-/// What was seen.
+/// The outcome of a case.
 #[derive(Clone, Debug)]
 pub struct Observed {
     pub happened: String,
     pub holds: bool,
-    /// The worst of all frames, where frames were shown to the estimator.
+    /// Worst of all frames, where the case has frames.
     pub fit: Option<Worst>,
 }
 
-/// How hard the estimator found it, over all frames of a case.
+/// Effort of the estimator, the worst over all frames of a case.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Worst {
     /// Largest condition number of an information matrix.
@@ -44,7 +45,7 @@ pub struct Worst {
     pub time: Duration,
 }
 
-/// A case after it was tried.
+/// A case with its outcome.
 #[derive(Clone, Debug)]
 pub struct Row {
     pub group: &'static str,
@@ -72,13 +73,11 @@ impl Case {
         }
     }
 
-    /// Tries the case, with frames of its own: cases that share their noise would share its accidents. A panic is an observation like any other: the promise is broken.
+    /// Runs the case with random frames of its own, so that cases do not share their noise. A panic is an outcome that violates the
+    /// requirement.
     pub fn run(&self, options: &Options) -> Row {
         let start = Instant::now();
-        // FNV-1a: the same everywhere and for ever, unlike the standard library's hashes.
-        let own = self.name.bytes().fold(0xcbf2_9ce4_8422_2325, |hash: u64, byte| {
-            (hash ^ u64::from(byte)).wrapping_mul(0x100_0000_01b3)
-        });
+        let own = fnv1a(self.name.bytes());
         let options = &Options {
             seed: options.seed.wrapping_add(own),
             ..options.clone()
@@ -99,8 +98,8 @@ impl Case {
     }
 }
 
-/// Emitters invented where none is that the estimator's price of an emitter allows in so many frames: one in a thousand frames
-/// on average, and more than this number in one of ten thousand studies.
+/// Most false emitters that the estimator's penalty allows in so many frames: one in a thousand frames on average, and more than
+/// this number in one of ten thousand studies.
 pub(crate) fn false_alarms_allowed(frames: usize) -> usize {
     const RATE: f64 = 1e-3;
     const CHANCE: f64 = 1e-4;

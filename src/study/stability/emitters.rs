@@ -1,10 +1,10 @@
-//! Emitters that are hard to tell apart, to see at all, or to bear in number.
+//! Emitters that are hard to resolve, faint, or many.
 
 use super::trial::{Source, anywhere, camera, energy, expose, observe};
 use super::{Case, false_alarms_allowed};
 
 const GROUP: &str = "Emitters";
-/// Standard deviations beyond which a position without a warning counts as wrong: 1e-7 of honest ones are.
+/// Standard deviations beyond which a position without a warning counts as wrong; 1e-7 of correct ones lie beyond.
 pub(super) const LIMIT: f64 = 6.0;
 
 pub(super) fn cases() -> Vec<Case> {
@@ -19,7 +19,7 @@ pub(super) fn cases() -> Vec<Case> {
 /// Two equal emitters `d` σ apart, each with a signal-to-noise ratio of 1000.
 fn pair(d: f64) -> Case {
     const SNR: f64 = 1e3;
-    // Two emitters can be told apart from d ≥ 5σ/√SNR on; half as much again for one in ten that is unlucky.
+    // Two emitters can be resolved from d ≥ 5σ/√SNR; half as much again covers nine frames in ten.
     let is_resolvable = d >= 7.5 / SNR.sqrt();
     let expected = if is_resolvable {
         "two found; no position without a warning is off by more than 6 of its own σ; from 1 σ on nine in ten carry none"

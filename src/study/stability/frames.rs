@@ -1,4 +1,4 @@
-//! Frames that no optics made.
+//! Frames that no optical system could produce.
 
 use ndarray::Array2;
 use rand_chacha::ChaCha8Rng;
@@ -13,16 +13,16 @@ use crate::optics::Camera;
 const GROUP: &str = "Frames";
 const NO_STRAY: &str = "no position without a warning, except at the emitter";
 
-/// What an odd frame is owed.
+/// The requirement on such a frame.
 #[derive(Clone, Copy)]
-enum Promise {
+enum Requirement {
     Nothing,
     NoneClean,
     Refused,
     AtEmitter,
 }
 
-impl Promise {
+impl Requirement {
     fn words(self) -> &'static str {
         match self {
             Self::Nothing => "nothing found",
@@ -34,12 +34,12 @@ impl Promise {
 }
 
 pub(super) fn cases() -> Vec<Case> {
-    use Promise::{AtEmitter, NoneClean, Nothing, Refused};
+    use Requirement::{AtEmitter, NoneClean, Nothing, Refused};
     vec![
         flat("all zero", "no noise at all", Nothing, 0.0),
         flat(
             "constant, 10 σ_n a pixel",
-            "a background no config speaks of",
+            "a background that the config does not mention",
             NoneClean,
             1e-5,
         ),
@@ -50,8 +50,8 @@ pub(super) fn cases() -> Vec<Case> {
             1.0,
         ),
         flat("negative, −10 σ_n a pixel", "no emitter is negative", NoneClean, -1e-5),
-        flat("NaN everywhere", "nothing to go by", Refused, f64::NAN),
-        flat("+∞ everywhere", "nothing to go by", Refused, f64::INFINITY),
+        flat("NaN everywhere", "no usable pixel", Refused, f64::NAN),
+        flat("+∞ everywhere", "no usable pixel", Refused, f64::INFINITY),
         flat("largest f64 everywhere", "squares overflow", NoneClean, f64::MAX),
         flat("most negative f64 everywhere", "squares overflow", NoneClean, f64::MIN),
         flat("subnormal everywhere", "reciprocals overflow", Nothing, 5e-324),
@@ -107,7 +107,7 @@ pub(super) fn cases() -> Vec<Case> {
                 frame
             },
         ),
-        odd("everything masked", "nothing to go by", Refused, |camera, rng| {
+        odd("everything masked", "no usable pixel", Refused, |camera, rng| {
             let mut frame = expose(camera, &[emitter(camera)], rng);
             frame.masked = Some(Array2::from_elem(camera.shape(), true));
             frame
@@ -178,24 +178,24 @@ fn pattern(camera: &Camera, value: impl Fn(usize, usize) -> f64) -> Frame {
     frame(Array2::from_shape_fn(camera.shape(), |(y, x)| value(y, x)))
 }
 
-fn keep(
+fn check(
     options: &Options,
     camera: &Camera,
-    promise: Promise,
+    requirement: Requirement,
     make: impl Fn(&Camera, &mut ChaCha8Rng) -> Frame,
 ) -> Observed {
     let tally = observe(options, camera, |rng| (make(camera, rng), Vec::new()));
     let place = emitter(camera).sensor_m;
-    let places = if matches!(promise, Promise::AtEmitter) {
+    let places = if matches!(requirement, Requirement::AtEmitter) {
         vec![place]
     } else {
         Vec::new()
     };
     let (clean, stray) = tally.strays(camera, LIMIT, |_| places.clone());
-    let holds = match promise {
-        Promise::Nothing => tally.refused() == 0 && tally.counts().1 == 0,
-        Promise::Refused => tally.refused() == options.frames,
-        Promise::NoneClean | Promise::AtEmitter => stray <= false_alarms_allowed(options.frames),
+    let holds = match requirement {
+        Requirement::Nothing => tally.refused() == 0 && tally.counts().1 == 0,
+        Requirement::Refused => tally.refused() == options.frames,
+        Requirement::NoneClean | Requirement::AtEmitter => stray <= false_alarms_allowed(options.frames),
     };
     tally.observed(holds, &format!("{clean} clean positions, {stray} astray"))
 }
@@ -203,23 +203,23 @@ fn keep(
 fn odd(
     name: &'static str,
     hard: &'static str,
-    promise: Promise,
+    requirement: Requirement,
     make: impl Fn(&Camera, &mut ChaCha8Rng) -> Frame + 'static,
 ) -> Case {
-    Case::new(GROUP, name, hard, promise.words(), move |options| {
-        keep(options, &camera([32, 32], 1e-3), promise, &make)
+    Case::new(GROUP, name, hard, requirement.words(), move |options| {
+        check(options, &camera([32, 32], 1e-3), requirement, &make)
     })
 }
 
-fn flat(name: &'static str, hard: &'static str, promise: Promise, value: f64) -> Case {
-    odd(name, hard, promise, move |camera, _| pattern(camera, |_, _| value))
+fn flat(name: &'static str, hard: &'static str, requirement: Requirement, value: f64) -> Case {
+    odd(name, hard, requirement, move |camera, _| pattern(camera, |_, _| value))
 }
 
 fn laden(name: &'static str, share: f64) -> Case {
     odd(
         name,
         "holes anywhere in the spot",
-        Promise::AtEmitter,
+        Requirement::AtEmitter,
         move |camera, rng| {
             let mut frame = expose(camera, &[emitter(camera)], rng);
             let uniform = Uniform::new(0.0, 1.0).expect("a range");
@@ -233,16 +233,16 @@ fn laden(name: &'static str, share: f64) -> Case {
     )
 }
 
-fn saturated(name: &'static str, share: f64, promise: Promise) -> Case {
+fn saturated(name: &'static str, share: f64, requirement: Requirement) -> Case {
     Case::new(
         GROUP,
         name,
-        "a saturated pixel says only that it is bright",
-        promise.words(),
+        "a saturated pixel gives only a lower bound",
+        requirement.words(),
         move |options| {
             let mut camera = camera([32, 32], 1e-3);
             camera.saturation_j = Some(1e-3);
-            keep(options, &camera, promise, |camera, rng| {
+            check(options, &camera, requirement, |camera, rng| {
                 let mut frame = expose(camera, &[emitter(camera)], rng);
                 let uniform = Uniform::new(0.0, 1.0).expect("a range");
                 for value in &mut frame.pixels {

@@ -1,4 +1,4 @@
-//! What may not change the answer, or must change it in a known way.
+//! Transformations that must not change the estimate, or must change it in a known way.
 
 use std::sync::Arc;
 
@@ -62,8 +62,8 @@ fn locate(options: &Options, camera: &Camera, frame: &Frame) -> Estimate {
     estimator.estimate(frame).expect("a usable frame")
 }
 
-/// Largest distance between two answers, emitter by emitter, in the first's own standard deviations; ∞ where the numbers of
-/// emitters differ. The order in which they are listed does not matter.
+/// Largest distance between two estimates over their emitters, in standard deviations of the first; ∞ where the numbers of
+/// emitters differ. Their order does not matter.
 fn difference(a: &Estimate, b: &Estimate, map: impl Fn([f64; 2]) -> [f64; 2]) -> f64 {
     if a.emitters.len() != b.emitters.len() {
         return f64::INFINITY;
@@ -79,7 +79,7 @@ fn difference(a: &Estimate, b: &Estimate, map: impl Fn([f64; 2]) -> [f64; 2]) ->
     nearest.fold(0.0, f64::max)
 }
 
-/// The verdict over all frames: the share that agrees within `limit` standard deviations, and the worst.
+/// Summary over all frames: the share that agrees within `limit` standard deviations, and the worst.
 fn agreement(differences: impl Iterator<Item = f64>, limit: f64) -> Observed {
     let all: Vec<f64> = differences.collect();
     let apart = all.iter().filter(|d| **d > limit).count();
@@ -148,7 +148,7 @@ fn mirrored(
     )
 }
 
-/// The same pixels called by other coordinates: the axis starts elsewhere.
+/// The same pixels in other coordinates: the axis has another origin.
 fn shifted() -> Case {
     Case::new(
         GROUP,
@@ -249,7 +249,7 @@ fn threads() -> Case {
                     let (camera, frames, options) = (camera.clone(), frames.clone(), options.clone());
                     std::thread::spawn(move || {
                         let mut estimator = estimate::build(&options.estimator, &camera).expect("a known estimator");
-                        // Each thread in another order, so that what one frame leaves behind would show in the next.
+                        // A different order in each thread, so that state kept from one frame would change the next.
                         let n = frames.len();
                         let mut seen = vec![Vec::new(); n];
                         for i in 0..n {
@@ -279,7 +279,7 @@ fn threads() -> Case {
     )
 }
 
-/// Judged by this room's own forward model, not by the estimator's.
+/// Uses this module's own forward model, not the estimator's.
 fn no_worse_than_nothing() -> Case {
     Case::new(
         GROUP,

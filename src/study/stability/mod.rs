@@ -1,13 +1,13 @@
-//! The stability study: a catalogue of hard cases, each with what makes it hard, what is promised and what happened.
+//! The stability study: a catalogue of hard cases, each with its difficulty, its requirement and its outcome.
 //!
-//! Two promises stand behind every case that shows frames to the estimator: nothing it says is malformed
-//! ([`trial::faults`]), and a position that carries no warning is where an emitter is.
+//! Every case with frames requires two things of the estimator: its output is well-formed ([`trial::faults`]), and a position
+//! without a warning is the position of an emitter.
 
 mod case;
 mod emitters;
+mod estimators;
 mod frames;
 mod invariance;
-mod ladder;
 mod numbers;
 mod sensors;
 mod table;
@@ -18,13 +18,13 @@ pub(crate) use case::false_alarms_allowed;
 pub use case::{Case, Observed, Options, Row, Worst};
 pub use table::markdown;
 
-/// Every hard case known.
+/// All hard cases.
 pub fn catalogue() -> Vec<Case> {
     [
         emitters::cases(),
         frames::cases(),
         sensors::cases(),
-        ladder::cases(),
+        estimators::cases(),
         invariance::cases(),
         numbers::cases(),
         verdicts::cases(),

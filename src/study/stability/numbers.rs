@@ -1,4 +1,4 @@
-//! The formulas at the ends of their ranges, and assignments that are hard to make.
+//! Formulas at the limits of their ranges, and difficult assignments.
 
 use super::{Case, Observed};
 use crate::assign::assign;
@@ -23,7 +23,7 @@ pub(super) fn cases() -> Vec<Case> {
 fn observed(bad: &[String], tried: usize) -> Observed {
     Observed {
         happened: match bad.first() {
-            None => format!("{tried} tried, all as promised"),
+            None => format!("{tried} tried, all as required"),
             Some(first) => format!("{} of {tried} not, the first: {first}", bad.len()),
         },
         holds: bad.is_empty(),

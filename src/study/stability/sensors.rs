@@ -1,4 +1,4 @@
-//! Cameras that nobody builds, and units that nobody uses.
+//! Extreme cameras and units.
 
 use super::emitters::LIMIT;
 use super::trial::{Source, camera, energy, expose, observe};
@@ -12,14 +12,14 @@ pub(super) fn cases() -> Vec<Case> {
     for ratio in [1e-6, 1e-3, 0.03, 0.1, 0.3] {
         cases.push(shows(
             format!("σ_eff = {ratio} pixel"),
-            "the place within a pixel leaves no trace",
+            "the position within a pixel hardly changes the frame",
             move || camera([32, 32], ratio * 0.03 / 32.0),
         ));
     }
     for ratio in [0.5, 1.0, 10.0, 1e3] {
         cases.push(shows(
             format!("σ_eff = {ratio} sensor widths"),
-            "every place looks alike",
+            "all positions give nearly the same frame",
             move || camera([32, 32], ratio * 0.03),
         ));
     }
@@ -84,7 +84,7 @@ fn shows(name: String, hard: &'static str, camera: impl Fn() -> Camera + 'static
     shows_at(name, hard, 300.0, camera)
 }
 
-/// An emitter near the middle, seen by an odd camera.
+/// An emitter near the middle of the given camera.
 fn shows_at(name: String, hard: &'static str, snr: f64, camera: impl Fn() -> Camera + 'static) -> Case {
     Case::new(
         GROUP,

@@ -1,3 +1,5 @@
+//! The study as Markdown tables.
+
 use super::{Options, Row};
 use crate::estimate;
 
@@ -14,7 +16,7 @@ pub fn markdown(rows: &[Row], options: &Options) -> String {
         if row.group != group {
             group = row.group;
             text += &format!(
-                "\n### {group}\n\n{how}\n\n| case | what makes it hard | promised | happened | condition | steps | holds |\n|---|---|---|---|---|---|---|\n"
+                "\n### {group}\n\n{how}\n\n| case | what makes it hard | requirement | outcome | condition | steps | holds |\n|---|---|---|---|---|---|---|\n"
             );
         }
         let (condition, steps) = match row.seen.fit {

@@ -1,4 +1,4 @@
-//! Frames shown to the estimator, and what it said of them.
+//! Runs the estimator on random frames and tallies its output.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::time::Instant;
@@ -13,6 +13,7 @@ use super::{Observed, Options, Worst};
 use crate::estimate::{self, Error, Estimate, Flags};
 use crate::frame::Frame;
 use crate::optics::{Camera, Config, psf};
+use crate::stats::mahalanobis2;
 
 /// An emitter as it appears on the sensor.
 #[derive(Clone, Copy, Debug)]
@@ -21,19 +22,19 @@ pub struct Source {
     pub energy_j: f64,
 }
 
-/// What one frame really held, and what the estimator said.
+/// Truth and estimate of one frame.
 #[derive(Debug)]
 pub struct Sighting {
     pub truth: Vec<Source>,
     pub outcome: Result<Estimate, Error>,
 }
 
-/// Everything seen over a case's frames.
+/// Results over the frames of a case.
 #[derive(Debug, Default)]
 pub struct Tally {
     pub sightings: Vec<Sighting>,
     pub panics: usize,
-    /// Malformed statements, with the frame they were made about.
+    /// Malformed output, with its frame.
     pub faults: Vec<String>,
     pub worst: Worst,
 }
@@ -101,7 +102,7 @@ pub fn frame(pixels: Array2<f64>) -> Frame {
     }
 }
 
-/// Shows the estimator `options.frames` frames that `make` draws.
+/// Runs the estimator on `options.frames` frames that `make` draws.
 pub fn observe(options: &Options, camera: &Camera, make: impl Fn(&mut ChaCha8Rng) -> (Frame, Vec<Source>)) -> Tally {
     let build = || estimate::build(&options.estimator, camera).expect("a known estimator");
     let mut estimator = build();
@@ -132,7 +133,7 @@ pub fn observe(options: &Options, camera: &Camera, make: impl Fn(&mut ChaCha8Rng
     tally
 }
 
-/// What is malformed about an estimate, whatever the frame was: numbers that are not finite, covariances that are none.
+/// Malformed values of an estimate: numbers that are not finite, invalid covariances.
 pub fn faults(estimate: &Estimate) -> Vec<String> {
     let mut found = Vec::new();
     for (i, e) in estimate.emitters.iter().enumerate() {
@@ -176,7 +177,7 @@ pub fn faults(estimate: &Estimate) -> Vec<String> {
     found
 }
 
-/// Flags that tell a reader not to take a position at its covariance's word.
+/// Flags that warn that the covariance of a position may be too small.
 pub const WARNING: Flags = Flags::UNRESOLVED
     .union(Flags::NO_CONVERGENCE)
     .union(Flags::POOR_FIT)
@@ -185,7 +186,7 @@ pub const WARNING: Flags = Flags::UNRESOLVED
     .union(Flags::NON_GAUSSIAN);
 
 impl Tally {
-    /// Estimates without the frames that were refused.
+    /// Estimates of the frames that were not refused.
     pub fn estimates(&self) -> impl Iterator<Item = (&[Source], &Estimate)> {
         self.sightings
             .iter()
@@ -226,7 +227,7 @@ impl Tally {
         (clean, stray)
     }
 
-    /// The tally in words, and whether it is free of panics and faults and `holds` besides.
+    /// The outcome: the tally as text; it holds where `holds` is true and there are no panics and faults.
     pub fn observed(&self, holds: bool, remark: &str) -> Observed {
         let (least, most) = self.counts();
         let flagged = self
@@ -260,20 +261,4 @@ impl Tally {
             fit: Some(self.worst),
         }
     }
-}
-
-/// dᵀC⁻¹d; 0 for no difference, ∞ where C says that there can be none.
-pub fn mahalanobis2(cov: [[f64; 2]; 2], d: [f64; 2]) -> f64 {
-    if d == [0.0, 0.0] {
-        return 0.0;
-    }
-    // Whitened axis by axis, so that covariances of 1e-300 do not underflow in a determinant.
-    let (sx, sy) = (cov[0][0].sqrt(), cov[1][1].sqrt());
-    if sx == 0.0 || sy == 0.0 {
-        return f64::INFINITY;
-    }
-    let rho = cov[0][1] / sx / sy;
-    let (u, v) = (d[0] / sx, d[1] / sy);
-    let across = (v - rho * u).powi(2) / ((1.0 - rho) * (1.0 + rho)).max(f64::EPSILON);
-    u * u + across
 }

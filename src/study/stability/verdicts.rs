@@ -1,4 +1,4 @@
-//! Covariances that are none, and clocks that step, shown to the monitor.
+//! Invalid covariances and clock steps as input of the monitor.
 
 use jiff::{SignedDuration, Timestamp};
 
@@ -30,20 +30,20 @@ pub(super) fn cases() -> Vec<Case> {
             [[tiny, 0.0], [0.0, tiny]],
         ),
         covariance("1e12 : 1e-12", "condition 1e24", [[1e12, 0.0], [0.0, 1e-12]]),
-        covariance("indefinite", "no covariance at all", [[1.0, 2.0], [2.0, 1.0]]),
-        covariance("NaN", "no number at all", [[f64::NAN; 2]; 2]),
+        covariance("indefinite", "not a covariance", [[1.0, 2.0], [2.0, 1.0]]),
+        covariance("NaN", "not a number", [[f64::NAN; 2]; 2]),
     ];
     cases.extend([3600.0, -7200.0, 3.2e8, -3.2e8, 0.01, -0.01].map(clock_step));
     cases
 }
 
-/// All clocks step at once, as when a host's is set: the frames' and the claims'.
+/// The clocks of frames and claims step together, as when the clock of a host is set.
 fn clock_step(by_s: f64) -> Case {
     Case::new(
         GROUP,
         format!("the clock steps by {by_s:e} s"),
         "time runs backwards, or years pass between two frames",
-        "within 20 s the user is verified again; an eavesdropper who comes then is alerted, and nobody else",
+        "within 20 s the user is verified again; an eavesdropper who comes then is alerted, and no other alert is raised",
         move |_| {
             let camera = camera([64, 64], 1e-3);
             let config = claims::Config::default();
@@ -129,7 +129,7 @@ fn claim(time: Timestamp) -> Claim {
     }
 }
 
-/// Not the same numbers twice, or the sensor would look frozen.
+/// Varies from frame to frame, because identical frames count as a frozen sensor.
 fn emitter(camera: &Camera, frame: u64, [x_m, y_m]: [f64; 2], cov_m2: [[f64; 2]; 2]) -> Emitter {
     Emitter {
         x_m: x_m + 1e-3 * (frame as f64).sin(),
@@ -153,7 +153,7 @@ fn estimate(emitters: Vec<Emitter>) -> Estimate {
     }
 }
 
-/// A user and an eavesdropper, both said to be known as well as `cov_m2` says.
+/// A user and an eavesdropper, both with the covariance `cov_m2`.
 fn covariance(name: &str, hard: &'static str, cov_m2: [[f64; 2]; 2]) -> Case {
     let is_told = cov_m2.iter().flatten().all(|c| c.abs() < 1e6);
     Case::new(
@@ -161,7 +161,7 @@ fn covariance(name: &str, hard: &'static str, cov_m2: [[f64; 2]; 2]) -> Case {
         format!("covariance {name}"),
         hard,
         if is_told {
-            "nothing malformed; the emitter that nobody claims is alerted"
+            "nothing malformed; the unclaimed emitter is alerted"
         } else {
             "nothing malformed"
         },

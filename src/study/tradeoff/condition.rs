@@ -1,4 +1,4 @@
-//! What may be wrong with a camera without the estimator being told, and the bound that then holds.
+//! Model errors that the estimator is not given, and the bound under each.
 
 use ndarray::Array2;
 use rand::RngExt;
@@ -78,7 +78,7 @@ impl Condition {
         truth
     }
 
-    /// What a spot consists of: offsets of its parts, the same in x and in y, and their shares.
+    /// The Gaussians that a spot consists of: offsets, the same in x and in y, and shares.
     pub(super) fn parts(condition: Option<Self>, camera: &Camera) -> Vec<(f64, f64)> {
         if condition != Some(Self::Ellipse) {
             return vec![(0.0, 1.0)];

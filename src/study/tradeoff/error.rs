@@ -19,7 +19,7 @@ pub enum Error {
     Picture { path: PathBuf, message: PictureError },
 }
 
-/// What the plotting library said.
+/// The error of the plotting library.
 #[derive(Debug)]
 pub struct PictureError(pub(super) Box<dyn std::error::Error + Send + Sync>);
 

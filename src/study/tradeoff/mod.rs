@@ -1,9 +1,8 @@
-//! What accuracy costs in time: every rung of the ladder on the same frames, against the Cramér–Rao bound.
+//! The trade-off study: accuracy and time of every estimator on the same frames, against the Cramér–Rao bound.
 
 mod condition;
 mod error;
 mod networks;
-#[cfg(test)]
 mod oracle;
 mod picture;
 mod report;
@@ -14,22 +13,25 @@ use std::path::Path;
 
 use crate::estimate::{ESTIMATORS, Learned};
 pub(in crate::study) use networks::Candidate;
+pub(in crate::study) use scene::Scene;
+pub(in crate::study) use score::CUTOFF_M;
 
 pub use condition::Condition;
 pub use error::{Error, PictureError};
 pub use networks::{Trained, Training};
+pub use oracle::Oracle;
 pub use scene::{Cell, Noise};
 pub use score::{Row, Study};
 
-/// What to measure.
+/// Cells, estimators and frames to measure.
 #[derive(Clone, Debug)]
 pub struct Plan {
     pub cells: Vec<Cell>,
-    /// Names of rungs.
+    /// Names of estimators.
     pub rungs: Vec<&'static str>,
-    /// Networks for the learned rungs besides the embedded one, each in the cell that it was trained for.
+    /// Networks for the learned estimators besides the embedded one, each in the cell that it was trained for.
     pub networks: Vec<Trained>,
-    /// Frames a cell.
+    /// Frames per cell.
     pub frames: usize,
     pub seed: u64,
 }
@@ -68,7 +70,7 @@ impl Plan {
         }
     }
 
-    /// The same picture from few cells and frames, under a minute.
+    /// Few cells and frames, under a minute.
     pub fn quick() -> Self {
         let mut cells = vec![
             Cell::new(Noise::Energy, 1.0, 64),
@@ -91,7 +93,7 @@ impl Plan {
         self.pairs().count()
     }
 
-    /// Every cell with the rungs that can be had there: a network only where it was trained.
+    /// Every cell with its estimators: a network only in the cell that it was trained for.
     fn pairs(&self) -> impl Iterator<Item = (Cell, Candidate)> {
         let had = |cell: &Cell| -> Vec<(Cell, Candidate)> {
             let rungs = self.rungs.iter().flat_map(|r| Candidate::of(r, cell, &self.networks));
@@ -111,7 +113,7 @@ fn rungs() -> Vec<&'static str> {
 }
 
 /// Runs what `out` does not hold yet and writes tradeoff.json after each row, tradeoff.md and the pictures at the end.
-/// `progress` is told of each row.
+/// `progress` is called after each row.
 pub fn run(plan: &Plan, out: &Path, progress: &mut dyn FnMut(&Row)) -> Result<Study, Error> {
     let io = |path: &Path| {
         let path = path.to_owned();

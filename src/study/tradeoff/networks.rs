@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use super::{Cell, Error};
 use crate::estimate::Learned;
 
-/// A network and what its card says of it.
+/// A network with its card.
 #[derive(Clone, Debug)]
 pub struct Trained {
     pub path: PathBuf,
@@ -33,12 +33,12 @@ pub struct Training {
     pub seconds: f64,
 }
 
-/// One rung as it is run in one cell.
+/// One estimator as it is run in one cell.
 #[derive(Clone, Debug)]
 pub(in crate::study) struct Candidate {
     /// What `[estimator] name` selects it by.
     pub rung: &'static str,
-    /// The network in front of it; the embedded one where a learned rung has none.
+    /// The network in front of it; the embedded one where a learned estimator has none.
     pub network: Option<Trained>,
 }
 
@@ -93,7 +93,7 @@ impl Trained {
 }
 
 impl Candidate {
-    /// The rung in `cell`: once, or once for each network trained for it.
+    /// The estimator in `cell`: once, or once for each network trained for it.
     pub fn of(rung: &'static str, cell: &Cell, networks: &[Trained]) -> Vec<Self> {
         let alone = Self { rung, network: None };
         if Learned::ALL.iter().all(|l| l.name() != rung) {
@@ -119,7 +119,7 @@ impl Candidate {
         self.network.as_ref().map(Trained::training)
     }
 
-    /// The rung's name in tables.
+    /// The name of the estimator in tables.
     pub fn label(&self) -> String {
         match &self.network {
             Some(network) => format!("{} {}", self.rung, network.card.network),

@@ -1,3 +1,5 @@
+//! The pictures of the study (SVG).
+
 use std::path::Path;
 
 use plotters::prelude::*;

@@ -1,3 +1,5 @@
+//! The study as Markdown.
+
 use std::fmt::Write;
 
 use super::{Noise, Row, Study};
@@ -13,7 +15,7 @@ pub(super) const PAPER: [(usize, f64, f64); 6] = [
     (100, 0.81, 1.3),
 ];
 
-/// Rungs of one cell that no other beats in both time and OSPA.
+/// The Pareto front of one cell: estimators that no other beats in both time and OSPA.
 pub(super) fn front<'a>(rows: &[&'a Row]) -> Vec<&'a Row> {
     let mut sorted = rows.to_vec();
     sorted.sort_by(|a, b| a.latency_median_us.total_cmp(&b.latency_median_us));
@@ -28,7 +30,7 @@ pub(super) fn front<'a>(rows: &[&'a Row]) -> Vec<&'a Row> {
         .collect()
 }
 
-/// Whether a row's label is of the rung `name`: a network's own name may follow.
+/// Whether a row's label belongs to the estimator `name`; the name of a network may follow.
 fn is_rung(label: &str, name: &str) -> bool {
     label.split_whitespace().next() == Some(name)
 }
@@ -133,7 +135,7 @@ pub(super) fn markdown(study: &Study) -> String {
     text
 }
 
-/// The paper's errors by array size, and those of every rung that has a row among the cells that `is_wanted` names.
+/// The paper's errors by array size, and those of every estimator that has a row among the cells that `is_wanted` names.
 fn beside(text: &mut String, study: &Study, is_wanted: impl Fn(&Row) -> bool) {
     let rows: Vec<&Row> = study.rows.iter().filter(|r| is_wanted(r)).collect();
     let mut rungs: Vec<&str> = ESTIMATORS.iter().map(|r| r.name).collect();

@@ -1,3 +1,5 @@
+//! The cells of the study: frames from the paper's scene, with truth and bounds.
+
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, Gamma, Normal};
@@ -27,7 +29,7 @@ pub struct Cell {
     pub pixels: usize,
     /// Emitters a frame; 5 to 9 when left out.
     pub emitters: Option<usize>,
-    /// What the estimator is not told of.
+    /// The model error that the estimator is not given.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub condition: Option<Condition>,
 }
@@ -71,7 +73,7 @@ impl Cell {
         }
     }
 
-    /// The same cell under a condition that the estimator is not told of.
+    /// The same cell with a model error that the estimator is not given.
     pub fn under(self, condition: Condition) -> Self {
         Self {
             condition: Some(condition),
@@ -79,7 +81,7 @@ impl Cell {
         }
     }
 
-    /// Five to nine emitters, and nothing that the estimator is not told of.
+    /// Five to nine emitters, without a model error.
     pub(super) fn is_plain(&self) -> bool {
         self.emitters.is_none() && self.condition.is_none()
     }

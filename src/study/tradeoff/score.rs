@@ -1,3 +1,5 @@
+//! Scores of one estimator in one cell.
+
 use std::time::Instant;
 
 use serde::{Deserialize, Serialize};
@@ -9,18 +11,18 @@ use crate::assign::ospa;
 use crate::estimate;
 
 /// OSPA's cutoff, m.
-pub(super) const CUTOFF_M: f64 = 25.0;
+pub(in crate::study) const CUTOFF_M: f64 = 25.0;
 /// An emitter is resolvable where its bound's root is below this share of the distance to the next and below 10 m.
 const RESOLVABLE_SHARE: f64 = 0.1;
 const RESOLVABLE_M: f64 = 10.0;
 
-/// The study's file: rows are found again by cell, rung, frames and seed.
+/// The study's file: rows are identified by cell, estimator, frames and seed.
 #[derive(Debug, Default, Serialize, Deserialize)]
 pub struct Study {
     pub rows: Vec<Row>,
 }
 
-/// One rung in one cell.
+/// One estimator in one cell.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Row {
     pub cell: Cell,

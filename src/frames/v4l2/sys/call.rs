@@ -24,7 +24,7 @@ impl Zeroed for c::v4l2_requestbuffers {}
 impl Zeroed for c::v4l2_buffer {}
 impl Zeroed for c::v4l2_plane {}
 
-/// `argument` must be the struct that `request` is defined for: every call in this room pairs them as the V4L2
+/// `argument` must be the struct that `request` is defined for: every call in this module pairs them as the V4L2
 /// headers do, and the request number carries the struct's size.
 pub fn ioctl<T>(fd: &File, request: vidioc::_IOC_TYPE, argument: &mut T) -> io::Result<()> {
     // SAFETY: the pointer is to a live, exclusively borrowed struct of the size encoded in the request.

@@ -2,8 +2,8 @@
 //! `Stream` and `Arena` are not used: their `Drop` panics on most errors, a stream is unusable after a timeout
 //! or a signal, `format()` panics on unknown colour spaces and multi-planar devices are refused.
 //!
-//! This is the only room with unsafe code: ioctls take a pointer to a C struct, replies come in unions, and
-//! buffers are mapped memory. Each block says why it is sound.
+//! This is the only module with unsafe code: ioctls take a pointer to a C struct, replies come in unions, and buffers are mapped
+//! memory. Each block states why it is sound.
 #![allow(unsafe_code)]
 
 mod call;

@@ -1,3 +1,5 @@
+//! An open device node: capability, formats, frame interval and controls.
+
 use std::fs::{File, OpenOptions};
 use std::io;
 use std::os::unix::fs::OpenOptionsExt;
@@ -8,7 +10,7 @@ use v4l::v4l2::vidioc;
 
 use super::call::{Zeroed, ioctl, text};
 
-/// What a node says it is.
+/// Identity of a node.
 #[derive(Clone, Debug)]
 pub struct Capability {
     pub driver: String,
@@ -109,7 +111,7 @@ impl Node {
                 description: text(&raw.description),
             })
         };
-        // A driver that never says EINVAL would list for ever.
+        // Bounded: a faulty driver might never end the list with EINVAL.
         (0..256).map_while(offered).collect()
     }
 

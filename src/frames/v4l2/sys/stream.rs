@@ -1,3 +1,5 @@
+//! A running stream: mapped buffers, dequeue and requeue.
+
 use std::io;
 use std::os::fd::AsRawFd;
 use std::os::raw::c_void;
@@ -10,7 +12,7 @@ use v4l::v4l2::{self, vidioc};
 use super::call::{Zeroed, ioctl};
 use super::node::Node;
 
-/// What the driver says about one filled buffer.
+/// Metadata of one filled buffer.
 #[derive(Clone, Copy, Debug)]
 pub struct Meta {
     pub flags: u32,
@@ -53,7 +55,7 @@ impl Stream {
         Ok(stream)
     }
 
-    /// Waits for a filled buffer or for trouble; `false` when neither came in time.
+    /// Waits for a filled buffer or an error; `false` when neither came in time.
     pub fn wait(&self, patience: Duration) -> io::Result<bool> {
         let mut fd = libc::pollfd {
             fd: self.node.fd.as_raw_fd(),

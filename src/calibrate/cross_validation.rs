@@ -1,20 +1,22 @@
-//! Whether a calibration helps: the program's own estimator on frames that the fit has not seen.
+//! Cross-validation: the error of the configured estimator on frames that the fit did not use.
 
 use jiff::Timestamp;
 use ndarray::Array2;
+use serde::Serialize;
 
 use super::truth::Beacon;
 use crate::assign::assign;
 use crate::estimate::Estimator;
 use crate::frame::Frame;
+use crate::stats::median;
 
-/// A beacon farther than this from every emitter found counts as missed, m.
+/// Distance to the nearest emitter beyond which a beacon counts as missed, m.
 const CUTOFF_M: f64 = 25.0;
 
-/// How well an estimator finds the beacons.
-#[derive(Clone, Copy, Debug, PartialEq)]
+/// Localisation error of an estimator on the beacons.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Score {
-    /// Beacons looked for.
+    /// Beacons in the frames.
     pub beacons: usize,
     /// Beacons without an emitter within the cutoff.
     pub missed: usize,
@@ -24,12 +26,14 @@ pub struct Score {
     pub mse_m2: f64,
     /// Median squared distance of the others, m².
     pub median_m2: f64,
+    /// Median squared distance that the estimator's own covariances predict, m².
+    pub noise_median_m2: f64,
 }
 
-/// Runs an estimator over frames and holds what it finds to the beacons. Beacons need not be all that shines, so
-/// emitters too many cost nothing.
+/// Runs an estimator over frames and compares its emitters with the beacons. Surplus emitters cost nothing, because frames may
+/// hold sources without a surveyed position.
 pub fn score(estimator: &mut dyn Estimator, frames: &[(usize, &Array2<f64>)], beacons: &[Beacon]) -> Score {
-    let mut squared = Vec::new();
+    let (mut squared, mut variances) = (Vec::new(), Vec::new());
     let mut total = 0;
     for (index, pixels) in frames {
         let here: Vec<&Beacon> = beacons.iter().filter(|b| b.frame == *index).collect();
@@ -40,7 +44,7 @@ pub fn score(estimator: &mut dyn Estimator, frames: &[(usize, &Array2<f64>)], be
             pixels: (*pixels).clone(),
             masked: None,
         };
-        // A frame that cannot be used finds nobody, with either calibration.
+        // All beacons of an unusable frame count as missed, with either calibration.
         let Ok(estimate) = estimator.estimate(&frame) else {
             continue;
         };
@@ -50,6 +54,8 @@ pub fn score(estimator: &mut dyn Estimator, frames: &[(usize, &Array2<f64>)], be
         };
         let matching = assign(here.len(), found.len(), CUTOFF_M * CUTOFF_M, distance2);
         squared.extend(matching.pairs.iter().map(|&(b, e)| distance2(b, e)));
+        let variance = |e: usize| found[e].cov_m2[0][0] + found[e].cov_m2[1][1];
+        variances.extend(matching.pairs.iter().map(|&(_, e)| variance(e)));
     }
     let missed = total - squared.len();
     let sum: f64 = squared.iter().sum();
@@ -58,6 +64,8 @@ pub fn score(estimator: &mut dyn Estimator, frames: &[(usize, &Array2<f64>)], be
         missed,
         cost_m2: (sum + missed as f64 * CUTOFF_M * CUTOFF_M) / total as f64,
         mse_m2: sum / squared.len() as f64,
-        median_m2: super::believe::median(squared).unwrap_or(f64::NAN),
+        median_m2: median(squared).unwrap_or(f64::NAN),
+        // A squared distance with two equal variances of sum v is exponential with mean v.
+        noise_median_m2: std::f64::consts::LN_2 * median(variances).unwrap_or(f64::NAN),
     }
 }

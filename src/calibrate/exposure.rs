@@ -1,4 +1,4 @@
-//! One frame of the fit: its spots, how well they explain the pixels, and the normal equations.
+//! One frame of the fit: its spots, the residual that they leave, and the normal equations.
 
 use faer::linalg::matmul::triangular::{self, BlockStructure};
 use faer::linalg::solvers::{Llt, Solve as _};
@@ -9,45 +9,45 @@ use crate::optics::{Camera, PixelMaps, psf};
 /// One light source in one frame.
 #[derive(Clone, Debug)]
 pub struct Spot {
-    /// Index of the beacon that it is believed to be; none for a source that nobody surveyed.
+    /// Index of the beacon that the spot is assigned to; none for a source without a surveyed position.
     pub beacon: Option<usize>,
-    /// Where the beacon's position says the spot should be, m; follows the geometry as it is fitted.
+    /// Sensor position that the fitted geometry predicts for the beacon, m.
     pub predicted_m: [f64; 2],
     pub sensor_m: [f64; 2],
     pub energy_j: f64,
-    /// Whether the beacon's position takes part in the fit.
-    pub trusted: bool,
+    /// Whether the beacon's position is used in the fit.
+    pub is_inlier: bool,
 }
 
-/// One frame and the current explanation of it.
+/// One frame and its current model.
 #[derive(Clone, Debug)]
-pub struct Shot {
+pub struct Exposure {
     /// Frame number in the recording.
     pub frame: usize,
     /// Energies as recorded, J, row by row.
     pub pixels: Vec<f64>,
-    /// Pixels with a value: finite and not saturated.
+    /// Usable pixels: finite and not saturated.
     pub valid: Vec<bool>,
     pub spots: Vec<Spot>,
-    /// Level, J a pixel, and its change from the array's middle to its edge in x and y; none when not modelled.
+    /// Background: level per pixel, J, and its change from the array's centre to its edge in x and y; none when not modelled.
     pub background: Option<[f64; 3]>,
     /// Weighted squared residual of the last fit.
     pub chi2: f64,
-    /// Whether the frame as a whole is explained as well as the others.
-    pub trusted: bool,
+    /// Whether the frame is used in the fit: its reduced χ² is not far above the median.
+    pub is_inlier: bool,
 }
 
 /// Gauss–Newton normal equations of one frame in its raw columns: x, y, energy, σ of each spot, then the background.
-pub struct Normal {
+pub struct NormalEquations {
     pub gram: Mat<f64>,
     pub rhs: Vec<f64>,
     pub chi2: f64,
 }
 
-/// Columns a spot owns in [`Normal`].
+/// Columns per spot in [`NormalEquations`].
 pub const PER_SPOT: usize = 4;
 
-impl Shot {
+impl Exposure {
     pub fn degrees_of_freedom(&self, camera: &Camera) -> f64 {
         let used = self.used(camera).filter(|&u| u).count();
         let fitted = 3 * self.spots.len() + self.background.map_or(0, |b| b.len());
@@ -58,7 +58,7 @@ impl Shot {
         self.chi2 / self.degrees_of_freedom(camera)
     }
 
-    /// Pixels that take part: valid here and not known to be bad.
+    /// Pixels used in the fit: valid in this frame and not marked as bad.
     pub fn used<'a>(&'a self, camera: &'a Camera) -> impl Iterator<Item = bool> + 'a {
         let bad = camera
             .pixels
@@ -70,7 +70,7 @@ impl Shot {
             .map(move |(p, &v)| v && bad.is_none_or(|bad| !bad[p]))
     }
 
-    /// What ideal pixels would read, J: `out[p]` without gain and dark level.
+    /// Writes the expected value of ideal pixels (unit gain, no dark level), J.
     pub fn ideal(&self, camera: &Camera, out: &mut [f64]) {
         let (ny, nx) = camera.shape();
         let [level, slope_x, slope_y] = self.background.unwrap_or_default();
@@ -91,7 +91,7 @@ impl Shot {
         }
     }
 
-    /// Residual in joules, as recorded minus expected; zero where the pixel takes no part.
+    /// Residual, recorded minus expected, J; zero for unused pixels.
     pub fn residual(&self, camera: &Camera, out: &mut [f64]) {
         self.ideal(camera, out);
         let (gain, dark) = maps(camera.pixels.as_deref());
@@ -104,8 +104,8 @@ impl Shot {
         }
     }
 
-    /// Linearises the frame around its current state, in units of the noise.
-    pub fn normal(&self, camera: &Camera) -> Normal {
+    /// Normal equations of the frame at its current state, residuals in units of the noise.
+    pub fn normal(&self, camera: &Camera) -> NormalEquations {
         let (ny, nx) = camera.shape();
         let n = ny * nx;
         let background = self.background.map_or(0, |b| b.len());
@@ -173,10 +173,10 @@ impl Shot {
             columns,
             |a, b| if a >= b { gram[(a, b)] } else { gram[(b, a)] },
         );
-        Normal { gram, rhs, chi2 }
+        NormalEquations { gram, rhs, chi2 }
     }
 
-    /// The raw columns that belong to this frame alone: all but the spots' σ.
+    /// Columns of the frame's own unknowns: all but the spots' σ, which the device fixes.
     pub fn local_columns(&self) -> Vec<usize> {
         let n = self.spots.len();
         let background = self.background.map_or(0, |b| b.len());
@@ -198,22 +198,22 @@ impl Shot {
         }
     }
 
-    /// Squared distance of the trusted spots from where their beacons put them, in units of `tether_m2`.
-    pub fn tether_cost(&self, tether_m2: f64) -> f64 {
-        let tied = self.spots.iter().filter(|s| s.trusted);
-        tied.map(|s| (0..2).map(|k| (s.sensor_m[k] - s.predicted_m[k]).powi(2)).sum::<f64>() / tether_m2)
+    /// Sum over the inlier spots of the squared distance to the surveyed position, in units of `survey_var_m2`.
+    pub fn survey_cost(&self, survey_var_m2: f64) -> f64 {
+        let tied = self.spots.iter().filter(|s| s.is_inlier);
+        tied.map(|s| (0..2).map(|k| (s.sensor_m[k] - s.predicted_m[k]).powi(2)).sum::<f64>() / survey_var_m2)
             .sum()
     }
 
-    /// The local normal equations, with the tether of variance `tether_m2` that holds trusted spots to their beacons.
-    pub fn tethered(&self, normal: &Normal, tether_m2: f64) -> (Mat<f64>, Vec<f64>) {
+    /// The local normal equations with the prior on inlier spots: N(surveyed position, `survey_var_m2`) per axis.
+    pub fn with_survey_prior(&self, normal: &NormalEquations, survey_var_m2: f64) -> (Mat<f64>, Vec<f64>) {
         let local = self.local_columns();
         let mut h = Mat::from_fn(local.len(), local.len(), |a, b| normal.gram[(local[a], local[b])]);
         let mut g: Vec<f64> = local.iter().map(|&c| normal.rhs[c]).collect();
-        for (i, spot) in self.spots.iter().enumerate().filter(|(_, s)| s.trusted) {
+        for (i, spot) in self.spots.iter().enumerate().filter(|(_, s)| s.is_inlier) {
             for k in 0..2 {
-                h[(3 * i + k, 3 * i + k)] += 1.0 / tether_m2;
-                g[3 * i + k] += (spot.predicted_m[k] - spot.sensor_m[k]) / tether_m2;
+                h[(3 * i + k, 3 * i + k)] += 1.0 / survey_var_m2;
+                g[3 * i + k] += (spot.predicted_m[k] - spot.sensor_m[k]) / survey_var_m2;
             }
         }
         (h, g)
@@ -221,19 +221,19 @@ impl Shot {
 
     /// Levenberg–Marquardt on positions, energies and background with the device held fixed (Marquardt, 1963).
     /// Returns the normal equations at the end.
-    pub fn fit(&mut self, camera: &Camera, tether_m2: f64, steps: usize) -> Normal {
+    pub fn fit(&mut self, camera: &Camera, survey_var_m2: f64, steps: usize) -> NormalEquations {
         let reach = 0.5 * camera.spot_sigma_m;
         let mut normal = self.normal(camera);
-        let mut cost = normal.chi2 + self.tether_cost(tether_m2);
+        let mut cost = normal.chi2 + self.survey_cost(survey_var_m2);
         let mut damping = 1e-4;
         for _ in 0..steps {
-            let (h, g) = self.tethered(&normal, tether_m2);
-            let Some(solver) = Scaled::new(&h, damping) else {
+            let (h, g) = self.with_survey_prior(&normal, survey_var_m2);
+            let Some(solver) = ScaledCholesky::new(&h, damping) else {
                 damping *= 10.0;
                 continue;
             };
             let mut step = solver.solve(&g);
-            // Beyond about half a σ the linearisation says nothing.
+            // The linearisation is not valid beyond about half a σ.
             let longest = step
                 .chunks(3)
                 .take(self.spots.len())
@@ -246,7 +246,7 @@ impl Shot {
             trial.step(&step);
             trial.keep_in_reach(camera);
             let next = trial.normal(camera);
-            let next_cost = next.chi2 + trial.tether_cost(tether_m2);
+            let next_cost = next.chi2 + trial.survey_cost(survey_var_m2);
             if next_cost < cost {
                 let gained = cost - next_cost;
                 (*self, normal, cost) = (trial, next, next_cost);
@@ -265,7 +265,7 @@ impl Shot {
         normal
     }
 
-    /// Far outside the sensor a spot has no light left to hold it.
+    /// Keeps positions near the sensor: a spot far outside leaves no light that would constrain it.
     fn keep_in_reach(&mut self, camera: &Camera) {
         let margin = 2.0 * camera.spot_sigma_m;
         let limit = [camera.x.half_width() + margin, camera.y.half_width() + margin];
@@ -297,16 +297,16 @@ pub fn maps(maps: Option<&PixelMaps>) -> (impl Fn(usize) -> f64 + '_, impl Fn(us
 }
 
 /// Cholesky factors of a normal matrix whose columns differ by many orders of magnitude.
-pub struct Scaled {
+pub struct ScaledCholesky {
     factors: Llt<f64>,
     scale: Vec<f64>,
 }
 
-impl Scaled {
+impl ScaledCholesky {
     /// Factors H + damping·diag(H); none if that is not positive definite.
     pub fn new(h: &Mat<f64>, damping: f64) -> Option<Self> {
         let n = h.nrows();
-        // A column without any light keeps its place with a unit diagonal.
+        // A column without light gets a unit diagonal, which leaves its unknown unchanged.
         let scale: Vec<f64> = (0..n)
             .map(|k| if h[(k, k)] > 0.0 { h[(k, k)].sqrt().recip() } else { 0.0 })
             .collect();

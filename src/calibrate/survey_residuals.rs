@@ -1,10 +1,12 @@
-//! How far spots lie from where their beacons put them, and how much of that is the survey's.
+//! Residuals of the surveyed positions: fitted minus predicted spot positions, and the variance that the survey itself adds.
 
 use faer::Mat;
 
-use super::shot::{Normal, Scaled, Shot};
+use crate::stats::{mahalanobis2, median};
 
-/// How far an untethered spot lies from where its beacon puts it, m on the sensor.
+use super::exposure::{Exposure, NormalEquations, ScaledCholesky};
+
+/// Fitted position of a spot without the survey prior, minus the predicted one, m on the sensor.
 #[derive(Clone, Copy)]
 pub(super) struct Displacement {
     pub offset: [f64; 2],
@@ -12,27 +14,25 @@ pub(super) struct Displacement {
 }
 
 impl Displacement {
-    pub fn mahalanobis2(&self, tether: f64) -> f64 {
+    pub fn mahalanobis2(&self, survey_var_m2: f64) -> f64 {
         let [[a, b], [_, c]] = self.cov;
-        let (a, c) = (a + tether, c + tether);
-        let [x, y] = self.offset;
-        (c * x * x - 2.0 * b * x * y + a * y * y) / (a * c - b * b)
+        mahalanobis2([[a + survey_var_m2, b], [b, c + survey_var_m2]], self.offset)
     }
 }
 
-/// One Newton step without the tether, from the fitted state.
-pub(super) fn displacements(shot: &Shot, normal: &Normal) -> Vec<Option<Displacement>> {
-    let local = shot.local_columns();
+/// The displacement of each spot: one Newton step without the survey prior, from the fitted state.
+pub(super) fn displacements(exposure: &Exposure, normal: &NormalEquations) -> Vec<Option<Displacement>> {
+    let local = exposure.local_columns();
     let h = Mat::from_fn(local.len(), local.len(), |a, b| normal.gram[(local[a], local[b])]);
     let g: Vec<f64> = local.iter().map(|&c| normal.rhs[c]).collect();
-    let Some(solver) = Scaled::new(&h, 0.0) else {
-        return vec![None; shot.spots.len()];
+    let Some(solver) = ScaledCholesky::new(&h, 0.0) else {
+        return vec![None; exposure.spots.len()];
     };
     let (step, inverse) = (
         solver.solve(&g),
         solver.solve_many(&Mat::identity(local.len(), local.len())),
     );
-    let spots = shot.spots.iter().enumerate();
+    let spots = exposure.spots.iter().enumerate();
     spots
         .map(|(i, spot)| {
             spot.beacon?;
@@ -53,7 +53,7 @@ pub(super) fn excess_variance(axes: &[(f64, f64)]) -> f64 {
         return 0.0;
     }
     let (mut low, mut high) = (0.0, axes.iter().map(|a| a.0).fold(0.0, f64::max).max(1e-30) * 10.0);
-    // In the logarithm first: the answer may lie many orders of magnitude below the largest offset.
+    // Bisection of the logarithm: the root may lie many orders of magnitude below the largest offset.
     for _ in 0..200 {
         let middle = if low == 0.0 { high * 0.1 } else { (low * high).sqrt() };
         if ratio(middle) > MEDIAN_CHI2 {
@@ -66,13 +66,4 @@ pub(super) fn excess_variance(axes: &[(f64, f64)]) -> f64 {
         }
     }
     (low * high).sqrt().max(low)
-}
-
-/// The middle value; none of an empty list.
-pub(super) fn median(mut values: Vec<f64>) -> Option<f64> {
-    if values.is_empty() {
-        return None;
-    }
-    let middle = values.len() / 2;
-    Some(*values.select_nth_unstable_by(middle, f64::total_cmp).1)
 }

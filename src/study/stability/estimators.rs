@@ -1,4 +1,4 @@
-//! Every rung of the ladder on what is hardest for it, and pencils that have no good answer.
+//! Hard cases of each estimator, and ill-conditioned matrix pencils.
 
 use ndarray::Array2;
 use rand_distr::{Distribution, Uniform};
@@ -7,7 +7,7 @@ use super::trial::{Source, anywhere, camera, energy, expose, frame, observe};
 use super::{Case, Options};
 use crate::estimate::{Config, ESTIMATORS};
 
-const GROUP: &str = "Ladder";
+const GROUP: &str = "Estimators";
 
 pub(super) fn cases() -> Vec<Case> {
     let mut cases = vec![
@@ -33,11 +33,11 @@ pub(super) fn cases() -> Vec<Case> {
             |k| [(k % 3) as f64, (k / 3) as f64],
         ),
     ];
-    cases.extend(ESTIMATORS.iter().map(|rung| rung.name).map(bears_anything));
+    cases.extend(ESTIMATORS.iter().map(|estimator| estimator.name).map(bears_anything));
     cases
 }
 
-/// Nine emitters (two where that is the name) at σ_eff 8 mm, where the rung "pencil" says what its eigenvectors say.
+/// Nine emitters (two where the name says so) at σ_eff 8 mm, where the estimator `pencil` returns the eigenvalues unrefined.
 fn pencil(name: &'static str, hard: &'static str, place: impl Fn(usize) -> [f64; 2] + 'static) -> Case {
     let count = if name.starts_with("two") { 2 } else { 9 };
     Case::new(
@@ -82,18 +82,18 @@ fn pencil(name: &'static str, hard: &'static str, place: impl Fn(usize) -> [f64;
     )
 }
 
-/// Frames that are coincident emitters, random bits, and holes, in turn.
-fn bears_anything(rung: &'static str) -> Case {
+/// Frames with coincident emitters, random bits, and missing pixels, in turn.
+fn bears_anything(estimator: &'static str) -> Case {
     Case::new(
         GROUP,
-        format!("{rung}: frames of any kind"),
+        format!("{estimator}: frames of any kind"),
         "coincident emitters, random bits, and half of the pixels missing, in turn",
         "no panic, nothing malformed",
         move |options| {
             let camera = camera([24, 16], 1e-3);
             let options = Options {
                 estimator: Config {
-                    name: Some(rung.to_owned()),
+                    name: Some(estimator.to_owned()),
                     ..options.estimator.clone()
                 },
                 ..options.clone()

@@ -1,0 +1,82 @@
+// The evidence of an alert in sentences; the numbers behind them stand in a table of their own.
+
+import { lasting, named, roughly, stamp } from "./words.js";
+
+const seconds = (s) => lasting(s * 1000);
+const isNumber = (v) => typeof v === "number" && Number.isFinite(v);
+
+// A list of sentences, each a list of text and nodes.
+export function sentences(alert) {
+  const told = TELL[alert.kind]?.(alert.evidence ?? {}, alert) ?? [];
+  return told.filter(Boolean);
+}
+
+const TELL = {
+  unclaimed_emitter(e) {
+    const near = e.nearest_user;
+    const ratio = e.energy_against_users?.users_median_j > 0 ? e.energy_j / e.energy_against_users.users_median_j : NaN;
+    return [
+      isNumber(e.unclaimed_s) && [`The beam has been seen for ${seconds(e.unclaimed_s)} without a claim${e.seen_since ? `, since ${stamp(Date.parse(e.seen_since))}` : ""}.`],
+      e.shares_the_spot_of && ["It comes from within the spot of ", named(e.shares_the_spot_of), ": two lights where one is claimed."],
+      near && near.second_beam_for_claim && ["It is a second beam for the claim of ", named(near.user), `, ${roughly(near.distance_m)} from the claimed place.`],
+      near && !near.second_beam_for_claim && ["The nearest claimed user, ", named(near.user), `, is ${roughly(near.distance_m)} away.`],
+      isNumber(ratio) && [ratio > 1.5 ? `It is ${+ratio.toPrecision(2)} times as bright as the users usually are.` : ratio < 1 / 1.5 ? `It is ${+(1 / ratio).toPrecision(2)} times fainter than the users usually are.` : "It is about as bright as the users are."],
+      e.vanished_users?.length && ["Since about then no beam is seen of ", ...list(e.vanished_users.map((v) => v.user)), "."],
+      strength(e.log_likelihood_ratio, e.threshold),
+    ];
+  },
+  position_mismatch(e, alert) {
+    const user = alert.user ? named(alert.user) : "The user";
+    return [
+      isNumber(e.distance_m) && ["The beam of ", user, ` is ${roughly(e.distance_m)} from the claimed place; ${isNumber(e.tolerated_distance_m) ? `${roughly(e.tolerated_distance_m)} are tolerated.` : ""}`],
+      isNumber(e.mean_distance_m) && e.claims_in_window > 1 && [`Over the last ${e.claims_in_window} claims it was ${roughly(e.mean_distance_m)} on average.`],
+      e.answered_from_elsewhere && ["Another beam is at the claimed place or answers instead."],
+      Math.abs(e.clock_offset_s) > 0.5 && [`The clock of the claims is ${+Math.abs(e.clock_offset_s).toPrecision(2)} s ${e.clock_offset_s > 0 ? "ahead" : "behind"}; that has been taken into account.`],
+    ];
+  },
+  user_unseen(e, alert) {
+    if (!alert.user && e.users_never_seen) {
+      return [[`${e.users_never_seen} users claim to be here, and none of them was ever seen: `, ...list((e.users ?? []).slice(0, 5)), e.users_never_seen > 5 ? " and others." : "."]];
+    }
+    return [
+      alert.user && isNumber(e.unseen_s) && [named(alert.user), ` claims to send, and no beam has answered for ${seconds(e.unseen_s)}.`],
+      [e.last_seen ? `Last seen at ${stamp(Date.parse(e.last_seen))}.` : "Never seen in this run."],
+    ];
+  },
+  sensor_lost(e) {
+    const reason = {
+      no_frame: "No frames arrive",
+      unusable: "Frames arrive, but none can be used",
+      saturated: "The array is saturated: somebody may be shining into it",
+      frozen: "The same frame is repeated, pixel for pixel",
+      all_beams_lost: "All beams went out at the same time",
+    }[e.reason];
+    return [
+      reason && [`${reason}${isNumber(e.blind_s) ? `, for ${seconds(e.blind_s)} now` : ""}.`],
+      typeof e.detail === "string" && [`The monitor says: ${e.detail}.`],
+      e.last_usable && [`The last frame that could be used came at ${stamp(Date.parse(e.last_usable))}.`],
+    ];
+  },
+  claims_stale(e, alert) {
+    const age = e.newest_came_s_ago ?? e.newest_made_s_ago;
+    return [
+      isNumber(age) && [alert.user ? "The newest claim of " : "The newest claim", ...(alert.user ? [named(alert.user)] : []), ` is ${seconds(age)} old${isNumber(e.typical_period_s) ? `; usually one comes every ${seconds(e.typical_period_s)}` : ""}${isNumber(e.limit_s) ? `, and ${seconds(e.limit_s)} are waited` : ""}.`],
+      !alert.user && ["Users cannot be held against their claims meanwhile; beams that are new are still alerted."],
+    ];
+  },
+  pose_inconsistent(e) {
+    return [
+      isNumber(e.largest_in_view_m) && [`${e.users_agreeing} of ${e.users} users are shifted alike, by up to ${roughly(e.largest_in_view_m)} within the view; ${roughly(e.limit_m)} are tolerated.`],
+      ["Our own position, attitude or calibration is off, and all positions with it."],
+    ];
+  },
+};
+
+function list(users) {
+  return users.flatMap((user, k) => (k ? [", ", named(user)] : [named(user)]));
+}
+
+function strength(found, needed) {
+  if (!isNumber(found) || !isNumber(needed) || needed <= 0) return null;
+  return [found >= needed ? `The evidence is ${+(found / needed).toPrecision(2)} times what an alert needs.` : "The evidence has grown weaker than an alert needs to begin."];
+}

@@ -1,0 +1,60 @@
+//! Why a `[[webhook]]` cannot be used.
+
+use std::path::PathBuf;
+
+use super::signature::SecretError;
+
+/// Why a `[[webhook]]` cannot be used. `index` counts the tables from 1.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    #[error("[[webhook]] {index}: url: {cause}")]
+    Url { index: usize, cause: url::ParseError },
+    #[error("[[webhook]] {index}: url: expected https:// or http://, found {scheme}://")]
+    Scheme { index: usize, scheme: String },
+    #[error(
+        "[[webhook]] {index}: url: http:// to {host} would show alerts to anyone on the way; use https://, or set allow_http = true"
+    )]
+    Plain { index: usize, host: String },
+    #[error("[[webhook]] {index}: secret_file: {path}: {cause}")]
+    Unreadable {
+        index: usize,
+        path: PathBuf,
+        cause: std::io::Error,
+    },
+    #[error("[[webhook]] {index}: secret_file: {path}: line {line}: {cause}")]
+    Secret {
+        index: usize,
+        path: PathBuf,
+        line: usize,
+        cause: SecretError,
+    },
+    #[error("[[webhook]] {index}: ca_file: {path}: {cause}")]
+    Authority {
+        index: usize,
+        path: PathBuf,
+        cause: AuthorityError,
+    },
+    #[error("[[webhook]] {index}: timeout_s: expected 1 to 120, found {found}")]
+    Timeout { index: usize, found: f64 },
+    #[error("[[webhook]] {index}: cool_down_s: expected 0 to 86400, found {found}")]
+    CoolDown { index: usize, found: f64 },
+    #[error("[[webhook]] {index}: name: expected 1 to 64 letters, digits, '-' or '_', found `{found}`")]
+    Name { index: usize, found: String },
+    #[error("[[webhook]] {index}: `{name}` is taken by [[webhook]] {earlier}; give one of them another name")]
+    Twice { index: usize, earlier: usize, name: String },
+    #[error("[[webhook]] {index}: kinds: an empty list would send nothing; leave it out to send all")]
+    NoKinds { index: usize },
+    #[error("[[webhook]] {index}: {cause}")]
+    Client { index: usize, cause: reqwest::Error },
+}
+
+/// Why a `ca_file` cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum AuthorityError {
+    #[error(transparent)]
+    Unreadable(#[from] std::io::Error),
+    #[error("not PEM certificates: {0}")]
+    Malformed(#[from] reqwest::Error),
+    #[error("holds no certificate")]
+    Empty,
+}
