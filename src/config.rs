@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
+use crate::estimate::Learned;
 use crate::{api, calibrate, claims, estimate, frames, journal, logging, monitor, notify, optics, scene, toml_file};
 
 /// A config file. Every table may be left out.
@@ -20,6 +21,9 @@ pub struct Config {
     pub journal: journal::Config,
     pub webhook: Vec<notify::Config>,
     pub log: logging::Config,
+    /// Keys that the file sets although the rest of it leaves them without effect; filled in by [`Config::load`].
+    #[serde(skip)]
+    pub unused: Vec<String>,
 }
 
 /// Why a config file cannot be used.
@@ -29,6 +33,12 @@ pub enum Error {
     File(#[from] toml_file::Error),
     #[error("optics.calibration: {0}")]
     Calibration(#[from] calibrate::file::Error),
+    #[error("{path}: {source}")]
+    Optics { path: PathBuf, source: optics::Error },
+    #[error("{path}: {source}")]
+    Frames { path: PathBuf, source: frames::Error },
+    #[error("{path}: record.folder: expected a folder, since [record] is given; found nothing")]
+    NoRecordFolder { path: PathBuf },
 }
 
 /// Why there is no camera.
@@ -79,7 +89,67 @@ impl Config {
         let mut config: Self = toml_file::read(path)?;
         let base = path.parent().unwrap_or(Path::new("")).to_owned();
         config.rebase(&base);
+        config.validate(path)?;
+        let given: toml::Table = toml_file::read(path)?;
+        if given.contains_key("record") && config.record.folder.is_none() {
+            return Err(Error::NoRecordFolder { path: path.to_owned() });
+        }
+        config.unused = config.unused_among(&given);
         Ok(config)
+    }
+
+    /// Checks the numbers of the tables that do not check them where they are used.
+    fn validate(&self, path: &Path) -> Result<(), Error> {
+        self.optics.validate().map_err(|source| Error::Optics {
+            path: path.to_owned(),
+            source,
+        })?;
+        let frames = self.source.validate().and_then(|()| self.record.check());
+        frames.map_err(|source| Error::Frames {
+            path: path.to_owned(),
+            source,
+        })
+    }
+
+    /// Keys among `given` that the chosen source or estimator does not use, each with the reason.
+    fn unused_among(&self, given: &toml::Table) -> Vec<String> {
+        let keys = |table: &str| {
+            let table = given.get(table).and_then(toml::Value::as_table);
+            table.into_iter().flat_map(|t| t.keys().map(String::as_str))
+        };
+        let kind = self.source.kind.name();
+        let source = self.source.unused(keys("source"));
+        let mut unused: Vec<String> = source
+            .into_iter()
+            .map(|key| format!("source.{key} has no effect with source.kind = {kind:?}"))
+            .collect();
+        let name = self.estimator.name.as_deref().unwrap_or(estimate::DEFAULT);
+        let is_learned = Learned::ALL.iter().any(|l| l.name() == name);
+        for key in keys("estimator") {
+            let is_used = match key {
+                "network" => is_learned,
+                "known_power" => name == "map",
+                _ => true,
+            };
+            if !is_used {
+                unused.push(format!("estimator.{key} has no effect with estimator.name = {name:?}"));
+            }
+        }
+        unused
+    }
+
+    /// What is probably a mistake in a config that can be used.
+    pub fn warnings(&self, camera: &optics::Camera) -> Vec<String> {
+        let mut warnings = self.unused.clone();
+        let corner = camera.to_ground([camera.x.half_width(), camera.y.half_width()]);
+        let diagonal = 2.0 * corner[0].hypot(corner[1]);
+        let tolerated = self.monitor.tolerated_distance_m;
+        if tolerated > diagonal {
+            warnings.push(format!(
+                "monitor.tolerated_distance_m = {tolerated}: no user in the field of view, {diagonal:.3} m across, can be that far from a claim"
+            ));
+        }
+        warnings
     }
 
     fn rebase(&mut self, base: &Path) {
@@ -210,5 +280,52 @@ mod tests {
                 }
             }
         }
+    }
+
+    fn loaded(text: &str) -> Result<Config, String> {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("oapwatch.toml");
+        std::fs::write(&path, text).unwrap();
+        Config::load(&path).map_err(|e| e.to_string())
+    }
+
+    #[test]
+    fn a_number_out_of_range_is_refused_with_the_reason() {
+        for (text, expected) in [
+            ("[optics]\nspot_sigma_m = 10", "optics.spot_sigma_m: expected"),
+            ("[optics]\naltitude_m = 3e8", "optics.altitude_m: expected"),
+            ("[optics]\nsaturation_j = 1e-9", "optics.saturation_j: expected"),
+            ("[source]\nrate_hz = -5", "source.rate_hz: expected"),
+            ("[source]\nkind = \"replay\"\nspeed = -1", "source.speed: expected"),
+            ("[source.v4l2]\nstall_s = 0", "source.v4l2.stall_s: expected"),
+            ("[record]\nlimit_mb = 10", "record.folder: expected a folder"),
+            ("[record]\nfolder = \"r\"\nbefore_s = 1e9", "record.before_s: expected"),
+        ] {
+            let error = loaded(text).expect_err(text);
+            assert!(error.contains(expected) && error.contains("found"), "{text}: {error}");
+        }
+        loaded("[optics]\nspot_sigma_m = 0.01\n[record]\nfolder = \"r\"").unwrap();
+    }
+
+    #[test]
+    fn keys_without_effect_are_named() {
+        let config = loaded(
+            "[source]\nkind = \"replay\"\nframes = \"f.npy\"\ndevice = \"/dev/video0\"\nseed = 3\n\
+             [estimator]\nname = \"ml\"\nnetwork = \"n.onnx\"\n[monitor]\ntolerated_distance_m = 5000",
+        );
+        let config = config.unwrap();
+        let warnings = config.warnings(&config.camera().unwrap());
+        let named: Vec<&str> = warnings.iter().filter_map(|w| w.split_whitespace().next()).collect();
+        assert_eq!(
+            named,
+            [
+                "source.device",
+                "source.seed",
+                "estimator.network",
+                "monitor.tolerated_distance_m"
+            ]
+        );
+        let plain = loaded("[source]\nseed = 3\nrate_hz = 10").unwrap();
+        assert_eq!(plain.warnings(&plain.camera().unwrap()), [""; 0]);
     }
 }

@@ -22,20 +22,47 @@ impl Default for Config {
     }
 }
 
+/// Why `log.level` is no filter.
 #[derive(Debug, thiserror::Error)]
-#[error("log.level: expected a level or filter such as \"info,oapwatch::frames=debug\", found {level:?}: {source}")]
-pub struct Error {
-    level: String,
-    source: tracing_subscriber::filter::ParseError,
+pub enum Error {
+    #[error("log.level: expected a filter such as \"info,oapwatch::frames=debug\", found {level:?}: {source}")]
+    Filter {
+        level: String,
+        source: tracing_subscriber::filter::ParseError,
+    },
+    #[error("log.level: expected {} or TARGET=LEVEL, found {found:?} in {level:?}", LEVELS.join(", "))]
+    Level { level: String, found: String },
 }
+
+/// The levels, from nothing to everything.
+const LEVELS: [&str; 6] = ["off", "error", "warn", "info", "debug", "trace"];
 
 /// Changes the level of a running daemon.
 #[derive(Clone)]
 pub struct Handle(reload::Handle<EnvFilter, Registry>);
 
 impl Config {
+    /// The filter that `level` describes.
+    ///
+    /// # Errors
+    /// A directive without a known level.
     pub fn filter(&self) -> Result<EnvFilter, Error> {
-        EnvFilter::builder().parse(&self.level).map_err(|source| Error {
+        // `EnvFilter` takes an unknown word for a target, and then logs nothing else.
+        let directives = self.level.split(',').map(str::trim);
+        let level_of = |directive: &str| {
+            directive
+                .rsplit_once('=')
+                .map_or(directive, |(_, level)| level)
+                .trim()
+                .to_lowercase()
+        };
+        if let Some(found) = directives.clone().find(|d| !LEVELS.contains(&level_of(d).as_str())) {
+            return Err(Error::Level {
+                level: self.level.clone(),
+                found: found.to_owned(),
+            });
+        }
+        EnvFilter::builder().parse(&self.level).map_err(|source| Error::Filter {
             level: self.level.clone(),
             source,
         })
@@ -76,5 +103,39 @@ impl Handle {
                 .expect("the subscriber lives as long as the process");
         }
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_directive_needs_a_known_level() {
+        let filter = |level: &str| {
+            Config {
+                level: level.to_owned(),
+            }
+            .filter()
+        };
+        for good in [
+            "info",
+            "WARN",
+            "off",
+            "info,oapwatch::frames=debug",
+            "oapwatch::frames[span{frame=3}]=trace",
+        ] {
+            filter(good).unwrap_or_else(|e| panic!("{good}: {e}"));
+        }
+        for bad in [
+            "loud",
+            "",
+            "info,oapwatch::frames",
+            "info,oapwatch::frames=loud",
+            "info,,warn",
+        ] {
+            let error = filter(bad).expect_err(bad).to_string();
+            assert!(error.starts_with("log.level: expected"), "{error}");
+        }
     }
 }

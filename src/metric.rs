@@ -55,11 +55,22 @@ pub const HTTP_REFUSED: &str = "oapwatch_http_refused_total";
 /// Label `protocol`: websocket, sse.
 pub const STREAM_CLIENTS: &str = "oapwatch_stream_clients";
 pub const STREAM_POSITIONS_MISSED: &str = "oapwatch_stream_positions_missed_total";
+/// The metrics that every Prometheus client exports of its process.
+pub const PROCESS_CPU: &str = "process_cpu_seconds_total";
+pub const PROCESS_RESIDENT: &str = "process_resident_memory_bytes";
+pub const PROCESS_VIRTUAL: &str = "process_virtual_memory_bytes";
+pub const PROCESS_FDS: &str = "process_open_fds";
+pub const PROCESS_MAX_FDS: &str = "process_max_fds";
+pub const PROCESS_THREADS: &str = "process_threads";
+pub const PROCESS_START: &str = "process_start_time_seconds";
 /// Always 1; label `version`.
 pub const BUILD_INFO: &str = "oapwatch_build_info";
 
 /// Values of the label `stage`, in the order of the chain.
 pub const STAGES: [&str; 4] = ["estimate", "monitor", "journal", "publish"];
+
+/// Values of the label `outcome` of [`CLAIMS`].
+const CLAIM_OUTCOMES: [&str; 6] = ["accepted", "late", "duplicate", "refused", "malformed", "shed"];
 
 const LATENCY_BUCKETS: [f64; 14] = [
     50e-6, 100e-6, 250e-6, 500e-6, 1e-3, 2.5e-3, 5e-3, 10e-3, 25e-3, 50e-3, 100e-3, 250e-3, 1.0, 5.0,
@@ -154,20 +165,85 @@ pub fn describe() {
     c!(HTTP_REFUSED, "Connections and requests refused, by reason.");
     g!(STREAM_CLIENTS, "Open streams, by protocol.");
     c!(STREAM_POSITIONS_MISSED, "Position messages dropped for slow readers.");
+    c!(
+        PROCESS_CPU,
+        Unit::Seconds,
+        "User and system time of the process, whole seconds."
+    );
+    g!(PROCESS_RESIDENT, Unit::Bytes, "Resident memory of the process.");
+    g!(PROCESS_VIRTUAL, Unit::Bytes, "Virtual memory of the process.");
+    g!(PROCESS_FDS, "Open file descriptors of the process.");
+    g!(PROCESS_MAX_FDS, "Most file descriptors that the process may open.");
+    g!(PROCESS_THREADS, "Threads of the process.");
+    g!(PROCESS_START, Unit::Seconds, "Unix time at which the daemon started.");
     g!(BUILD_INFO, "The running version; always 1.");
 
     for name in [
         FRAMES_CAPTURED,
         FRAMES_DROPPED,
         FRAMES_UNUSABLE,
+        FRAMES_CUT_SHORT,
         CLAIMS_SKIPPED,
         STREAM_POSITIONS_MISSED,
         JOURNAL_FAILURES,
+        JOURNAL_LOST,
+        RECORDER_DROPPED,
+        RECORDER_ERRORS,
+        SOURCE_OPENED,
+        SOURCE_FRAMES_LOST,
     ] {
         counter!(name).increment(0);
     }
-    for outcome in ["accepted", "late", "duplicate", "refused", "malformed", "shed"] {
+    for outcome in CLAIM_OUTCOMES {
         counter!(CLAIMS, "outcome" => outcome).increment(0);
     }
+    // A rule on the age of these must fire also where the first never comes.
+    for name in [LAST_GOOD_FRAME, CLAIMS_LAST] {
+        gauge!(name).set(0.0);
+    }
     gauge!(BUILD_INFO, "version" => env!("CARGO_PKG_VERSION")).set(1.0);
+}
+
+#[cfg(test)]
+mod tests {
+    /// The names of metrics in a text.
+    fn names(text: &str) -> impl Iterator<Item = &str> {
+        let words = text.split(|c: char| !(c.is_ascii_alphanumeric() || c == '_'));
+        words.filter(|w| w.starts_with("oapwatch_") || w.starts_with("process_"))
+    }
+
+    #[test]
+    fn rules_and_dashboard_use_metrics_that_exist() {
+        let known: Vec<&str> = names(include_str!("metric.rs")).collect();
+        for (file, text) in [
+            ("prometheus-alerts.yml", include_str!("../deploy/prometheus-alerts.yml")),
+            (
+                "grafana-dashboard.json",
+                include_str!("../deploy/grafana-dashboard.json"),
+            ),
+        ] {
+            let used: Vec<&str> = names(text).collect();
+            assert!(used.len() > 5, "{file}");
+            for name in used {
+                assert!(known.contains(&name.trim_end_matches("_bucket")), "{file}: {name}");
+            }
+        }
+    }
+
+    #[test]
+    fn nothing_that_a_rule_needs_is_absent_at_the_start() {
+        let recorder = super::recorder().unwrap();
+        let handle = recorder.handle();
+        metrics::with_local_recorder(&recorder, super::describe);
+        let text = handle.render();
+        for line in [
+            "oapwatch_last_good_frame_timestamp_seconds 0",
+            "oapwatch_claims_last_timestamp_seconds 0",
+            "oapwatch_journal_events_lost_total 0",
+            "oapwatch_recorder_errors_total 0",
+            "oapwatch_claims_total{outcome=\"refused\"} 0",
+        ] {
+            assert!(text.lines().any(|l| l == line), "{line} is not in:\n{text}");
+        }
+    }
 }

@@ -8,7 +8,7 @@ use crate::claims::{self, Claim, Store};
 use crate::config::Config;
 use crate::estimate::{self, Estimate, Estimator};
 use crate::frame::Frame;
-use crate::frames::SourceKind;
+use crate::frames::{self, SourceKind};
 use crate::monitor::{self, Monitor, Observation, Report};
 use crate::optics::Camera;
 
@@ -21,11 +21,15 @@ pub enum Error {
     Monitor(#[from] monitor::ConfigError),
     #[error(transparent)]
     Claims(#[from] claims::ConfigError),
+    #[error(transparent)]
+    Source(#[from] frames::Error),
 }
 
 /// Owns everything that one frame after another goes through.
 pub struct Pipeline {
     estimator: Box<dyn Estimator>,
+    /// Time allowed a frame.
+    budget: Option<Duration>,
     saturation_j: f64,
     pub claims: Store,
     pub monitor: Monitor,
@@ -51,10 +55,11 @@ impl Pipeline {
         let source = monitor::Source {
             kind: config.source.kind.name().to_owned(),
             file: file.map(|f| f.display().to_string()),
-            rate_hz: config.source.rate_hz,
+            rate_hz: config.source.frame_rate_hz()?,
         };
         Ok(Self {
             estimator: estimate::build(&config.estimator, camera)?,
+            budget: config.estimator.budget(),
             saturation_j: camera.saturation_j.unwrap_or(f64::INFINITY),
             claims: Store::new(&config.claims),
             monitor: Monitor::new(&config.monitor, &config.claims, camera, source),
@@ -76,9 +81,11 @@ impl Pipeline {
     pub fn step(&mut self, frame: &Frame) -> Step {
         let began = Instant::now();
         let digest = frame.digest();
+        let digested = Instant::now();
+        let is_over = || self.budget.is_some_and(|budget| digested.elapsed() >= budget);
         let estimate = match self.blinding_share(frame) {
             Some(share) => Ok(self.blinded(share)),
-            None => self.estimator.estimate(frame),
+            None => self.estimator.estimate_until(frame, &is_over),
         };
         let estimated = Instant::now();
         let observation = Observation {

@@ -131,8 +131,16 @@ impl Key {
 
     /// Checks `value` against a range; `reason` says why the range ends there, for the message.
     pub fn within(&self, value: f64, range: RangeInclusive<f64>, reason: &str) -> Result<f64, OutOfRange> {
-        let expected = format!("{:e} to {:e} ({reason})", range.start(), range.end());
+        let expected = format!("{} to {} ({reason})", plain(*range.start()), plain(*range.end()));
         self.check(value, range.contains(&value), &expected)
+    }
+}
+
+/// A number without an exponent where that is short.
+fn plain(value: f64) -> String {
+    match value == 0.0 || (1e-3..1e6).contains(&value.abs()) {
+        true => value.to_string(),
+        false => format!("{value:e}"),
     }
 }
 
@@ -154,7 +162,7 @@ mod tests {
         }
         assert_eq!(
             key.within(5.0, 0.5..=4.0, "walking").unwrap_err().expected,
-            "5e-1 to 4e0 (walking)"
+            "0.5 to 4 (walking)"
         );
     }
 

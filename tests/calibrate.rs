@@ -320,6 +320,52 @@ fn a_calibration_that_helps_nobody_is_not_written() {
     assert_eq!(std::fs::read_to_string(at("calibration.toml")).unwrap(), "as it was");
 }
 
+/// Positions of another time: close enough to the emitters to be fitted, and a camera that gets worse.
+#[test]
+fn positions_that_lag_behind_their_frames_are_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    let at = |name: &str| dir.path().join(name);
+    let scene = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/scenes/builtin.toml");
+    let made = oapwatch(&[
+        &"simulate",
+        &"--scene",
+        &scene,
+        &"--frames",
+        &"120",
+        &"--seed",
+        &"3",
+        &"--out",
+        &dir.path(),
+    ]);
+    assert!(made.status.success());
+    std::fs::write(at("plain.toml"), "[optics]\npixels = [64, 64]\nspot_sigma_m = 0.001\n").unwrap();
+    // The n-th claim taken for the n-th frame, as if there were one a frame: it is up to five seconds late.
+    let claims = std::fs::read_to_string(at("claims.ndjson")).unwrap();
+    let numbered: String = claims
+        .lines()
+        .enumerate()
+        .map(|(k, line)| {
+            let claim: serde_json::Value = serde_json::from_str(line).unwrap();
+            format!(
+                "{}\n",
+                serde_json::json!({"frame": k, "x_m": claim["x_m"], "y_m": claim["y_m"]})
+            )
+        })
+        .collect();
+    std::fs::write(at("numbered.ndjson"), numbered).unwrap();
+    let frames = at("frames.npy");
+    for (truth, code, expected) in [
+        ("claims.ndjson", 2, "line 1, frame: expected a frame number"),
+        ("numbered.ndjson", 1, "are the positions those of these frames"),
+    ] {
+        let out = calibrate(&at("plain.toml"), &at(truth), &at("calibration.toml"), &frames);
+        let text = String::from_utf8_lossy(&out.stderr);
+        assert_eq!(out.status.code(), Some(code), "{text}");
+        assert!(text.contains(expected), "{text}");
+        assert!(!at("calibration.toml").exists());
+    }
+}
+
 #[test]
 fn input_that_cannot_be_used_is_named() {
     let dir = tempfile::tempdir().unwrap();

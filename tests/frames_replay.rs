@@ -23,7 +23,7 @@ fn config(path: &Path, speed: f64) -> Config {
         kind: SourceKind::Replay,
         frames: Some(path.to_owned()),
         start: Some("2026-11-21T08:00:00Z".parse().unwrap()),
-        rate_hz: 10.0,
+        rate_hz: Some(10.0),
         speed,
         ..Config::default()
     }
@@ -131,8 +131,8 @@ fn nonsense_in_the_config_is_refused_by_field() {
     let folder = tempfile::tempdir().unwrap();
     let path = recording(folder.path(), 1);
     let wrong: [(&str, fn(&mut Config)); 5] = [
-        ("source.rate_hz", |c| c.rate_hz = 0.0),
-        ("source.rate_hz", |c| c.rate_hz = f64::NAN),
+        ("source.rate_hz", |c| c.rate_hz = Some(0.0)),
+        ("source.rate_hz", |c| c.rate_hz = Some(f64::NAN)),
         ("source.speed", |c| c.speed = -1.0),
         ("source.speed", |c| c.speed = f64::INFINITY),
         ("source.frames", |c| c.frames = None),

@@ -112,3 +112,38 @@ fn an_unknown_key_is_refused_with_the_nearest_known_one() {
     let said = refusal(&locate(folder.path(), &path, "spot_sigma = 0.001\n"), 64);
     assert!(said.contains("spot_sigma") && said.contains("spot_sigma_m"), "{said}");
 }
+
+#[test]
+fn stdin_is_read_and_frames_of_which_none_can_be_used_are_a_failure() {
+    let folder = tempfile::tempdir().unwrap();
+    let frames = npy(folder.path(), &dict("<f8", "False", "(2, 32, 32)"), 2, SIDE, |_| 0.0);
+    let config = folder.path().join("oapwatch.toml");
+    std::fs::write(&config, format!("[optics]\npixels = [{SIDE}, {SIDE}]\n")).unwrap();
+    let mut child = Command::new(env!("CARGO_BIN_EXE_oapwatch"))
+        .args(["locate", "--config"])
+        .args([config.as_path(), Path::new("-")])
+        .stdin(std::process::Stdio::piped())
+        .stdout(std::process::Stdio::piped())
+        .spawn()
+        .unwrap();
+    let mut stdin = child.stdin.take().unwrap();
+    std::io::Write::write_all(&mut stdin, &std::fs::read(&frames).unwrap()).unwrap();
+    drop(stdin);
+    let output = child.wait_with_output().unwrap();
+    assert!(output.status.success());
+    assert_eq!(lines(&output).len(), 2);
+
+    let broken = npy(folder.path(), &dict("<f8", "False", "(2, 32, 32)"), 2, SIDE, |_| {
+        f64::NAN
+    });
+    let output = locate(folder.path(), &broken, "");
+    assert_eq!(output.status.code(), Some(2));
+    assert!(lines(&output).iter().all(|l| l["error"].is_string()));
+    let text = String::from_utf8_lossy(&output.stderr);
+    assert!(text.contains("no frame can be used"), "{text}");
+    // One that can be used is enough.
+    let mixed = npy(folder.path(), &dict("<f8", "False", "(2, 32, 32)"), 2, SIDE, |k| {
+        [f64::NAN, 0.0][k]
+    });
+    assert!(locate(folder.path(), &mixed, "").status.success());
+}

@@ -122,18 +122,18 @@ impl Config {
             }
             _ => {}
         }
-        if self.max_connections == 0 {
+        if !(1..=100_000).contains(&self.max_connections) {
             return Err(ConfigError::OutOfRange {
                 field: "max_connections",
-                expected: "at least 1",
-                found: 0.0,
+                expected: "1 to 100000 (a host has no more ports for one client)",
+                found: self.max_connections as f64,
             });
         }
-        if self.requests_per_second == 0 {
+        if !(1..=1_000_000).contains(&self.requests_per_second) {
             return Err(ConfigError::OutOfRange {
                 field: "requests_per_second",
-                expected: "at least 1",
-                found: 0.0,
+                expected: "1 to 1000000 (more than the API can answer)",
+                found: self.requests_per_second.into(),
             });
         }
         if !(0.1..=3600.0).contains(&self.client_timeout_s) {

@@ -2,6 +2,7 @@
 
 use jiff::Timestamp;
 use ndarray::Array2;
+use serde::Serialize;
 
 use super::truth::Beacon;
 use crate::assign::assign;
@@ -13,7 +14,7 @@ use crate::stats::median;
 const CUTOFF_M: f64 = 25.0;
 
 /// Localisation error of an estimator on the beacons.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Score {
     /// Beacons in the frames.
     pub beacons: usize,
@@ -25,12 +26,14 @@ pub struct Score {
     pub mse_m2: f64,
     /// Median squared distance of the others, m².
     pub median_m2: f64,
+    /// Median squared distance that the estimator's own covariances predict, m².
+    pub noise_median_m2: f64,
 }
 
 /// Runs an estimator over frames and compares its emitters with the beacons. Surplus emitters cost nothing, because frames may
 /// hold sources without a surveyed position.
 pub fn score(estimator: &mut dyn Estimator, frames: &[(usize, &Array2<f64>)], beacons: &[Beacon]) -> Score {
-    let mut squared = Vec::new();
+    let (mut squared, mut variances) = (Vec::new(), Vec::new());
     let mut total = 0;
     for (index, pixels) in frames {
         let here: Vec<&Beacon> = beacons.iter().filter(|b| b.frame == *index).collect();
@@ -51,6 +54,8 @@ pub fn score(estimator: &mut dyn Estimator, frames: &[(usize, &Array2<f64>)], be
         };
         let matching = assign(here.len(), found.len(), CUTOFF_M * CUTOFF_M, distance2);
         squared.extend(matching.pairs.iter().map(|&(b, e)| distance2(b, e)));
+        let variance = |e: usize| found[e].cov_m2[0][0] + found[e].cov_m2[1][1];
+        variances.extend(matching.pairs.iter().map(|&(_, e)| variance(e)));
     }
     let missed = total - squared.len();
     let sum: f64 = squared.iter().sum();
@@ -60,5 +65,7 @@ pub fn score(estimator: &mut dyn Estimator, frames: &[(usize, &Array2<f64>)], be
         cost_m2: (sum + missed as f64 * CUTOFF_M * CUTOFF_M) / total as f64,
         mse_m2: sum / squared.len() as f64,
         median_m2: median(squared).unwrap_or(f64::NAN),
+        // A squared distance with two equal variances of sum v is exponential with mean v.
+        noise_median_m2: std::f64::consts::LN_2 * median(variances).unwrap_or(f64::NAN),
     }
 }

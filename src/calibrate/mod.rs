@@ -46,6 +46,20 @@ pub struct Calibrated {
     pub after: Score,
 }
 
+/// Factor on the noise that the estimator predicts, up to which a residual counts as noise: covariances are right to some ten
+/// per cent in median, and gains that no calibration removes add to them.
+const NOISE_ALLOWANCE: f64 = 2.0;
+
+impl Calibrated {
+    /// Median squared distance of the held-out positions from the emitters, in excess of the noise, where it is larger than what
+    /// the calibration gained, m². Such positions do not describe the frames: they are of another time, or of other frames.
+    pub fn unexplained_m2(&self) -> Option<f64> {
+        let excess = self.after.median_m2 - NOISE_ALLOWANCE * self.after.noise_median_m2;
+        let gained = self.before.median_m2 - self.after.median_m2;
+        (excess > gained.max(0.0)).then_some(excess)
+    }
+}
+
 /// Why there is no calibration.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {

@@ -111,6 +111,13 @@ fn parse_row(row: &Value, rows_before: usize, line: usize, out: &mut Vec<Beacon>
             .try_for_each(|(k, frame)| parse_row(frame, k, line, out));
     }
     let frame = match object.get("frame") {
+        None if object.contains_key("time") => {
+            return Err(wrong(
+                "frame",
+                "a frame number; a line with a time and none, such as a claim, belongs to no frame",
+                row,
+            ));
+        }
         None => rows_before,
         Some(value) => value
             .as_u64()
@@ -190,6 +197,8 @@ mod tests {
                 .unwrap_err()
                 .contains("line 1, frame")
         );
+        let claim = r#"{"time":"2026-01-01T00:00:00Z","user":"u-1","x_m":1,"y_m":2,"sigma_m":0.3,"state":"active"}"#;
+        assert!(parse(claim).unwrap_err().contains("line 1, frame"));
         assert!(parse("{\"frame\":0").unwrap_err().contains("line 1: not JSON"));
         assert!(parse("\n").unwrap_err().contains("no positions"));
     }

@@ -100,9 +100,9 @@ impl Config {
         };
         let sigma = self.default_sigma_m;
         check(
-            sigma.is_finite() && sigma > 0.0,
+            (1e-4..=1e5).contains(&sigma),
             "default_sigma_m",
-            "a positive finite number",
+            "0.0001 to 100000 (metres; a wider claim says nothing)",
             sigma,
         )?;
         let offset = self.clock_offset_s;

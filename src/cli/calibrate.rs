@@ -1,11 +1,12 @@
 //! `oapwatch calibrate`: fits the calibration of a device to frames with known positions.
 
-use std::path::PathBuf;
+use std::io::Write;
+use std::path::{Path, PathBuf};
 
 use anyhow::{Context, anyhow};
-use indicatif::{ProgressBar, ProgressStyle};
 use ndarray::Array2;
 
+use super::progress::Steps;
 use super::{Failure, Outcome};
 use crate::calibrate::{self, Calibrated, file, truth};
 use crate::config::Config;
@@ -14,6 +15,9 @@ use crate::frames::npy;
 use crate::optics::Camera;
 
 #[derive(Debug, clap::Args)]
+#[command(
+    after_help = "Examples:\n  oapwatch calibrate --config oapwatch.toml --truth positions.ndjson --out calibration.toml frames.npy"
+)]
 pub struct Args {
     /// Config with the data sheet of the device; the result must improve on a calibration that it names
     #[arg(long)]
@@ -24,6 +28,9 @@ pub struct Args {
     /// Where to write the calibration
     #[arg(long)]
     out: PathBuf,
+    /// Print one JSON object instead of sentences
+    #[arg(long)]
+    json: bool,
     /// FRAMES.npy
     frames: PathBuf,
 }
@@ -51,20 +58,18 @@ pub fn run(args: Args) -> Outcome {
     let frames = read_frames(&args, &camera, &beacons)?;
     let list: Vec<(usize, &Array2<f64>)> = frames.iter().map(|(k, pixels)| (*k, pixels)).collect();
 
-    let style = ProgressStyle::with_template("{spinner} {msg}").expect("a valid template");
-    let bar = ProgressBar::new_spinner().with_style(style);
+    let mut steps = Steps::unbounded();
     let mut progress = |p: calibrate::Progress| {
-        bar.set_message(format!(
+        steps.next(&format!(
             "{}: round {}, reduced χ² {:.3}, positions within {:.3} m",
             p.stage, p.round, p.reduced_chi2, p.survey_std_m
         ));
-        bar.tick();
     };
     let mut build = |camera: &Camera| estimate::build(&config.estimator, camera);
     // Checked before the long fit.
     build(&camera).with_context(in_config).map_err(Failure::Config)?;
     let outcome = calibrate::calibrate(&camera, &list, &beacons, &mut build, &mut progress);
-    bar.finish_and_clear();
+    steps.finish();
     let calibrated = outcome.map_err(|e| match e {
         calibrate::Error::TooLittle { .. } => {
             Failure::Input(anyhow::Error::new(e).context(args.truth.display().to_string()))
@@ -72,8 +77,10 @@ pub fn run(args: Args) -> Outcome {
         calibrate::Error::Estimator(e) => Failure::Config(anyhow::Error::new(e).context(in_config())),
         calibrate::Error::Unusable(_) => Failure::other(e),
     })?;
-    for line in report(&calibrated) {
-        println!("{line}");
+    let mut out = std::io::stdout().lock();
+    if !args.json {
+        let lines = report(&calibrated).join("\n");
+        writeln!(out, "{lines}").map_err(Failure::other)?;
     }
     let (before, after) = (calibrated.before, calibrated.after);
     if after.cost_m2 >= before.cost_m2 {
@@ -95,11 +102,25 @@ pub fn run(args: Args) -> Outcome {
             after.beacons
         )));
     }
+    if let Some(excess) = calibrated.unexplained_m2() {
+        return Err(Failure::Other(anyhow!(
+            "{} was not written: the held-out positions lie {:.3} m from the emitters (median), {:.3} m more than the noise \
+             explains, and the calibration gained less than that ({:.3} m before); are the positions those of these frames, \
+             each at its own time?",
+            args.out.display(),
+            after.median_m2.sqrt(),
+            after.median_m2.sqrt() - (after.median_m2 - excess).max(0.0).sqrt(),
+            before.median_m2.sqrt()
+        )));
+    }
     let mut remarks = vec!["Written by `oapwatch calibrate`; name it in [optics] calibration.".to_owned()];
     remarks.extend(report(&calibrated));
     file::write(&args.out, &file::render(&calibrated.fitted.calibration, &remarks)).map_err(Failure::other)?;
-    println!("written to {}", args.out.display());
-    Ok(())
+    match args.json {
+        true => writeln!(out, "{}", object(&calibrated, &args.out)),
+        false => writeln!(out, "written to {}", args.out.display()),
+    }
+    .map_err(Failure::other)
 }
 
 /// Reads the frames that have beacons.
@@ -132,6 +153,33 @@ fn read_frames(args: &Args, camera: &Camera, beacons: &[truth::Beacon]) -> Resul
         )));
     }
     Ok(frames)
+}
+
+/// The report as JSON.
+fn object(c: &Calibrated, written: &Path) -> serde_json::Value {
+    let (fitted, k) = (&c.fitted, &c.fitted.calibration);
+    let lines: Vec<usize> = fitted.rejected.iter().map(|b| b.line).collect();
+    serde_json::json!({
+        "written": written.display().to_string(),
+        "frames": c.frames,
+        "positions_used": fitted.accepted.len(),
+        "rejected_lines": lines,
+        "unexplained_frames": fitted.unexplained,
+        "reduced_chi2": fitted.reduced_chi2,
+        "survey_std_m": fitted.survey_std_m,
+        "geometry": {
+            "principal_point_m": k.distortion.principal_point_m,
+            "focal_scale": k.distortion.focal_scale,
+            "radial": k.distortion.radial,
+            "tangential": k.distortion.tangential,
+        },
+        "spot_sigma_m": k.spot_sigma_m,
+        "spot_growth": k.spot_growth,
+        "noise_std_j": k.noise_std_j,
+        "bad_pixels": k.pixels.as_ref().map(|maps| maps.bad.iter().filter(|b| **b).count()),
+        "before": c.before,
+        "after": c.after,
+    })
 }
 
 fn report(c: &Calibrated) -> Vec<String> {

@@ -1,6 +1,9 @@
 //! `oapwatch check`: validates a config or scene.
 
-use std::path::PathBuf;
+use std::io::Write;
+use std::path::{Path, PathBuf};
+
+use serde_json::{Value, json};
 
 use super::{Failure, Outcome};
 use crate::config::Config;
@@ -20,37 +23,89 @@ const OF_SCENES: [&str; 7] = [
 ];
 
 #[derive(Debug, clap::Args)]
+#[command(after_help = "Examples:\n  oapwatch check oapwatch.toml\n  oapwatch check --json config/scenes/paper.toml")]
 pub struct Args {
     /// A config or scene
     file: PathBuf,
+    /// Print one JSON object instead of a sentence, also where the file is refused
+    #[arg(long)]
+    json: bool,
 }
 
+/// What a file describes.
+struct Checked {
+    sentence: String,
+    facts: Value,
+    warnings: Vec<String>,
+}
+
+/// A file that can be used is described on stdout, with its probable mistakes on stderr.
 pub fn run(args: Args) -> Outcome {
     let name = args.file.display();
-    let table: toml::Table = toml_file::read(&args.file).map_err(Failure::config)?;
-    if OF_SCENES.iter().any(|key| table.contains_key(*key)) {
-        let scene = Scene::load(&args.file).map_err(Failure::config)?;
-        Plan::compile(&scene, 0).map_err(Failure::config)?;
-        println!(
-            "{name}: a scene, {} users and {} intruders",
-            scene.user.len(),
-            scene.intruder.len()
-        );
-        return Ok(());
+    let checked = check(&args.file);
+    let mut out = std::io::stdout().lock();
+    if args.json {
+        let mut object = json!({ "file": name.to_string(), "valid": checked.is_ok() });
+        match &checked {
+            Ok(checked) => {
+                object["warnings"] = json!(checked.warnings);
+                for (key, value) in checked.facts.as_object().into_iter().flatten() {
+                    object[key] = value.clone();
+                }
+            }
+            Err(failure) => object["error"] = json!(failure.message()),
+        }
+        writeln!(out, "{object}").map_err(Failure::other)?;
     }
-    let config = Config::load(&args.file).map_err(Failure::config)?;
+    let checked = checked?;
+    if !args.json {
+        writeln!(out, "{name}: {}", checked.sentence).map_err(Failure::other)?;
+        for warning in &checked.warnings {
+            eprintln!("oapwatch: {name}: warning: {warning}");
+        }
+    }
+    Ok(())
+}
+
+fn check(file: &Path) -> Result<Checked, Failure> {
+    let table: toml::Table = toml_file::read(file).map_err(Failure::config)?;
+    match OF_SCENES.iter().any(|key| table.contains_key(*key)) {
+        true => scene(file),
+        false => config(file),
+    }
+}
+
+fn scene(file: &Path) -> Result<Checked, Failure> {
+    let scene = Scene::load(file).map_err(Failure::config)?;
+    Plan::compile(&scene, 0).map_err(Failure::config)?;
+    let (users, intruders) = (scene.user.len(), scene.intruder.len());
+    Ok(Checked {
+        sentence: format!("a scene, {users} users and {intruders} intruders"),
+        facts: json!({ "kind": "scene", "users": users, "intruders": intruders, "rate_hz": scene.rate_hz }),
+        warnings: Vec::new(),
+    })
+}
+
+fn config(file: &Path) -> Result<Checked, Failure> {
+    let config = Config::load(file).map_err(Failure::config)?;
     let camera = config.camera().map_err(Failure::config)?;
     let pipeline = Pipeline::new(&config, &camera).map_err(Failure::config)?;
     frames::open(&config.source, &camera).map_err(Failure::config)?;
     config.log.filter().map_err(Failure::config)?;
+    config.journal.validate().map_err(Failure::config)?;
     api::Server::new(config.api.clone()).map_err(Failure::config)?;
     notify::load(&config.webhook).map_err(Failure::config)?;
-    println!(
-        "{name}: a config; {} × {} pixels, source {}, estimator {}",
-        camera.x.n,
-        camera.y.n,
+    let (pixels, source, estimator) = (
+        [camera.x.n, camera.y.n],
         config.source.kind.name(),
-        pipeline.estimator()
+        pipeline.estimator(),
     );
-    Ok(())
+    Ok(Checked {
+        sentence: format!(
+            "a config; {} × {} pixels, source {source}, estimator {estimator}",
+            pixels[0], pixels[1]
+        ),
+        facts: json!({ "kind": "config", "pixels": pixels, "source": source, "estimator": estimator }),
+        warnings: config.warnings(&camera),
+    })
 }

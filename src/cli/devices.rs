@@ -1,21 +1,31 @@
 //! `oapwatch devices`: lists V4L2 devices with their formats and sizes.
 
 use std::io::Write;
+use std::path::Path;
+
+use serde_json::{Value, json};
 
 use super::{Failure, Outcome};
 use crate::frames::v4l2::{Device, Sizes, devices};
 
 #[derive(Debug, clap::Args)]
+#[command(after_help = "Examples:\n  oapwatch devices\n  oapwatch devices --all --json")]
 pub struct Args {
     /// Also list formats that cannot be a source (colour, compressed)
     #[arg(long)]
     all: bool,
+    /// Print a JSON list instead
+    #[arg(long)]
+    json: bool,
 }
 
 pub fn run(args: Args) -> Outcome {
     let found = devices().map_err(|e| Failure::other(anyhow::Error::new(e).context("/dev")))?;
     let mut out = std::io::stdout().lock();
-    let printed = if found.is_empty() {
+    let printed = if args.json {
+        let devices = found.iter().map(|(path, device)| object(path, device, args.all));
+        writeln!(out, "{}", devices.collect::<Value>())
+    } else if found.is_empty() {
         writeln!(out, "no V4L2 device: there is no /dev/video*")
     } else {
         found.iter().try_for_each(|(path, device)| match device {
@@ -24,6 +34,26 @@ pub fn run(args: Args) -> Outcome {
         })
     };
     printed.map_err(Failure::other)
+}
+
+fn object(path: &Path, device: &std::io::Result<Device>, all: bool) -> Value {
+    let path = path.display().to_string();
+    let device = match device {
+        Ok(device) => device,
+        Err(error) => return json!({ "path": path, "error": error.to_string() }),
+    };
+    let formats = device.formats.iter().filter(|f| all || f.usable).map(|f| {
+        let sizes: Value = f.sizes.iter().map(size).collect();
+        json!({ "name": f.name, "description": f.description, "usable": f.usable, "sizes": sizes })
+    });
+    json!({
+        "path": path,
+        "card": device.card,
+        "driver": device.driver,
+        "bus": device.bus,
+        "captures": device.captures,
+        "formats": formats.collect::<Value>(),
+    })
 }
 
 fn print(out: &mut impl Write, path: &str, device: &Device, all: bool) -> std::io::Result<()> {

@@ -2,13 +2,20 @@
 
 use std::fmt::Write;
 use std::hint::black_box;
+use std::io::Write as _;
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
-use super::{Failure, Outcome, picture};
+use indicatif::ProgressBar;
+use serde_json::{Value, json};
+
+use super::{Failure, Outcome, picture, progress};
 use crate::scene::{Effect, Plan, Scene, Status};
 
 #[derive(Debug, clap::Args)]
+#[command(
+    after_help = "Examples:\n  oapwatch explain config/scenes/windy.toml\n  oapwatch explain --picture frame.svg --frame 20 config/scenes/windy.toml"
+)]
 pub struct Args {
     /// A scene file
     scene: PathBuf,
@@ -20,6 +27,9 @@ pub struct Args {
     frame: u64,
     #[arg(long, default_value_t = 0)]
     seed: u64,
+    /// Print one JSON object instead of a table
+    #[arg(long)]
+    json: bool,
 }
 
 /// Rounds of timing; the fastest counts.
@@ -33,15 +43,42 @@ pub fn run(args: Args) -> Outcome {
     if let Some(path) = &args.picture {
         picture::draw(path, &plan, args.frame).map_err(Failure::Other)?;
     }
-    print!("{}", table(&scene, &plan, args.seed).map_err(Failure::config)?);
-    if let Some(path) = &args.picture {
-        println!("\nFrame {} is drawn in {}", args.frame, path.display());
+    let bar = progress::count("rounds of timing");
+    let costs = costs(&scene, &plan, args.seed, &bar).map_err(Failure::config)?;
+    bar.finish_and_clear();
+    let mut text = match args.json {
+        true => format!("{}\n", object(&scene, &plan, &costs)),
+        false => table(&scene, &plan, &costs),
+    };
+    if let Some(path) = args.picture.as_ref().filter(|_| !args.json) {
+        let _ = writeln!(text, "\nFrame {} is drawn in {}", args.frame, path.display());
     }
-    Ok(())
+    std::io::stdout().write_all(text.as_bytes()).map_err(Failure::other)
 }
 
-fn table(scene: &Scene, plan: &Plan, seed: u64) -> Result<String, crate::scene::Error> {
-    let costs = costs(scene, plan, seed)?;
+/// The table as JSON; an effect without a cost of its own has none.
+fn object(scene: &Scene, plan: &Plan, costs: &Costs) -> Value {
+    let camera = plan.camera();
+    let effects = plan.decisions().iter().map(|decision| {
+        let cost = costs.each.iter().find(|c| c.0 == decision.effect).map(|c| c.1.max(0.0));
+        json!({
+            "effect": decision.effect.name(),
+            "status": decision.status.name(),
+            "cost_us": cost,
+            "reason": decision.reason,
+        })
+    });
+    json!({
+        "about": scene.about,
+        "pixels": [camera.x.n, camera.y.n],
+        "rate_hz": plan.rate_hz(),
+        "frame_us": costs.whole,
+        "resolution_us": costs.resolution,
+        "effects": effects.collect::<Value>(),
+    })
+}
+
+fn table(scene: &Scene, plan: &Plan, costs: &Costs) -> String {
     let camera = plan.camera();
     let mut text = String::new();
     let about = if scene.about.is_empty() {
@@ -79,7 +116,7 @@ fn table(scene: &Scene, plan: &Plan, seed: u64) -> Result<String, crate::scene::
         text,
         "without it (fastest of {ROUNDS} rounds); costs do not add up where effects share work."
     );
-    Ok(text)
+    text
 }
 
 /// Microseconds a frame.
@@ -91,7 +128,7 @@ struct Costs {
 }
 
 /// Times the plan against the plans of the scene without one effect each, in turns, so that a slow moment hits all alike.
-fn costs(scene: &Scene, plan: &Plan, seed: u64) -> Result<Costs, crate::scene::Error> {
+fn costs(scene: &Scene, plan: &Plan, seed: u64, bar: &ProgressBar) -> Result<Costs, crate::scene::Error> {
     let simulated = plan
         .decisions()
         .iter()
@@ -118,6 +155,7 @@ fn costs(scene: &Scene, plan: &Plan, seed: u64) -> Result<Costs, crate::scene::E
             *fastest = fastest.min(time(other, frames));
         }
         whole.push(time(plan, frames));
+        bar.inc(1);
     }
     whole.sort_by(f64::total_cmp);
     let best = whole[0];

@@ -28,21 +28,33 @@ impl Failure {
         Self::Other(e.into())
     }
 
+    fn error(&self) -> &anyhow::Error {
+        match self {
+            Self::Config(e) | Self::Input(e) | Self::Other(e) => e,
+        }
+    }
+
+    /// The error with its causes, in one line.
+    pub fn message(&self) -> String {
+        message(self.error())
+    }
+
     /// Prints one message with its causes and returns the exit code. A reader that closed stdout (`oapwatch locate … | head`) is
     /// not an error.
     pub fn report(self) -> ExitCode {
-        let (code, error) = match self {
-            Self::Config(e) => (64, e),
-            Self::Input(e) => (2, e),
-            Self::Other(e) => (1, e),
+        let code = match &self {
+            Self::Config(_) => 64,
+            Self::Input(_) => 2,
+            Self::Other(_) => 1,
         };
+        let error = self.error();
         let reader_left = error
             .downcast_ref::<std::io::Error>()
             .is_some_and(|e| e.kind() == std::io::ErrorKind::BrokenPipe);
         if reader_left {
             return ExitCode::SUCCESS;
         }
-        eprintln!("oapwatch: {}", message(&error));
+        eprintln!("oapwatch: {}", message(error));
         ExitCode::from(code)
     }
 }

@@ -15,6 +15,9 @@ use crate::monitor::AlertEvent;
 use crate::pipeline::Pipeline;
 
 #[derive(Debug, clap::Args)]
+#[command(
+    after_help = "Examples:\n  oapwatch simulate --scene config/scenes/eavesdropper.toml --frames 300 --out out\n  oapwatch review --config out/oapwatch.toml"
+)]
 pub struct Args {
     /// Config with a replay source
     #[arg(long)]

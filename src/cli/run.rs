@@ -9,6 +9,9 @@ use crate::daemon::Daemon;
 use crate::logging;
 
 #[derive(Debug, clap::Args)]
+#[command(
+    after_help = "Examples:\n  oapwatch run\n  oapwatch run --config /etc/oapwatch/oapwatch.toml\n  oapwatch run --listen localhost:9000"
+)]
 pub struct Args {
     /// Config file; without one the daemon runs on the built-in simulator
     #[arg(long)]

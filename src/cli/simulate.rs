@@ -1,9 +1,11 @@
 //! `oapwatch simulate`: writes the frames, truth and claims of a scene.
 
-use std::path::PathBuf;
+use std::io::ErrorKind;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
+use anyhow::Context;
 use jiff::Timestamp;
 
 use super::simulated_recording::Recording;
@@ -11,6 +13,9 @@ use super::{Failure, Outcome, progress};
 use crate::scene::{Plan, Scene};
 
 #[derive(Debug, clap::Args)]
+#[command(
+    after_help = "Examples:\n  oapwatch simulate --scene config/scenes/paper.toml --frames 100 --seed 1 --out out"
+)]
 pub struct Args {
     /// A scene file
     #[arg(long)]
@@ -21,7 +26,8 @@ pub struct Args {
     /// The same seed gives the same frames
     #[arg(long, default_value_t = 0)]
     seed: u64,
-    /// Folder for frames.npy (f8, J), truth.ndjson and claims.ndjson; made when it is not there, files are replaced
+    /// Folder for frames.npy (f8, J), truth.ndjson, claims.ndjson and oapwatch.toml, a config with which `review` runs on them;
+    /// made when it is not there, files are replaced, except a config of another origin
     #[arg(long)]
     out: PathBuf,
     /// Time of frame 0
@@ -66,7 +72,34 @@ pub fn run(args: Args) -> Outcome {
         )));
     }
     eprintln!("{next} frames in {}", args.out.display());
+    let config = args.out.join("oapwatch.toml");
+    match write_config(&config, &scene, args.start).map_err(Failure::other)? {
+        true => eprintln!("oapwatch review --config {} replays them", config.display()),
+        false => eprintln!("{} was there already and is left as it is", config.display()),
+    }
     Ok(())
+}
+
+/// First line of a config written here; one without it belongs to the user and is kept.
+const CONFIG_HEAD: &str = "# Written by `oapwatch simulate`: replays the frames and claims beside it.";
+
+/// Writes a config that replays the recording. `false` when a config of the user is in its place.
+fn write_config(path: &Path, scene: &Scene, start: Timestamp) -> anyhow::Result<bool> {
+    match std::fs::read_to_string(path) {
+        Ok(text) if !text.starts_with(CONFIG_HEAD) => return Ok(false),
+        Err(e) if e.kind() != ErrorKind::NotFound => return Err(e).with_context(|| path.display().to_string()),
+        _ => {}
+    }
+    let optics = toml::to_string(&scene.optics).context("the scene's [optics] as TOML")?;
+    // A table below [optics] would take in the keys after it, so it comes last.
+    let text = format!(
+        "{CONFIG_HEAD}\n\n[source]\nkind = \"replay\"\nframes = \"frames.npy\"\nstart = \"{start}\"\nrate_hz = {:?}\n\n\
+         [claims]\nlog = \"claims.ndjson\"\n\n[optics]\n{}",
+        scene.rate_hz,
+        optics.replace("[blur]", "[optics.blur]"),
+    );
+    std::fs::write(path, text).with_context(|| path.display().to_string())?;
+    Ok(true)
 }
 
 /// Becomes true on Ctrl-C or SIGTERM.

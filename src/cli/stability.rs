@@ -1,12 +1,15 @@
 //! `oapwatch stability`: runs the catalogue of hard cases.
 
+use std::io::Write;
 use std::path::PathBuf;
 
-use super::{Failure, Outcome, progress};
+use super::progress::Steps;
+use super::{Failure, Outcome};
 use crate::estimate;
 use crate::study::stability::{Options, catalogue, markdown};
 
 #[derive(Debug, clap::Args)]
+#[command(after_help = "Examples:\n  oapwatch stability --only NaN")]
 pub struct Args {
     /// Frames of each kind
     #[arg(long, value_name = "N", default_value_t = 20, value_parser = clap::value_parser!(u32).range(1..))]
@@ -40,14 +43,15 @@ pub fn run(args: Args) -> Outcome {
     let mut rows = Vec::new();
     let mut cases = catalogue();
     cases.retain(|case| wanted(case.group) || wanted(&case.name));
-    let bar = progress::bar(cases.len() as u64, "cases");
+    let mut steps = Steps::new(cases.len() as u64);
     for case in cases {
         rows.push(case.run(&options));
-        bar.inc(1);
+        steps.next(&case.name);
     }
-    bar.finish_and_clear();
+    steps.finish();
     let text = markdown(&rows, &options);
-    println!("{text}");
+    let mut out = std::io::stdout().lock();
+    writeln!(out, "{text}").map_err(Failure::other)?;
     if let Some(path) = &args.out {
         std::fs::write(path, &text).map_err(|e| Failure::other(anyhow::anyhow!("{}: {e}", path.display())))?;
     }
@@ -58,6 +62,5 @@ pub fn run(args: Args) -> Outcome {
             rows.len()
         )));
     }
-    println!("All {} requirements hold.", rows.len());
-    Ok(())
+    writeln!(out, "All {} requirements hold.", rows.len()).map_err(Failure::other)
 }

@@ -3,14 +3,16 @@
 use std::io::Write;
 use std::path::PathBuf;
 
-use indicatif::{ProgressBar, ProgressStyle};
-
-use super::{Failure, Outcome, progress};
+use super::progress::Steps;
+use super::{Failure, Outcome};
 use crate::estimate::Rules;
 use crate::study::ablation;
 use crate::study::tradeoff::{Oracle, Plan, Trained, run as study};
 
 #[derive(Debug, clap::Args)]
+#[command(
+    after_help = "Examples:\n  oapwatch tradeoff --quick --out out\n  oapwatch tradeoff --cells P8/60,E1/64 --rungs ml,map --frames 1000 --out out\n  oapwatch tradeoff --oracle --quick"
+)]
 pub struct Args {
     /// Folder for tradeoff.md, tradeoff.json and the pictures; measurements already there are kept
     #[arg(long, default_value = "tradeoff")]
@@ -74,19 +76,14 @@ pub fn run(args: Args) -> Outcome {
     if !args.without.is_empty() {
         return ablate(&plan, &args);
     }
-    let style =
-        ProgressStyle::with_template("{bar:40} {pos}/{len} {elapsed} (left {eta}) {msg}").map_err(Failure::other)?;
-    let bar = ProgressBar::new(plan.len() as u64).with_style(style);
+    let mut steps = Steps::new(plan.len() as u64);
     study(&plan, &args.out, &mut |row| {
-        bar.set_message(format!("{} {}", row.cell.name(), row.rung));
-        bar.inc(1);
+        steps.next(&format!("{} {}", row.cell.name(), row.rung));
     })
     .map_err(Failure::other)?;
-    bar.finish_and_clear();
-    print!(
-        "{}",
-        std::fs::read_to_string(args.out.join("tradeoff.md")).map_err(Failure::other)?
-    );
+    steps.finish();
+    let table = std::fs::read_to_string(args.out.join("tradeoff.md")).map_err(Failure::other)?;
+    std::io::stdout().write_all(table.as_bytes()).map_err(Failure::other)?;
     eprintln!("written to {}", args.out.display());
     Ok(())
 }
@@ -110,15 +107,15 @@ fn oracle(args: &Args) -> Outcome {
         .map_or(if args.quick { ORACLE_QUICK_FRAMES } else { ORACLE_FRAMES }, |n| {
             n.max(1)
         });
-    let bar = progress::bar(cells.len() as u64, "cells");
+    let mut steps = Steps::new(cells.len() as u64);
     let mut out = std::io::stdout().lock();
     writeln!(out, "{}", Oracle::HEAD).map_err(Failure::other)?;
     for cell in cells {
         let row = Oracle::measure(cell, frames, args.seed.unwrap_or(ORACLE_SEED)).map_err(Failure::other)?;
-        bar.suspend(|| writeln!(out, "{row}")).map_err(Failure::other)?;
-        bar.inc(1);
+        steps.suspend(|| writeln!(out, "{row}")).map_err(Failure::other)?;
+        steps.next(&cell.name());
     }
-    bar.finish_and_clear();
+    steps.finish();
     Ok(())
 }
 
@@ -142,9 +139,9 @@ fn ablate(plan: &Plan, args: &Args) -> Outcome {
         frames: plan.frames,
         seed: plan.seed,
     };
-    let bar = progress::bar(plan.cells.len() as u64, "cells");
-    let effects = ablation::run(&plan, &mut || bar.inc(1)).map_err(Failure::other)?;
-    bar.finish_and_clear();
-    print!("{}", ablation::markdown(&effects, &plan));
-    Ok(())
+    let mut steps = Steps::new(plan.cells.len() as u64);
+    let effects = ablation::run(&plan, &mut |cell| steps.next(&cell.name())).map_err(Failure::other)?;
+    steps.finish();
+    let table = ablation::markdown(&effects, &plan);
+    std::io::stdout().write_all(table.as_bytes()).map_err(Failure::other)
 }

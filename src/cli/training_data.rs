@@ -8,6 +8,9 @@ use crate::scene::{Plan, Scene};
 use crate::study::samples;
 
 #[derive(Debug, clap::Args)]
+#[command(
+    after_help = "Examples:\n  oapwatch training-data --scene config/scenes/paper.toml --samples 1000 > samples.bin"
+)]
 pub struct Args {
     /// A scene file
     #[arg(long)]

@@ -9,7 +9,7 @@ use jiff::{SignedDuration, Timestamp};
 use tokio::sync::mpsc;
 
 use super::claims_log::ClaimsLog;
-use super::intake::Posts;
+use super::posts::Posts;
 use super::publish::Outlet;
 use super::status::State;
 use super::supervisor::Supervisor;
@@ -144,6 +144,9 @@ impl Compute {
         match &estimate {
             Ok(estimate) => {
                 metrics::counter!(metric::FRAMES_CUT_SHORT).increment(u64::from(estimate.is_cut_short));
+                if s.last_good.is_none() {
+                    tracing::info!(frame = frame.index, "the first usable frame was processed");
+                }
                 s.last_good = Some(frame.time);
                 s.fault = None;
                 s.source = SourceState::Running;
@@ -227,10 +230,7 @@ impl Compute {
         let at = report.time;
         self.outlet.events(std::mem::take(&mut report.events), at);
         let status = self.status(&report);
-        let is_first = !self.ready.swap(true, Ordering::Relaxed);
-        if is_first {
-            tracing::info!(frame = report.frame, "the first frame is through");
-        }
+        self.ready.store(true, Ordering::Relaxed);
         let camera = self.camera.clone();
         let snapshot = Snapshot {
             report,

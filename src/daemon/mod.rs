@@ -3,6 +3,8 @@
 mod claims_log;
 mod compute;
 mod intake;
+mod posts;
+mod process;
 mod publish;
 mod reload;
 mod status;
@@ -52,6 +54,7 @@ pub struct Daemon {
     server: api::Server,
     endpoints: Vec<notify::Endpoint>,
     journal: Journal,
+    metrics: PrometheusHandle,
 }
 
 impl Daemon {
@@ -59,6 +62,16 @@ impl Daemon {
     pub fn new(config: Config, path: Option<PathBuf>) -> Result<Self> {
         let camera = config.camera()?;
         let pipeline = Pipeline::new(&config, &camera)?;
+        config.journal.validate()?;
+        // Before anything is opened, so that what is counted while opening is not lost.
+        let recorder = metric::recorder()?;
+        let metrics = recorder.handle();
+        // A second daemon in one process (a test) counts into the first one's recorder.
+        let _ = metrics::set_global_recorder(recorder);
+        metric::describe();
+        for warning in config.warnings(&camera) {
+            tracing::warn!("{warning}");
+        }
         let server = api::Server::new(config.api.clone())?;
         let endpoints = notify::load(&config.webhook)?;
         let source = frames::open(&config.source, &camera)?;
@@ -75,6 +88,7 @@ impl Daemon {
             server,
             endpoints,
             journal,
+            metrics,
         })
     }
 
@@ -82,12 +96,7 @@ impl Daemon {
     pub async fn run(mut self, logging: logging::Handle) -> Result<()> {
         let listen = &self.config.api.listen;
         let listener = api::Listener::bind(listen).with_context(|| format!("api.listen: cannot listen on {listen}"))?;
-        let recorder = metric::recorder()?;
-        let metrics = recorder.handle();
-        // A second daemon in one process (a test) counts into the first one's recorder.
-        let _ = metrics::set_global_recorder(recorder);
-        metric::describe();
-
+        let metrics = self.metrics.clone();
         let started_at = Timestamp::now();
         let open = self.journal.open_alerts()?;
         let known: Vec<_> = open.iter().map(|a| (a.id.clone(), a.kind)).collect();
@@ -147,7 +156,7 @@ impl Daemon {
             capture: Capture::start(self.source)?,
             recorder: self.recorder,
             inbox: inbox.clone(),
-            posts: intake::Posts::default(),
+            posts: posts::Posts::default(),
             unrecorded: Vec::new(),
             commands: orders,
             follower: log
@@ -167,7 +176,7 @@ impl Daemon {
         };
         let mut compute = tokio::task::spawn_blocking(move || compute.run());
         let mut serving = tokio::spawn(self.server.serve(listener, state, stops()));
-        let upkeep = tokio::spawn(maintain(self.journal.clone(), metrics));
+        let upkeep = tokio::spawn(maintain(self.journal.clone(), metrics, started_at));
 
         let outcome = tokio::select! {
             signal = reload::until_stopped(&self.config, self.path.as_deref(), &logging) => signal,
@@ -201,13 +210,16 @@ impl Daemon {
     }
 }
 
-async fn maintain(journal: Journal, metrics: PrometheusHandle) {
+async fn maintain(journal: Journal, metrics: PrometheusHandle, started_at: Timestamp) {
     let mut maintenance = tokio::time::interval(MAINTENANCE);
     let mut upkeep = tokio::time::interval(UPKEEP);
     loop {
         tokio::select! {
             _ = maintenance.tick() => journal.maintain(Timestamp::now()),
-            _ = upkeep.tick() => metrics.run_upkeep(),
+            _ = upkeep.tick() => {
+                metrics.run_upkeep();
+                process::measure(started_at);
+            }
         }
     }
 }

@@ -41,6 +41,9 @@ pub(super) struct State {
 
 impl State {
     pub fn new(started_at: Timestamp, clock: Timestamp, open: impl IntoIterator<Item = (String, AlertKind)>) -> Self {
+        for kind in AlertKind::ALL {
+            counter!(metric::ALERTS_RAISED, "kind" => word(kind)).increment(0);
+        }
         Self {
             started_at,
             clock,

@@ -1,6 +1,7 @@
 //! `[estimator]` and why it may be refused.
 
 use std::path::PathBuf;
+use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
@@ -15,13 +16,21 @@ pub struct Config {
     pub name: Option<String>,
     /// ONNX file of the `network` and `hybrid` estimators, its card beside it; the embedded one when left out.
     pub network: Option<PathBuf>,
-    /// Time allowed a frame, ms; the best hypothesis reached by then is returned.
+    /// Time allowed a frame, ms; the best hypothesis reached by then is returned. Whoever holds the clock passes the test to
+    /// [`Estimator::estimate_until`](crate::estimate::Estimator::estimate_until); see [`Config::budget`].
     pub budget_ms: Option<f64>,
     /// What the `map` estimator may assume of users' power; without it `map` is `ml`.
     pub known_power: Option<KnownPower>,
     /// The rules in force; all, but where a study measures what one of them gains.
     #[serde(skip)]
     pub rules: Rules,
+}
+
+impl Config {
+    /// Time allowed a frame.
+    pub fn budget(&self) -> Option<Duration> {
+        self.budget_ms.map(|ms| Duration::from_secs_f64(ms * 1e-3))
+    }
 }
 
 /// `[estimator.known_power]`.
@@ -54,24 +63,27 @@ impl KnownPower {
     /// Checks every field.
     pub fn validate(&self) -> Result<(), ConfigError> {
         let outside = |field, expected, found| Err(ConfigError::OutOfRange { field, expected, found });
-        let is_positive = |v: f64| v.is_finite() && v > 0.0;
-        if let Some(&energy) = self.energies_j.iter().find(|e| !is_positive(**e)) {
-            return outside("known_power.energies_j", "positive finite numbers", energy);
+        if let Some(&energy) = self.energies_j.iter().find(|e| !(1e-30..=1e6).contains(*e)) {
+            return outside(
+                "known_power.energies_j",
+                "numbers from 1e-30 to 1e6 (joules per exposure)",
+                energy,
+            );
         }
-        if !is_positive(self.relative_std) {
+        if !(1e-6..=10.0).contains(&self.relative_std) {
             return outside(
                 "known_power.relative_std",
-                "a positive finite number",
+                "1e-6 to 10 (fading scatters by less than its mean several times over)",
                 self.relative_std,
             );
         }
         if !(self.share > 0.0 && self.share < 1.0) {
             return outside("known_power.share", "a number between 0 and 1", self.share);
         }
-        if !(self.attenuation_per_m.is_finite() && self.attenuation_per_m >= 0.0) {
+        if !(0.0..=1.0).contains(&self.attenuation_per_m) {
             return outside(
                 "known_power.attenuation_per_m",
-                "a finite number, 0 or more",
+                "0 to 1 (per metre; more lets no light through)",
                 self.attenuation_per_m,
             );
         }

@@ -5,6 +5,10 @@ use std::path::PathBuf;
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 
+use super::Error;
+use crate::scene::Scene;
+use crate::toml_file::Key;
+
 /// `[source]`.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -22,8 +26,10 @@ pub struct Config {
     pub frames: Option<PathBuf>,
     /// The time of frame 0. Replay: frame k is at start + k/rate_hz whatever the speed. Simulator: now when left out.
     pub start: Option<Timestamp>,
-    /// Frames per second of the recording, or asked of the device.
-    pub rate_hz: f64,
+    /// Frames per second of the recording, or requested from the device; [`Config::DEFAULT_RATE_HZ`] when left out. A simulator
+    /// runs at its scene's rate, and another one given here is refused.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub rate_hz: Option<f64>,
     /// Replay: 1 = as recorded, 0 = as fast as possible.
     pub speed: f64,
     /// Replay: start again at the end.
@@ -59,9 +65,65 @@ impl Default for Config {
             v4l2: super::v4l2::Config::default(),
             frames: None,
             start: None,
-            rate_hz: 10.0,
+            rate_hz: None,
             speed: 1.0,
             r#loop: false,
         }
+    }
+}
+
+impl Config {
+    /// Frames per second of a recording or device when `rate_hz` is left out.
+    pub const DEFAULT_RATE_HZ: f64 = 10.0;
+
+    /// Checks every number, whether the chosen source uses it or not.
+    pub fn validate(&self) -> Result<(), Error> {
+        let key = Key::new("source");
+        if let Some(rate_hz) = self.rate_hz {
+            key.at("rate_hz").within(
+                rate_hz,
+                1e-3..=1e5,
+                "frames per second: from one in a quarter of an hour to faster than any camera",
+            )?;
+        }
+        if self.speed != 0.0 {
+            let reason = "times the original speed, or 0: as fast as possible";
+            key.at("speed").within(self.speed, 1e-6..=1e6, reason)?;
+        }
+        self.v4l2.validate()
+    }
+
+    /// Frames per second that the source gives: the scene's, or those of `rate_hz`.
+    ///
+    /// # Errors
+    /// The scene cannot be read, or has a rate other than `rate_hz`.
+    pub fn frame_rate_hz(&self) -> Result<f64, Error> {
+        match self.kind {
+            SourceKind::Simulator => match &self.scene {
+                Some(path) => self.rate_of(&Scene::load(path)?),
+                None => self.rate_of(&Scene::builtin()),
+            },
+            SourceKind::V4l2 | SourceKind::Replay => Ok(self.rate_hz.unwrap_or(Self::DEFAULT_RATE_HZ)),
+        }
+    }
+
+    pub(super) fn rate_of(&self, scene: &Scene) -> Result<f64, Error> {
+        match self.rate_hz {
+            Some(given) if given != scene.rate_hz => Err(Error::SceneRate {
+                given,
+                scene: scene.rate_hz,
+            }),
+            _ => Ok(scene.rate_hz),
+        }
+    }
+
+    /// Keys of `[source]` among `given` that the chosen kind of source does not use.
+    pub fn unused<'a>(&self, given: impl Iterator<Item = &'a str>) -> Vec<&'a str> {
+        let used: &[&str] = match self.kind {
+            SourceKind::Simulator => &["scene", "seed", "start", "rate_hz"],
+            SourceKind::V4l2 => &["device", "v4l2", "rate_hz"],
+            SourceKind::Replay => &["frames", "start", "rate_hz", "speed", "loop"],
+        };
+        given.filter(|key| *key != "kind" && !used.contains(key)).collect()
     }
 }

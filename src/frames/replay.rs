@@ -109,7 +109,8 @@ struct Replay {
 
 impl Replay {
     fn open(path: &Path, config: &Config, joules_per_count: Option<f64>) -> Result<Self, Error> {
-        Key::new("source.rate_hz").positive(config.rate_hz)?;
+        let rate_hz = config.rate_hz.unwrap_or(Config::DEFAULT_RATE_HZ);
+        Key::new("source.rate_hz").positive(rate_hz)?;
         let start = config.start.unwrap_or_else(|| {
             tracing::warn!(frames = %path.display(), "source.start is not set: frame 0 is taken to be at 1970-01-01T00:00:00Z");
             Timestamp::UNIX_EPOCH
@@ -117,7 +118,7 @@ impl Replay {
         Ok(Self {
             reader: Reader::open(path, joules_per_count)?,
             start,
-            rate_hz: config.rate_hz,
+            rate_hz,
             looped: config.r#loop,
             pace: Pace::new(config.speed)?,
             next: 0,

@@ -34,6 +34,7 @@ impl Simulator {
             Some(path) => Scene::load(path)?,
             None => Scene::builtin(),
         };
+        config.rate_of(&scene)?;
         let plan = Plan::compile(&scene, config.seed)?;
         let (found, expected) = (plan.camera().shape(), camera.shape());
         if found != expected {
@@ -233,6 +234,24 @@ mod tests {
             .collect();
         // Two intervals of one second.
         assert_eq!(reported, [1, 3, 5]);
+    }
+
+    #[test]
+    fn a_rate_that_is_not_the_scene_s_is_refused() {
+        let camera = Scene::builtin().optics.camera().unwrap();
+        let open = |rate_hz| {
+            let config = Config {
+                rate_hz: Some(rate_hz),
+                ..Config::default()
+            };
+            Simulator::open(&config, &camera)
+        };
+        assert!(open(Scene::builtin().rate_hz).is_ok());
+        let message = open(25.0).err().expect("another rate").to_string();
+        assert!(
+            message.contains("expected 10, the rate of the scene") && message.ends_with("found 25"),
+            "{message}"
+        );
     }
 
     #[test]

@@ -4,6 +4,8 @@ use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
 
+use crate::toml_file::{Key, OutOfRange};
+
 /// `[journal]`.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -22,6 +24,49 @@ impl Default for Config {
             path: None,
             keep_days: 90,
             max_mb: 512,
+        }
+    }
+}
+
+/// Why a `[journal]` table cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum ConfigError {
+    #[error(transparent)]
+    OutOfRange(#[from] OutOfRange),
+    #[error("journal.path: {path}: expected a file in a folder that exists, found no folder {folder}")]
+    NoFolder { path: PathBuf, folder: PathBuf },
+    #[error("journal.path: {path}: expected a file, found a folder")]
+    IsFolder { path: PathBuf },
+}
+
+impl Config {
+    /// Checks every number, and that the journal's folder exists.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        let key = Key::new("journal");
+        key.at("keep_days").within(
+            self.keep_days.into(),
+            1.0..=36_500.0,
+            "a cleared alert is kept for a day at least",
+        )?;
+        key.at("max_mb").within(
+            self.max_mb.into(),
+            1.0..=1e6,
+            "an empty journal takes a good part of one MB",
+        )?;
+        let Some(path) = &self.path else { return Ok(()) };
+        let folder = match path.parent() {
+            Some(folder) if !folder.as_os_str().is_empty() => folder.to_owned(),
+            _ => PathBuf::from("."),
+        };
+        if !folder.is_dir() {
+            return Err(ConfigError::NoFolder {
+                path: path.clone(),
+                folder,
+            });
+        }
+        match path.is_dir() {
+            true => Err(ConfigError::IsFolder { path: path.clone() }),
+            false => Ok(()),
         }
     }
 }

@@ -35,7 +35,7 @@ use store::{Store, Write};
 use writer::{Link, Shared, Writer, lock};
 
 pub use audit::{AuditAction, AuditEntry, AuditRecord};
-pub use config::Config;
+pub use config::{Config, ConfigError};
 pub use error::Error;
 pub use follow::Follower;
 pub use health::Health;

@@ -1,3 +1,5 @@
+//! `[monitor]`: what the operator sets; and what the monitor is told of its source.
+
 use serde::{Deserialize, Serialize};
 
 /// `[monitor]`: what the operator understands, from which the statistical tests are derived.
@@ -6,13 +8,13 @@ use serde::{Deserialize, Serialize};
 pub struct Config {
     /// A user this far from the claim is still where they say.
     pub tolerated_distance_m: f64,
-    /// The log's clock may be this much off ours, either way: what users on the move tell of it is corrected for.
+    /// Largest offset of the log's clock from ours, either way, that is estimated from moving users and corrected.
     pub tolerated_clock_offset_s: f64,
-    /// A user's light may grow by this factor for good before the rest counts as somebody else's in the same spot.
+    /// Factor by which a user's light may grow for good before the rest counts as a second beam in the same spot.
     pub tolerated_brightening: f64,
-    /// False alerts a month of continuous watching may bring, all kinds together.
+    /// Tolerated false alerts per month of continuous watching, all kinds together.
     pub false_alerts_per_month: f64,
-    /// Seconds from the first sight of a beam nobody claims to its alert; claims may come this much later than beams.
+    /// Seconds from the first detection of a beam nobody claims to its alert. Claims must arrive within 0.65 of it.
     pub decision_s: f64,
     /// Seconds without a usable frame before the sensor counts as lost.
     pub sensor_lost_s: f64,
@@ -23,7 +25,7 @@ pub struct Config {
     /// A common shift of all users up to this is corrected; a larger one is an alert. Half the tolerated distance when
     /// left out.
     pub pose_limit_m: Option<f64>,
-    /// Longest time that a cause which comes and goes is held open before it counts as cleared.
+    /// Longest absence, s, for which an alert whose cause comes and goes is held open.
     pub cool_down_s: f64,
 }
 
@@ -56,34 +58,49 @@ impl Default for Config {
 impl Config {
     /// Checks every number.
     pub fn validate(&self) -> Result<(), ConfigError> {
-        const POSITIVE: &str = "a positive finite number";
-        let positive = [
-            ("tolerated_distance_m", self.tolerated_distance_m),
-            ("tolerated_clock_offset_s", self.tolerated_clock_offset_s),
-            ("false_alerts_per_month", self.false_alerts_per_month),
-            ("decision_s", self.decision_s),
-            ("sensor_lost_s", self.sensor_lost_s),
-            ("claims_stale_s", self.claims_stale_s),
-            ("ended_grace_s", self.ended_grace_s),
-            ("pose_limit_m", self.pose_limit_m.unwrap_or(1.0)),
-            ("cool_down_s", self.cool_down_s),
+        const DISTANCE: &str = "0.001 to 100000 (metres; no camera sees farther)";
+        const SECONDS: &str = "0.001 to 3600 (seconds; what is reported an hour later comes too late)";
+        let ranges = [
+            ("tolerated_distance_m", self.tolerated_distance_m, 1e-3..=1e5, DISTANCE),
+            ("pose_limit_m", self.pose_limit_m.unwrap_or(1.0), 1e-3..=1e5, DISTANCE),
+            ("decision_s", self.decision_s, 1e-3..=3600.0, SECONDS),
+            ("sensor_lost_s", self.sensor_lost_s, 1e-3..=3600.0, SECONDS),
+            ("ended_grace_s", self.ended_grace_s, 1e-3..=3600.0, SECONDS),
+            (
+                "tolerated_clock_offset_s",
+                self.tolerated_clock_offset_s,
+                1e-3..=3600.0,
+                "0.001 to 3600 (seconds; a larger offset is for claims.clock_offset_s)",
+            ),
+            (
+                "claims_stale_s",
+                self.claims_stale_s,
+                1e-3..=86_400.0,
+                "0.001 to 86400 (seconds; a log that is silent for a day is stale)",
+            ),
+            (
+                "cool_down_s",
+                self.cool_down_s,
+                1e-3..=86_400.0,
+                "0.001 to 86400 (seconds; an alert that never clears hides the next one)",
+            ),
+            (
+                "false_alerts_per_month",
+                self.false_alerts_per_month,
+                1e-6..=1e6,
+                "1e-6 to 1e6 (from one in 80000 years to one every three seconds)",
+            ),
+            (
+                "tolerated_brightening",
+                self.tolerated_brightening,
+                1.0..=100.0,
+                "a factor of 1 to 100 (more would hide any second emitter in the spot)",
+            ),
         ];
-        for (field, found) in positive {
-            if !(found.is_finite() && found > 0.0) {
-                return Err(ConfigError {
-                    field,
-                    expected: POSITIVE,
-                    found,
-                });
+        for (field, found, range, expected) in ranges {
+            if !range.contains(&found) {
+                return Err(ConfigError { field, expected, found });
             }
-        }
-        let brightening = self.tolerated_brightening;
-        if !(brightening.is_finite() && brightening >= 1.0) {
-            return Err(ConfigError {
-                field: "tolerated_brightening",
-                expected: "a finite factor of 1 or more",
-                found: brightening,
-            });
         }
         Ok(())
     }

@@ -68,6 +68,77 @@ impl Config {
     /// σ_eff when neither `spot_sigma_m` nor `blur` is given, m.
     pub const DEFAULT_SPOT_SIGMA_M: f64 = 1e-3;
 
+    /// Refuses values that no device has, which [`Config::camera`] would accept: they are slips, such as millimetres for metres.
+    pub fn validate(&self) -> Result<(), Error> {
+        let key = Key::new("optics");
+        let camera = Self {
+            calibration: None,
+            calibrated: None,
+            ..self.clone()
+        }
+        .camera()?;
+        let within = |name, value, range, reason| key.at(name).within(value, range, reason).map(drop);
+        within(
+            "altitude_m",
+            camera.altitude_m,
+            0.01..=1e5,
+            "from a laboratory bench to the stratosphere",
+        )?;
+        within(
+            "lens_radius_m",
+            camera.lens_radius_m,
+            1e-5..=10.0,
+            "from a microlens to the largest telescope",
+        )?;
+        within(
+            "plane_distance_m",
+            camera.plane_distance_m,
+            1e-5..=100.0,
+            "from a microlens to the longest telescope",
+        )?;
+        for size in self.sensor_size_m {
+            within(
+                "sensor_size_m",
+                size,
+                1e-5..=10.0,
+                "from a few pixels to the largest mosaic",
+            )?;
+        }
+        let pitch = camera.x.pitch_m.min(camera.y.pitch_m);
+        let widest = 2.0 * camera.x.half_width().max(camera.y.half_width());
+        let name = if self.blur.is_some() { "blur" } else { "spot_sigma_m" };
+        let reason = "from a thousandth of a pixel to the sensor's width, beyond which a spot has no position";
+        within(name, camera.spot_sigma_m, 1e-3 * pitch..=widest, reason)?;
+        if let Some(blur) = &self.blur {
+            within(
+                "blur.focal_length_m",
+                blur.focal_length_m,
+                1e-5..=100.0,
+                "from a microlens to the longest telescope",
+            )?;
+            within(
+                "blur.wavelength_m",
+                blur.wavelength_m,
+                1e-8..=1e-3,
+                "from the ultraviolet to terahertz waves",
+            )?;
+        }
+        let energy = "joules per pixel and exposure: from below one photon to far above any array";
+        within("noise_std_j", camera.noise_std_j, 1e-30..=1e6, energy)?;
+        if let Some(scale) = self.joules_per_count {
+            within("joules_per_count", scale, 1e-30..=1e6, energy)?;
+        }
+        if let Some(level) = self.saturation_j {
+            within(
+                "saturation_j",
+                level,
+                camera.noise_std_j..=1e12,
+                "from noise_std_j on; below it every pixel is saturated",
+            )?;
+        }
+        Ok(())
+    }
+
     /// Checks every field and resolves the blur budget.
     pub fn camera(&self) -> Result<Camera, Error> {
         let key = Key::new("optics");

@@ -124,7 +124,7 @@ pub struct Reviewed {
 pub fn review(story: &Story) -> Reviewed {
     let plan = Plan::compile(&story.scene, story.seed).unwrap().starting_at(start());
     let mut config = story.config.clone();
-    config.source.rate_hz = RATE_HZ;
+    config.source.rate_hz = Some(RATE_HZ);
     let mut pipeline = Pipeline::new(&config, plan.camera()).unwrap();
     let mut told = Reviewed {
         events: Vec::new(),

@@ -167,3 +167,74 @@ fn explain_names_every_effect_and_draws_a_picture() {
     let svg = std::fs::read_to_string(picture).unwrap();
     assert!(svg.starts_with("<svg") && svg.contains("u-1") && svg.contains("eavesdropper"));
 }
+
+#[test]
+fn simulate_writes_a_config_that_review_runs() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().to_str().unwrap();
+    let config = folder.path().join("oapwatch.toml");
+    let simulate = || {
+        let done = oapwatch(&["simulate", "--scene", &builtin(), "--frames", "90", "--out", path]);
+        assert!(done.status.success(), "{}", String::from_utf8_lossy(&done.stderr));
+    };
+    simulate();
+    let checked = oapwatch(&["check", "--json", config.to_str().unwrap()]);
+    let checked: serde_json::Value = serde_json::from_slice(&checked.stdout).unwrap();
+    assert_eq!(checked["valid"], true, "{checked}");
+    assert_eq!(checked["warnings"], serde_json::json!([]), "{checked}");
+    let reviewed = oapwatch(&["review", "--config", config.to_str().unwrap()]);
+    assert!(
+        reviewed.status.success(),
+        "{}",
+        String::from_utf8_lossy(&reviewed.stderr)
+    );
+    // The eavesdropper comes five seconds after the start; everybody else is where they claim to be.
+    let text = String::from_utf8(reviewed.stdout).unwrap();
+    let raised: Vec<serde_json::Value> = text.lines().map(|l| serde_json::from_str(l).unwrap()).collect();
+    assert!(
+        raised.iter().any(|e| e["alert"]["kind"] == "unclaimed_emitter"),
+        "{text}"
+    );
+    std::fs::write(&config, "# mine\n").unwrap();
+    simulate();
+    assert_eq!(std::fs::read_to_string(&config).unwrap(), "# mine\n");
+}
+
+#[test]
+fn a_closed_pipe_ends_a_command_quietly() {
+    let program = env!("CARGO_BIN_EXE_oapwatch");
+    for command in [
+        "completions bash".to_owned(),
+        format!("explain {}", builtin()),
+        format!("check {}", builtin()),
+    ] {
+        // The reader is gone before the first line, as with `| head -0`.
+        let mut child = Command::new(program)
+            .args(command.split_whitespace())
+            .stdout(Stdio::piped())
+            .stderr(Stdio::piped())
+            .spawn()
+            .unwrap();
+        drop(child.stdout.take());
+        let done = child.wait_with_output().unwrap();
+        let text = String::from_utf8_lossy(&done.stderr).into_owned();
+        assert!(done.status.success() && text.is_empty(), "{command}: {text}");
+    }
+}
+
+#[test]
+fn explain_and_devices_speak_json() {
+    let explained = oapwatch(&["explain", "--json", &builtin()]);
+    let object: serde_json::Value = serde_json::from_slice(&explained.stdout).unwrap();
+    assert_eq!(object["rate_hz"], 10.0);
+    let effects = object["effects"].as_array().unwrap();
+    assert!(
+        effects
+            .iter()
+            .all(|e| e["effect"].is_string() && e["reason"].is_string()),
+        "{object}"
+    );
+    let devices = oapwatch(&["devices", "--json"]);
+    let list: serde_json::Value = serde_json::from_slice(&devices.stdout).unwrap();
+    assert!(list.is_array(), "{list}");
+}

@@ -97,7 +97,7 @@ pub fn source(change: impl FnOnce(&mut frames::v4l2::Config)) -> frames::Config 
     let mut config = frames::Config {
         kind: SourceKind::V4l2,
         device: Some(CAPTURE.into()),
-        rate_hz: 60.0,
+        rate_hz: Some(60.0),
         ..frames::Config::default()
     };
     change(&mut config.v4l2);

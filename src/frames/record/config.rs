@@ -41,11 +41,15 @@ impl Config {
     /// Checks every number.
     pub fn check(&self) -> Result<(), Error> {
         let key = Key::new("record");
-        key.at("limit_mb").positive(self.limit_mb)?;
-        key.at("segment_s").positive(self.segment_s)?;
-        key.at("before_s").positive(self.before_s)?;
-        key.at("after_s").positive(self.after_s)?;
-        key.at("evidence_limit_mb").positive(self.evidence_limit_mb)?;
+        let size = "MB; the largest file systems hold 1e9";
+        key.at("limit_mb").within(self.limit_mb, 1e-3..=1e9, size)?;
+        key.at("evidence_limit_mb")
+            .within(self.evidence_limit_mb, 1e-3..=1e9, size)?;
+        let segment = "a file that covers more than a day is never removed in time";
+        key.at("segment_s").within(self.segment_s, 0.01..=86_400.0, segment)?;
+        let clip = "evidence is a clip around an alert";
+        key.at("before_s").within(self.before_s, 1e-3..=3600.0, clip)?;
+        key.at("after_s").within(self.after_s, 1e-3..=3600.0, clip)?;
         Ok(())
     }
 }

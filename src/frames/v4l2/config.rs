@@ -3,6 +3,8 @@
 use serde::{Deserialize, Serialize};
 
 use super::image::{PixelFormat, Region};
+use crate::frames::Error;
+use crate::toml_file::Key;
 
 /// `[source.v4l2]`. Settings that are left out stay as the driver has them.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -32,6 +34,33 @@ pub struct Config {
 }
 
 impl Config {
+    /// Checks every number. What the driver has to grant is checked when the device is opened.
+    pub fn validate(&self) -> Result<(), Error> {
+        let key = Key::new("source.v4l2");
+        if let Some(exposure) = self.exposure_us {
+            key.at("exposure_us").within(
+                exposure,
+                1.0..=1e8,
+                "V4L2 counts in 100 µs; no camera exposes for minutes",
+            )?;
+        }
+        let reason = "more would skip minutes of frames";
+        key.at("settle_frames")
+            .within(self.settle_frames.into(), 0.0..=10_000.0, reason)?;
+        key.at("stall_s").within(
+            self.stall_s,
+            0.1..=3600.0,
+            "a stalled camera is reopened within the hour",
+        )?;
+        if let Some(size) = self.size.filter(|size| size.contains(&0)) {
+            return Err(key.at("size").refuse("a width and a height of at least 1", size).into());
+        }
+        if self.saturation_counts == Some(0) {
+            return Err(key.at("saturation_counts").refuse("1 to 65535", 0).into());
+        }
+        Ok(())
+    }
+
     pub(super) fn region(&self) -> Option<Region> {
         self.roi.map(|[x, y, width, height]| Region { x, y, width, height })
     }

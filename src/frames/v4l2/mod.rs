@@ -71,12 +71,13 @@ impl V4l2 {
         let positive = |name, found| Key::new("source").at(name).positive(found);
         let device = source.device.clone().ok_or(missing("device"))?;
         let config = source.v4l2.clone();
-        let rate_hz = positive("rate_hz", source.rate_hz)?;
+        let rate_hz = positive("rate_hz", source.rate_hz.unwrap_or(super::Config::DEFAULT_RATE_HZ))?;
         let seconds = |s: f64| Duration::try_from_secs_f64(s).unwrap_or(Duration::MAX);
         let stall_s = positive("v4l2.stall_s", config.stall_s)?;
         if let Some(exposure) = config.exposure_us {
             positive("v4l2.exposure_us", exposure)?;
         }
+        metrics::gauge!(metric::SOURCE_CONNECTED).set(0.0);
         let now = Instant::now();
         Ok(Self {
             faults: Faults::new(device.display().to_string()),
