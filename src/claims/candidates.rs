@@ -209,7 +209,7 @@ mod tests {
     use super::*;
 
     /// Users on a grid 1 m apart, all in view.
-    fn index(users: u32) -> (Index, impl Fn(u32) -> Option<[f64; 2]>) {
+    fn index(users: u32) -> (Index, impl Fn(u32) -> Option<[f64; 2]> + Copy) {
         let place = |slot: u32| Some([f64::from(slot % 100), f64::from(slot / 100)]);
         let mut index = Index::default();
         for slot in 0..users {
