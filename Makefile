@@ -76,7 +76,7 @@ soak: build
 	tests/deploy/soak.py target/release/oapwatch --seconds $(SOAK_S) $(SOAK)
 
 .PHONY: siege
-# Floods, slow and endless clients, a thousand viewers, a gigabyte of garbage: what they cost the monitor. Not in CI: minutes.
+# Floods of requests and of claims, slow and endless clients, a thousand viewers, a gigabyte of garbage: what they cost the monitor. Not in CI: minutes.
 siege: build
 	OAPWATCH_PROGRAM=$(CURDIR)/target/release/oapwatch cargo test --locked --test daemon -- --ignored --nocapture --test-threads 1 siege
 

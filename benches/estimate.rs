@@ -78,7 +78,7 @@ fn stages(group: &mut BenchmarkGroup<WallTime>, camera: &optics::Camera, frame: 
     let starts: Vec<_> = places.iter().map(|p| p.map(|v| v + 0.1 * camera.x.pitch_m)).collect();
     group.bench_function("stage: joint fit, five steps", |b| b.iter(|| stages.fit(&starts)));
     group.bench_function("stage: covariance, ground", |b| b.iter(|| stages.ground()));
-    let found = stages.ground().emitters;
+    let found = stages.ground();
     group.bench_function("stage: assignment to nine claims", |b| {
         b.iter(|| {
             assign(found.len(), found.len(), 1e4, |i, j| {

@@ -28,6 +28,8 @@ pub enum Error {
 /// Owns everything that one frame after another goes through.
 pub struct Pipeline {
     estimator: Box<dyn Estimator>,
+    /// Time allowed a frame.
+    budget: Option<Duration>,
     saturation_j: f64,
     pub claims: Store,
     pub monitor: Monitor,
@@ -57,6 +59,7 @@ impl Pipeline {
         };
         Ok(Self {
             estimator: estimate::build(&config.estimator, camera)?,
+            budget: config.estimator.budget(),
             saturation_j: camera.saturation_j.unwrap_or(f64::INFINITY),
             claims: Store::new(&config.claims),
             monitor: Monitor::new(&config.monitor, &config.claims, camera, source),
@@ -78,9 +81,11 @@ impl Pipeline {
     pub fn step(&mut self, frame: &Frame) -> Step {
         let began = Instant::now();
         let digest = frame.digest();
+        let digested = Instant::now();
+        let is_over = || self.budget.is_some_and(|budget| digested.elapsed() >= budget);
         let estimate = match self.blinding_share(frame) {
             Some(share) => Ok(self.blinded(share)),
-            None => self.estimator.estimate(frame),
+            None => self.estimator.estimate_until(frame, &is_over),
         };
         let estimated = Instant::now();
         let observation = Observation {

@@ -362,14 +362,10 @@ fn known_power_binds_no_stranger_and_finds_none_in_the_dark() {
 fn a_budget_ends_the_search_and_says_so() {
     let camera = camera(8e-3, 60, 4e-10);
     let mut rng = ChaCha8Rng::seed_from_u64(7);
-    let config = Config {
-        budget_ms: Some(1e-3),
-        ..Default::default()
-    };
-    let mut hurried = build(&config, &camera).unwrap();
-    let mut patient = estimator(None, &camera);
+    let mut estimator = estimator(None, &camera);
     let frame = frame(render(&camera, &scatter(8, 20.0, &mut rng), &mut rng));
-    let (short, long) = (hurried.estimate(&frame).unwrap(), patient.estimate(&frame).unwrap());
+    let short = estimator.estimate_until(&frame, &|| true).unwrap();
+    let long = estimator.estimate(&frame).unwrap();
     assert!(short.is_cut_short && !short.emitters.is_empty());
     assert!(short.emitters.iter().all(|e| e.flags.contains(Flags::OUT_OF_TIME)));
     assert!(!long.is_cut_short);

@@ -153,7 +153,7 @@ fn used(source: &Source, public: bool) -> Vec<Module> {
         let line = &rest[rest[..at].rfind('\n').map_or(0, |k| k + 1)..at];
         rest = &rest[at + "use ".len()..];
         let is_statement = if public {
-            line.starts_with("pub")
+            line.starts_with("pub") && line.ends_with(' ')
         } else {
             line.trim().is_empty()
         };

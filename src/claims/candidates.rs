@@ -3,9 +3,9 @@
 
 use std::collections::{BTreeMap, HashMap};
 
-/// Unanswered users handed to the monitor at most. At some microseconds each they cost a frame a millisecond or two; no honest scene has as many beams
-/// that were never seen.
-pub const MOST_UNANSWERED: usize = 320;
+/// Unanswered users handed to the monitor at most. At 4 µs each (compute thread, `siege_a_carpet_of_claims`) they cost a frame half as much again as
+/// its estimate; no honest scene has as many users that were never seen.
+pub const MOST_UNANSWERED: usize = 128;
 /// Users looked at again in each frame, because a claim's reach grows with its age: 20,000 take 80 frames, and as many as these none.
 const SWEEP: usize = 256;
 /// Edge of a cell of the grid, m, and how many cells around a beam's are searched: 20,000 claims in view are five a cell, and a claim answers a
@@ -209,7 +209,7 @@ mod tests {
     use super::*;
 
     /// Users on a grid 1 m apart, all in view.
-    fn index(users: u32) -> (Index, impl Fn(u32) -> Option<[f64; 2]>) {
+    fn index(users: u32) -> (Index, impl Fn(u32) -> Option<[f64; 2]> + Copy) {
         let place = |slot: u32| Some([f64::from(slot % 100), f64::from(slot / 100)]);
         let mut index = Index::default();
         for slot in 0..users {
@@ -227,7 +227,7 @@ mod tests {
         let (picked, left_out) = many.pick(&[[50.2, 70.1]], place);
         assert_eq!((picked.len(), left_out), (MOST_UNANSWERED, 10_000 - MOST_UNANSWERED));
         assert!(picked.contains(&7050), "the nearest");
-        assert!((0..300).all(|slot| picked.contains(&slot)), "those known longest");
+        assert!((0..120).all(|slot| picked.contains(&slot)), "those known longest");
     }
 
     #[test]

@@ -17,7 +17,7 @@ pub use candidates::MOST_UNANSWERED;
 pub use config::{Config, ConfigError, Fields, Origin};
 pub use follower::{Follower, LONGEST_LINE, Poll, Refused, read_log};
 pub use history::Standing;
-pub use inbox::{Batch, Inbox};
+pub use inbox::{Batch, Inbox, MOST_NEW};
 pub use line::{LineError, parse_line};
 pub use outcome::{NO_ROOM, Outcome};
 pub use pressure::{Squeeze, WINDOW_S};

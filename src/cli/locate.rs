@@ -57,6 +57,7 @@ pub fn run(args: Args) -> Outcome {
         false => &args.frames,
     };
     let frames = npy::Reader::open(path, camera.joules_per_count).map_err(Failure::input)?;
+    let budget = config.estimator.budget();
     let start = config.source.start.unwrap_or(jiff::Timestamp::UNIX_EPOCH);
     let mut out = std::io::BufWriter::new(std::io::stdout().lock());
     let bar = progress::count("frames");
@@ -76,7 +77,8 @@ pub fn run(args: Args) -> Outcome {
             masked: None,
         };
         let clock = Instant::now();
-        let estimate = estimator.estimate(&frame);
+        let is_over = || budget.is_some_and(|budget| clock.elapsed() >= budget);
+        let estimate = estimator.estimate_until(&frame, &is_over);
         let latency_us = clock.elapsed().as_micros() as u64;
         let (emitters, error) = match &estimate {
             Ok(estimate) => {

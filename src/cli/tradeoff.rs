@@ -140,7 +140,7 @@ fn ablate(plan: &Plan, args: &Args) -> Outcome {
         seed: plan.seed,
     };
     let mut steps = Steps::new(plan.cells.len() as u64);
-    let effects = ablation::run(&plan, &mut || steps.next("cells")).map_err(Failure::other)?;
+    let effects = ablation::run(&plan, &mut |cell| steps.next(&cell.name())).map_err(Failure::other)?;
     steps.finish();
     let table = ablation::markdown(&effects, &plan);
     std::io::stdout().write_all(table.as_bytes()).map_err(Failure::other)

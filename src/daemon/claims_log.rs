@@ -1,6 +1,6 @@
 //! The claims log beside the frames: a slow disk, a gigabyte of garbage or a flood of names holds up no frame.
 
-use std::collections::{HashMap, VecDeque};
+use std::collections::{HashMap, HashSet, VecDeque};
 use std::io;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 
 use jiff::Timestamp;
 
-use crate::claims::{Claim, Follower, Inbox, Poll};
+use crate::claims::{Claim, Follower, Inbox, MOST_NEW, Poll};
 
 /// How often the log is looked at.
 const FOLLOW_EVERY: Duration = Duration::from_millis(100);
@@ -17,8 +17,8 @@ const FOLLOW_EVERY: Duration = Duration::from_millis(100);
 const OLD_AT_START_S: f64 = 120.0;
 /// Of those the newest are taken all the same: they say when the log went quiet.
 const OLD_KEPT: usize = 100;
-/// Claims of one name that are taken at the start: as many as the store keeps.
-const KEPT_OF_A_NAME: u8 = 16;
+/// Claims of one name that are taken at the start at most: as many as the store keeps.
+const KEPT_OF_A_NAME: usize = 16;
 
 /// Who reads the log.
 #[derive(Debug)]
@@ -111,16 +111,19 @@ impl Backlog {
         }
     }
 
-    /// In the log's order, no more of one name than the store keeps.
+    /// In the log's order, of each name as many of the newest as the store keeps, fewer where the inbox has not room for that.
     fn newest(self) -> Vec<Claim> {
-        let mut kept: HashMap<String, u8> = HashMap::new();
         let mut claims: Vec<Claim> = Vec::from(self.old).into_iter().chain(self.recent).collect();
+        let names: HashSet<&str> = claims.iter().map(|claim| claim.user.as_str()).collect();
+        let most = (MOST_NEW / names.len().max(1)).clamp(1, KEPT_OF_A_NAME);
+        let mut kept: HashMap<String, usize> = HashMap::new();
         claims.reverse();
         claims.retain(|claim| {
             let count = kept.entry(claim.user.clone()).or_default();
-            *count = count.saturating_add(1);
-            *count <= KEPT_OF_A_NAME
+            *count += 1;
+            *count <= most
         });
+        claims.truncate(MOST_NEW);
         claims.reverse();
         claims
     }
@@ -150,8 +153,13 @@ mod tests {
         backlog.add((0..100).map(|k| claim("a".into(), 100 - k)).collect(), now);
         let taken = backlog.newest();
         let of_a = taken.iter().filter(|c| c.user == "a").count();
-        assert_eq!((taken.len() - of_a, of_a), (OLD_KEPT, usize::from(KEPT_OF_A_NAME)));
+        assert_eq!((taken.len() - of_a, of_a), (OLD_KEPT, KEPT_OF_A_NAME));
         assert_eq!(taken[0].user, "!4900");
         assert_eq!(taken.last().map(|c| c.time), Some(claim("a".into(), 1).time));
+        // Of more names than there is room for, the newest.
+        let mut backlog = Backlog::default();
+        backlog.add((0..5000).map(|k| claim(format!("!{k}"), 100)).collect(), now);
+        let taken = backlog.newest();
+        assert_eq!((taken.len(), taken[0].user.as_str()), (MOST_NEW, "!2952"));
     }
 }

@@ -9,7 +9,7 @@ use jiff::{SignedDuration, Timestamp};
 use tokio::sync::mpsc;
 
 use super::claims_log::ClaimsLog;
-use super::intake::Posts;
+use super::posts::Posts;
 use super::publish::Outlet;
 use super::status::State;
 use super::supervisor::Supervisor;

@@ -1,59 +1,20 @@
 //! What reaches the compute thread beside the frames: claims of the log and by POST, acknowledgements.
 
-use std::collections::VecDeque;
 use std::time::{Duration, Instant};
-
-use tokio::sync::oneshot;
 
 use super::compute::Compute;
 use crate::api::{Acknowledged, Command};
 use crate::claim::escape_undisplayable;
-use crate::claims::{Claim, Refused};
+use crate::claims::Refused;
 use crate::metric;
 use crate::monitor::{Acknowledgement, AlertEvent, AlertState, Withdrawal};
 
 /// How often lines of the claims log that are no claims are logged.
 const COMPLAIN_EVERY: Duration = Duration::from_secs(10);
-/// Posted claims that are placed between two looks for a frame. Each costs about a microsecond, by which a frame may be late.
-const POSTED_A_TURN: usize = 256;
-/// Of these, claims of one request before the next one has its turn.
-const POSTED_AT_ONCE: usize = 64;
-/// Posted claims that wait here; further requests wait in their channel, which is bounded.
-const MOST_POSTED: usize = 20_000;
-
-/// Claims by POST of which some have yet to be placed.
-pub(super) struct Posted {
-    claims: std::iter::Enumerate<std::vec::IntoIter<Claim>>,
-    refused: Vec<(usize, String)>,
-    reply: oneshot::Sender<Vec<(usize, String)>>,
-}
-
-/// Requests that wait to be placed, a little of each at a time.
-#[derive(Default)]
-pub(super) struct Posts {
-    waiting: VecDeque<Posted>,
-    claims: usize,
-}
-
-impl Posts {
-    pub fn is_empty(&self) -> bool {
-        self.waiting.is_empty()
-    }
-
-    fn add(&mut self, claims: Vec<Claim>, reply: oneshot::Sender<Vec<(usize, String)>>) {
-        self.claims += claims.len();
-        self.waiting.push_back(Posted {
-            claims: claims.into_iter().enumerate(),
-            refused: Vec::new(),
-            reply,
-        });
-    }
-}
-
 impl Compute {
     /// Acknowledgements, and some of the claims by POST.
     pub(super) fn handle_commands(&mut self) {
-        while self.posts.claims < MOST_POSTED
+        while self.posts.has_room()
             && let Ok(command) = self.commands.try_recv()
         {
             match command {
@@ -77,35 +38,20 @@ impl Compute {
                 }
             }
         }
-        let mut left = POSTED_A_TURN;
-        while left > 0
-            && let Some(post) = self.posts.waiting.pop_front()
-        {
-            left -= self.place(post, left.min(POSTED_AT_ONCE));
-        }
-    }
-
-    /// Places up to `most` claims of a request and answers it when it has no more; gives how much work that was.
-    fn place(&mut self, mut post: Posted, most: usize) -> usize {
         let now = self.now();
-        let mut placed = 0;
-        while placed < most {
-            let Some((index, claim)) = post.claims.next() else {
-                // A client that has gone away needs no answer.
-                let _ = post.reply.send(post.refused);
-                return placed.max(1);
-            };
-            placed += 1;
-            self.posts.claims -= 1;
-            if self.recorder.is_some() {
-                self.unrecorded.push(claim.clone());
+        let Self {
+            posts,
+            pipeline,
+            recorder,
+            unrecorded,
+            ..
+        } = self;
+        posts.place(|claim| {
+            if recorder.is_some() {
+                unrecorded.push(claim.clone());
             }
-            if let Some(reason) = self.pipeline.claims.insert(claim, now).refusal() {
-                post.refused.push((index, reason.to_owned()));
-            }
-        }
-        self.posts.waiting.push_back(post);
-        placed
+            pipeline.claims.insert(claim, now).refusal()
+        });
     }
 
     /// Publishes what an operator changed; without a change the answer is what the journal has.

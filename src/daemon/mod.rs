@@ -3,6 +3,7 @@
 mod claims_log;
 mod compute;
 mod intake;
+mod posts;
 mod process;
 mod publish;
 mod reload;
@@ -155,7 +156,7 @@ impl Daemon {
             capture: Capture::start(self.source)?,
             recorder: self.recorder,
             inbox: inbox.clone(),
-            posts: intake::Posts::default(),
+            posts: posts::Posts::default(),
             unrecorded: Vec::new(),
             commands: orders,
             follower: log

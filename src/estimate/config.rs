@@ -1,6 +1,7 @@
 //! `[estimator]` and why it may be refused.
 
 use std::path::PathBuf;
+use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
@@ -15,13 +16,21 @@ pub struct Config {
     pub name: Option<String>,
     /// ONNX file of the `network` and `hybrid` estimators, its card beside it; the embedded one when left out.
     pub network: Option<PathBuf>,
-    /// Time allowed a frame, ms; the best hypothesis reached by then is returned.
+    /// Time allowed a frame, ms; the best hypothesis reached by then is returned. Whoever holds the clock passes the test to
+    /// [`Estimator::estimate_until`](crate::estimate::Estimator::estimate_until); see [`Config::budget`].
     pub budget_ms: Option<f64>,
     /// What the `map` estimator may assume of users' power; without it `map` is `ml`.
     pub known_power: Option<KnownPower>,
     /// The rules in force; all, but where a study measures what one of them gains.
     #[serde(skip)]
     pub rules: Rules,
+}
+
+impl Config {
+    /// Time allowed a frame.
+    pub fn budget(&self) -> Option<Duration> {
+        self.budget_ms.map(|ms| Duration::from_secs_f64(ms * 1e-3))
+    }
 }
 
 /// `[estimator.known_power]`.

@@ -10,6 +10,12 @@ pub trait Estimator: Send {
     /// The name that `[estimator] name` selects it by.
     fn name(&self) -> &'static str;
 
-    /// Emitters of one frame; a frame that holds nothing gives an empty list.
-    fn estimate(&mut self, frame: &Frame) -> Result<Estimate, Error>;
+    /// Emitters of one frame; a frame that holds nothing gives an empty list. Once `is_over` says that the frame's time is up, the best
+    /// hypothesis so far is returned: it is asked between fits, and no clock is read here.
+    fn estimate_until(&mut self, frame: &Frame, is_over: &dyn Fn() -> bool) -> Result<Estimate, Error>;
+
+    /// [`Estimator::estimate_until`] without a limit of time.
+    fn estimate(&mut self, frame: &Frame) -> Result<Estimate, Error> {
+        self.estimate_until(frame, &|| false)
+    }
 }

@@ -19,6 +19,8 @@ mod preprocess;
 mod rules;
 #[doc(hidden)]
 pub mod stages;
+#[cfg(test)]
+mod test_frame;
 mod uncertainty;
 
 pub use config::{Config, ConfigError, KnownPower};

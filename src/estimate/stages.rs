@@ -1,15 +1,20 @@
 //! The stages of a frame one by one, for benches that time each and studies that begin at the truth; not part of the interface.
 
 use crate::estimate::config::KnownPower;
-use crate::estimate::emitter::Estimate;
+use crate::estimate::emitter::Emitter;
 use crate::estimate::error::Error;
+use crate::estimate::estimators::analytic::bases;
+use crate::estimate::fit::levenberg_marquardt::fit;
+use crate::estimate::fit::work_budget::WorkBudget;
 use crate::estimate::model::compressed_frame::CompressedFrame;
 use crate::estimate::model::hypothesis::{Hypothesis, Nuisances, PointSource};
+use crate::estimate::model_order::evidence::fit_with_prior;
+use crate::estimate::model_order::map_search::maximum_posterior;
 use crate::estimate::model_order::power_prior::PowerPrior;
-use crate::estimate::model_order::search::Search;
+use crate::estimate::model_order::search::{SearchSpace, TRIAL_STEPS};
 use crate::estimate::preprocess::screening::PreprocessedFrame;
 use crate::estimate::rules::Rules;
-use crate::estimate::uncertainty::localise;
+use crate::estimate::uncertainty::localise::localise;
 use crate::frame::Frame;
 use crate::optics::Camera;
 
@@ -19,7 +24,7 @@ const STEPS: usize = 5;
 /// An estimator that stops between stages.
 pub struct Stages {
     camera: Camera,
-    search: Search,
+    space: SearchSpace,
     frame: PreprocessedFrame,
     compressed: CompressedFrame,
     hypothesis: Hypothesis,
@@ -28,7 +33,7 @@ pub struct Stages {
 impl Stages {
     pub fn new(camera: &Camera) -> Self {
         Self {
-            search: Search::new(crate::estimate::estimators::analytic::bases(camera).0, Rules::default()),
+            space: SearchSpace::new(bases(camera).0, Rules::default()),
             camera: camera.clone(),
             frame: PreprocessedFrame::default(),
             compressed: CompressedFrame::default(),
@@ -39,8 +44,8 @@ impl Stages {
     /// Validates the frame and compresses it.
     pub fn load(&mut self, frame: &Frame) -> Result<(), Error> {
         self.frame.load(frame, &self.camera)?;
-        let fitter = &self.search.fitter;
-        self.compressed.load(&self.frame, &fitter.bx, &fitter.by);
+        self.compressed
+            .load(&self.frame, &self.space.bases.x, &self.space.bases.y);
         Ok(())
     }
 
@@ -49,14 +54,14 @@ impl Stages {
         let CompressedFrame {
             coefficients, mx, my, ..
         } = &self.compressed;
-        self.search.matched_filter.respond(coefficients, *mx, *my);
+        self.space.matched_filter.respond(coefficients, *mx, *my);
     }
 
     /// Number of maxima of the matched filter after non-maximum suppression.
     pub fn peaks(&mut self) -> usize {
-        self.search
+        self.space
             .matched_filter
-            .find(self.search.source_penalty.sqrt(), 1.0)
+            .find(self.space.source_penalty.sqrt(), 1.0)
             .len()
     }
 
@@ -70,32 +75,49 @@ impl Stages {
         self.hypothesis = Hypothesis::empty(Nuisances::default());
         let sources = places.iter().map(|p| PointSource::new(p.map(|v| v / sigma), 0.0));
         self.hypothesis.sources.extend(sources);
-        self.search.reset(None);
-        self.search.fitter.fit(&self.compressed, &mut self.hypothesis, steps);
+        let mut budget = WorkBudget::new(&|| false);
+        let mut search = self.space.search(&self.compressed, &self.frame, &mut budget);
+        fit(&mut search.context, &mut self.hypothesis, steps);
     }
 
     /// The most probable hypothesis that the `map` search reaches from sources at `places`, m on the sensor: its −2 ln probability, and its
     /// emitters.
-    pub fn most_probable(&mut self, known: &KnownPower, places: &[[f64; 2]]) -> (f64, Estimate) {
+    pub fn most_probable(&mut self, known: &KnownPower, places: &[[f64; 2]]) -> (f64, Vec<Emitter>) {
         self.fit_from(places, 0);
-        self.search.prior = Some(PowerPrior::new(known, &self.camera));
-        self.search
-            .fit_with_prior(&self.compressed, &mut self.hypothesis, f64::INFINITY, f64::INFINITY);
-        self.search.maximum_posterior(&self.compressed, &mut self.hypothesis);
-        let score = self.search.score(&self.hypothesis);
-        self.search.prior = None;
+        let prior = PowerPrior::new(known, &self.camera);
+        let mut budget = WorkBudget::new(&|| false);
+        let mut search = self
+            .space
+            .search(&self.compressed, &self.frame, &mut budget)
+            .with_prior(&prior);
+        let (threshold, leniency) = (f64::INFINITY, f64::INFINITY);
+        let mut hypothesis = self.hypothesis.clone();
+        fit_with_prior(
+            &mut search.context,
+            &prior,
+            &mut hypothesis,
+            TRIAL_STEPS,
+            threshold,
+            leniency,
+        );
+        self.hypothesis = maximum_posterior(&mut search, &prior, hypothesis);
+        let score = search.score(&self.hypothesis);
         (score, self.ground())
     }
 
     /// Positions on the ground of what was fitted, with covariances and flags.
-    pub fn ground(&mut self) -> Estimate {
-        let Self {
-            camera,
-            search,
-            frame,
-            compressed,
-            hypothesis,
-        } = self;
-        localise::localise(search, compressed, hypothesis, frame, camera, camera.noise_std_j, None)
+    pub fn ground(&mut self) -> Vec<Emitter> {
+        let mut budget = WorkBudget::new(&|| false);
+        let mut search = self.space.search(&self.compressed, &self.frame, &mut budget);
+        let noise_j = self.camera.noise_std_j;
+        let found = localise(
+            &mut search.context,
+            &mut self.hypothesis,
+            &self.frame,
+            &self.camera,
+            noise_j,
+            None,
+        );
+        found.emitters
     }
 }

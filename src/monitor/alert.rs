@@ -1,8 +1,16 @@
+//! Alerts and the events of their life, as the journal, the API and webhooks carry them.
+
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 
-/// Beams without a claim this near to each other, one after the other, are one cause, m.
+/// Distance within which beams without a claim, one after the other, are one cause, m. Wider joins two strangers into one
+/// alert; narrower raises an alert for each reappearance of one who walks on while off. Not tuned; `a_beam_that_blinks` in
+/// `tests/monitor` checks it.
 pub(super) const SAME_PLACE_M: f64 = 10.0;
+/// The key of an alert's evidence that names the user in whose spot a second beam is.
+pub(super) const SHARED_SPOT: &str = "shares_the_spot_of";
+/// Age from which an alert is critical, s. Longer delays the escalation, shorter makes every alert critical. Not tuned.
+const ESCALATE_S: f64 = 10.0;
 
 /// What an alert is about.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize, utoipa::ToSchema)]
@@ -44,6 +52,17 @@ pub enum Severity {
     Critical,
 }
 
+impl Severity {
+    /// Of a cause that has lasted `lasted_s`: a warning at first, then critical.
+    pub(super) fn of_duration(lasted_s: f64) -> Self {
+        if lasted_s >= ESCALATE_S {
+            Self::Critical
+        } else {
+            Self::Warning
+        }
+    }
+}
+
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum AlertState {
@@ -79,7 +98,7 @@ pub struct Alert {
     pub x_m: Option<f64>,
     pub y_m: Option<f64>,
     pub cov_m2: Option<[[f64; 2]; 2]>,
-    /// The claim the position was held against, where there is one.
+    /// The claim that the position was compared with, where there is one.
     pub claimed: Option<serde_json::Value>,
     pub evidence: serde_json::Value,
     pub source: AlertSource,
@@ -111,9 +130,10 @@ pub struct Withdrawal {
 }
 
 impl Alert {
-    /// Whether the other alert is about the same thing: its user, the spot it shares, or, where it names neither, its place.
+    /// Whether both alerts have one cause: the same user, the same shared spot or, where neither is named, the same place
+    /// to within 10 m.
     pub fn has_cause_of(&self, other: &Self) -> bool {
-        let spot = |alert: &Self| alert.evidence["shares_the_spot_of"].as_str().map(str::to_owned);
+        let spot = |alert: &Self| alert.evidence[SHARED_SPOT].as_str().map(str::to_owned);
         let is_near = match (self.x_m.zip(self.y_m), other.x_m.zip(other.y_m)) {
             (Some((x, y)), Some((ox, oy))) => (x - ox).hypot(y - oy) < SAME_PLACE_M,
             (here, there) => here == there,
@@ -124,7 +144,7 @@ impl Alert {
 }
 
 impl AlertEventKind {
-    /// Whether it is an operator's own act, of which webhooks do not tell.
+    /// Whether it is an operator's own act, which webhooks do not report.
     pub fn is_by_operator(self) -> bool {
         matches!(self, Self::Acknowledged | Self::Unacknowledged)
     }

@@ -1,68 +1,30 @@
-use std::collections::BTreeMap;
+//! The life of alerts: the only place that raises, updates, renames and clears them.
+
+use std::collections::{BTreeMap, BTreeSet};
 
 use jiff::Timestamp;
 use serde_json::Value;
 
-use crate::claims::seconds;
-use crate::monitor::alert::{
-    Acknowledgement, Alert, AlertEvent, AlertEventKind, AlertKind, AlertSource, AlertState, SAME_PLACE_M, Severity,
+use super::alert::{
+    Acknowledgement, Alert, AlertEvent, AlertEventKind, AlertKind, AlertSource, AlertState, SAME_PLACE_M, SHARED_SPOT,
     Withdrawal,
 };
+use super::finding::{Cause, Content, Finding};
+use crate::claims::seconds;
 
-/// What an alert is about: while one is open for a cause, the cause raises no other.
-#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub(super) enum Cause {
-    User(AlertKind, String),
-    Track(AlertKind, u64),
-    /// A second beam within this user's spot.
-    Spot(String),
-    Whole(AlertKind),
-}
+/// Absence after which an alert clears at the first occurrence of its cause, s. Longer keeps alerts open after their cause
+/// has gone; shorter splits one cause into several alerts. Doubled at each recurrence, so that only a cause's first
+/// minute depends on it. Not tuned.
+const CLEAR_S: f64 = 1.0;
+/// Cleared causes that are remembered for their recurrences; bounds memory under a flood of alerts.
+const MAX_CLEARED: usize = 10_000;
 
-/// What is known of a cause in this frame.
-#[derive(Clone, Debug)]
-pub(super) struct Finding {
-    pub severity: Severity,
-    pub x_m: Option<f64>,
-    pub y_m: Option<f64>,
-    pub cov_m2: Option<[[f64; 2]; 2]>,
-    pub claimed: Option<Value>,
-    pub evidence: Value,
-}
-
-#[derive(Clone, Debug)]
-struct Open {
-    alert: Alert,
-    /// Since when the cause has been absent.
-    quiet_since: Option<Timestamp>,
-    /// How often the cause came back after it had been absent for half of what clears it.
-    recurrences: u32,
-    /// Taken over from an earlier run and not seen in this one.
-    is_unseen: bool,
-}
-
-impl Open {
-    /// Absence that clears, s.
-    fn hold_s(&self, cool_down_s: f64) -> f64 {
-        (CLEAR_S * 2f64.powi(self.recurrences.min(20) as i32)).min(cool_down_s)
-    }
-}
-
-/// A cause that cleared lately.
-#[derive(Clone, Copy, Debug)]
-struct Cleared {
-    at: Timestamp,
-    /// How often it had come back.
-    recurrences: u32,
-    place: Option<[f64; 2]>,
-}
-
-/// The alerts of a run: raised once per cause, updated, acknowledged, cleared.
+/// The alerts of a run: one per cause, from raise to clear.
 #[derive(Debug)]
 pub(super) struct AlertLifecycle {
-    open: BTreeMap<Cause, Open>,
-    cleared: BTreeMap<Cause, Cleared>,
-    /// Alerts of each kind raised at the newest instant: a flood of them must not cost more than their number.
+    open: BTreeMap<Cause, OpenAlert>,
+    cleared: BTreeMap<Cause, ClearedCause>,
+    /// Alerts of each kind raised at the newest instant, for their ids.
     numbered: (Timestamp, BTreeMap<AlertKind, u32>),
     events: Vec<AlertEvent>,
     source_kind: String,
@@ -71,49 +33,34 @@ pub(super) struct AlertLifecycle {
     has_caught_up: bool,
 }
 
-/// A cause absent for this long is over, at its first occurrence.
-const CLEAR_S: f64 = 1.0;
-/// Causes remembered after they cleared.
-const MOST_CLEARED: usize = 10_000;
-
-impl Cause {
-    pub fn kind(&self) -> AlertKind {
-        match self {
-            Self::User(kind, _) | Self::Track(kind, _) | Self::Whole(kind) => *kind,
-            Self::Spot(_) => AlertKind::UnclaimedEmitter,
-        }
-    }
-
-    /// The user that the cause is about, if it is about one.
-    pub fn names(&self) -> Option<&str> {
-        match self {
-            Self::User(_, user) | Self::Spot(user) => Some(user),
-            Self::Track(..) | Self::Whole(_) => None,
-        }
-    }
-
-    fn user(&self) -> Option<&str> {
-        match self {
-            Self::User(_, user) => Some(user),
-            _ => None,
-        }
-    }
+#[derive(Clone, Debug)]
+struct OpenAlert {
+    alert: Alert,
+    /// Since when the cause has been absent.
+    absent_since: Option<Timestamp>,
+    /// How often the cause came back after it had been absent for half of what clears it.
+    recurrences: u32,
+    /// Taken over from an earlier run and not confirmed in this one.
+    is_restored: bool,
 }
 
-impl Finding {
-    pub fn new(severity: Severity, evidence: Value) -> Self {
-        Self {
-            severity,
-            x_m: None,
-            y_m: None,
-            cov_m2: None,
-            claimed: None,
-            evidence,
-        }
+/// A cause that cleared lately.
+#[derive(Clone, Copy, Debug)]
+struct ClearedCause {
+    at: Timestamp,
+    recurrences: u32,
+    place: Option<[f64; 2]>,
+}
+
+impl OpenAlert {
+    /// Absence that clears, s.
+    fn hold_s(&self, cool_down_s: f64) -> f64 {
+        (CLEAR_S * 2f64.powi(self.recurrences.min(20) as i32)).min(cool_down_s)
     }
 }
 
 impl AlertLifecycle {
+    /// `cool_down_s` bounds the absence for which an alert whose cause comes and goes stays open.
     pub fn new(source_kind: String, source_file: Option<String>, cool_down_s: f64) -> Self {
         Self {
             open: BTreeMap::new(),
@@ -127,7 +74,7 @@ impl AlertLifecycle {
         }
     }
 
-    /// Lets go of all causes; gives the alerts that stand.
+    /// Forgets all causes; gives the alerts that are open.
     pub fn start_again(&mut self) -> Vec<Alert> {
         self.cleared.clear();
         self.has_caught_up = false;
@@ -137,7 +84,7 @@ impl AlertLifecycle {
             .collect()
     }
 
-    /// Until then the absence of a cause from before this run says nothing.
+    /// Until this is told once, the absence of a cause from before this run is no evidence.
     pub fn catch_up(&mut self, has_caught_up: bool) {
         self.has_caught_up |= has_caught_up;
     }
@@ -158,143 +105,58 @@ impl AlertLifecycle {
         self.open.get(cause).map(|open| open.alert.raised_at)
     }
 
+    /// Open alerts by cause.
     pub fn open(&self) -> impl Iterator<Item = (&Cause, &Alert)> {
         self.open.iter().map(|(cause, open)| (cause, &open.alert))
     }
 
+    /// Users with an open alert of this kind.
+    pub fn users_with(&self, kind: AlertKind) -> BTreeSet<&str> {
+        self.open.keys().filter_map(|cause| user_of(cause, kind)).collect()
+    }
+
     /// Users with an alert of this kind that is open or cleared within the cool-down.
-    pub fn users_lately(&self, kind: AlertKind, now: Timestamp) -> usize {
-        let is_of = |cause: &Cause| matches!(cause, Cause::User(of, _) if *of == kind);
-        let open = self.open.keys().filter(|cause| is_of(cause)).count();
-        let cleared = self.cleared.iter().filter(|(cause, _)| is_of(cause));
-        open + cleared.filter(|(_, c)| seconds(c.at, now) <= self.cool_down_s).count()
+    pub fn users_lately_with(&self, kind: AlertKind, now: Timestamp) -> BTreeSet<&str> {
+        let recent = |c: &ClearedCause| seconds(c.at, now) <= self.cool_down_s;
+        let cleared = self.cleared.iter().filter(|(_, c)| recent(c)).map(|(cause, _)| cause);
+        let open = self.open.keys();
+        open.chain(cleared).filter_map(|cause| user_of(cause, kind)).collect()
     }
 
-    /// The cause is there: raises its alert, or brings the open one up to date (an event only when its severity changed).
-    pub fn report(&mut self, cause: &Cause, finding: Finding, now: Timestamp, frame: u64) {
-        if let Some(open) = self.open.get_mut(cause) {
-            open.is_unseen = false;
-            let hold_s = open.hold_s(self.cool_down_s);
-            let quiet_since = open.quiet_since.take();
-            if quiet_since.is_some_and(|since| seconds(since, now) >= 0.5 * hold_s) {
-                open.recurrences += 1;
+    /// Whether an open alert is about this user: their position, absence or claims, or a second beam in their spot.
+    pub fn concerns(&self, user: &str) -> bool {
+        const OF_USERS: [AlertKind; 3] = [
+            AlertKind::PositionMismatch,
+            AlertKind::UserUnseen,
+            AlertKind::ClaimsStale,
+        ];
+        OF_USERS
+            .iter()
+            .any(|kind| self.is_open(&Cause::User(*kind, user.to_owned())))
+            || self.is_open(&Cause::CoLocated(user.to_owned()))
+    }
+
+    /// Applies findings in their order.
+    pub fn apply(&mut self, findings: Vec<Finding>, now: Timestamp, frame: u64) {
+        for finding in findings {
+            match finding {
+                Finding::Present(cause, content) => self.present(cause, *content, now, frame),
+                Finding::Absent(cause) => self.absent(&cause, now),
+                Finding::Renamed { from, to } => self.rename(&from, to),
             }
-            let alert = &mut open.alert;
-            // An alert does not grow milder while its cause lasts.
-            let severity = alert.severity.max(finding.severity);
-            let escalated = severity != alert.severity;
-            finding.write_to(alert);
-            alert.severity = severity;
-            note_recurrences(alert, open.recurrences);
-            if escalated {
-                alert.source.frame = frame;
-                self.events.push(AlertEvent {
-                    event: AlertEventKind::Updated,
-                    alert: alert.clone(),
-                });
-            }
-            return;
-        }
-        let recurrences = self.cleared_lately(cause, &finding, now).map_or(0, |n| n + 1);
-        let id = self.new_id(cause.kind(), now);
-        let mut alert = Alert {
-            id,
-            kind: cause.kind(),
-            severity: finding.severity,
-            state: AlertState::Open,
-            raised_at: now,
-            cleared_at: None,
-            user: cause.user().map(str::to_owned),
-            x_m: None,
-            y_m: None,
-            cov_m2: None,
-            claimed: None,
-            evidence: Value::Null,
-            source: AlertSource {
-                kind: self.source_kind.clone(),
-                frame,
-                file: self.source_file.clone(),
-            },
-            acknowledgement: None,
-        };
-        finding.write_to(&mut alert);
-        note_recurrences(&mut alert, recurrences);
-        self.events.push(AlertEvent {
-            event: AlertEventKind::Raised,
-            alert: alert.clone(),
-        });
-        self.open.insert(
-            cause.clone(),
-            Open {
-                alert,
-                quiet_since: None,
-                recurrences,
-                is_unseen: false,
-            },
-        );
-    }
-
-    /// How often a cause that cleared within the cool-down had come back by then. A beam has another name each time it
-    /// comes on: it is known by its place.
-    fn cleared_lately(&mut self, cause: &Cause, finding: &Finding, now: Timestamp) -> Option<u32> {
-        let cool_down = self.cool_down_s;
-        let is_recent = |c: &Cleared| seconds(c.at, now) <= cool_down;
-        let same = match (cause, finding.x_m, finding.y_m) {
-            (Cause::Track(..), Some(x), Some(y)) => self
-                .cleared
-                .iter()
-                .filter(|(other, c)| matches!(other, Cause::Track(..)) && is_recent(c))
-                .find(|(_, c)| c.place.is_some_and(|[px, py]| (px - x).hypot(py - y) < SAME_PLACE_M))
-                .map(|(other, _)| other.clone()),
-            _ => Some(cause.clone()),
-        };
-        self.cleared.remove(&same?).filter(is_recent).map(|c| c.recurrences)
-    }
-
-    /// The cause is absent. Its alert clears after a second of that; twice as long each time it comes back from half of that or
-    /// within the cool-down, so that a flapping cause stays one open alert.
-    pub fn absent(&mut self, cause: &Cause, now: Timestamp) {
-        let Some(open) = self.open.get_mut(cause) else {
-            return;
-        };
-        if open.is_unseen && !self.has_caught_up {
-            return;
-        }
-        let since = *open.quiet_since.get_or_insert(now);
-        if seconds(since, now) >= open.hold_s(self.cool_down_s) {
-            self.clear(cause, now);
         }
     }
 
-    /// The cause is known to be over.
-    pub fn clear(&mut self, cause: &Cause, now: Timestamp) {
-        if let Some(mut open) = self.open.remove(cause) {
-            open.alert.state = AlertState::Cleared;
-            open.alert.cleared_at = Some(now);
-            let cool_down = self.cool_down_s;
-            if self.cleared.len() >= MOST_CLEARED {
-                self.cleared.retain(|_, c| seconds(c.at, now) <= cool_down);
-            }
-            if self.cleared.len() < MOST_CLEARED {
-                let place = open.alert.x_m.zip(open.alert.y_m).map(|(x, y)| [x, y]);
-                let cleared = Cleared {
-                    at: now,
-                    recurrences: open.recurrences,
-                    place,
-                };
-                self.cleared.insert(cause.clone(), cleared);
-            }
-            self.events.push(AlertEvent {
-                event: AlertEventKind::Cleared,
-                alert: open.alert,
-            });
-        }
-    }
-
-    /// The same cause under another name (a track that was lost and found again).
-    pub fn rename(&mut self, from: &Cause, to: Cause) {
-        if let Some(open) = self.open.remove(from) {
-            self.open.insert(to, open);
+    /// Counts the causes of users without an active claim as absent.
+    pub fn absent_without_claim(&mut self, has_claim: impl Fn(&str) -> bool, now: Timestamp) {
+        let orphans: Vec<Cause> = self
+            .open
+            .keys()
+            .filter(|cause| cause.user().is_some_and(|user| !has_claim(user)))
+            .cloned()
+            .collect();
+        for cause in orphans {
+            self.absent(&cause, now);
         }
     }
 
@@ -329,20 +191,154 @@ impl AlertLifecycle {
         })
     }
 
-    /// Takes over an alert that was open when the last run ended.
-    pub fn restore(&mut self, cause: Cause, alert: Alert) {
-        // Sight shows at once whether it is back.
-        let is_unseen = cause != Cause::Whole(AlertKind::SensorLost);
-        self.open.entry(cause).or_insert(Open {
+    /// Takes over an alert that was open when the last run ended. One that names neither user nor spot is about a track:
+    /// it gets `new_track`, an id that no track has.
+    pub fn restore(&mut self, alert: Alert, new_track: impl FnOnce() -> u64) {
+        let cause = match (alert.kind, &alert.user, alert.evidence[SHARED_SPOT].as_str()) {
+            (AlertKind::UnclaimedEmitter, None, Some(shared)) => Cause::CoLocated(shared.to_owned()),
+            (kind, Some(user), _) => Cause::User(kind, user.clone()),
+            (AlertKind::UnclaimedEmitter, None, None) => Cause::Track(new_track()),
+            (kind, None, _) => Cause::System(kind),
+        };
+        // The first frame shows whether the sensor is back.
+        let is_restored = cause != Cause::System(AlertKind::SensorLost);
+        self.open.entry(cause).or_insert(OpenAlert {
             alert,
-            quiet_since: None,
+            absent_since: None,
             recurrences: 0,
-            is_unseen,
+            is_restored,
         });
     }
 
     pub fn take_events(&mut self) -> Vec<AlertEvent> {
         std::mem::take(&mut self.events)
+    }
+
+    /// Raises the cause's alert, or updates the open one (an event only when its severity rises).
+    fn present(&mut self, cause: Cause, content: Content, now: Timestamp, frame: u64) {
+        if let Some(open) = self.open.get_mut(&cause) {
+            open.is_restored = false;
+            let hold_s = open.hold_s(self.cool_down_s);
+            let absent_since = open.absent_since.take();
+            if absent_since.is_some_and(|since| seconds(since, now) >= 0.5 * hold_s) {
+                open.recurrences += 1;
+            }
+            let alert = &mut open.alert;
+            // An alert never becomes milder while its cause lasts.
+            let severity = alert.severity.max(content.severity);
+            let has_escalated = severity != alert.severity;
+            content.write_to(alert);
+            alert.severity = severity;
+            write_recurrences(alert, open.recurrences);
+            if has_escalated {
+                alert.source.frame = frame;
+                self.events.push(AlertEvent {
+                    event: AlertEventKind::Updated,
+                    alert: alert.clone(),
+                });
+            }
+            return;
+        }
+        self.raise(cause, content, now, frame);
+    }
+
+    fn raise(&mut self, cause: Cause, content: Content, now: Timestamp, frame: u64) {
+        let recurrences = self.cleared_lately(&cause, &content, now).map_or(0, |n| n + 1);
+        let mut alert = Alert {
+            id: self.new_id(cause.kind(), now),
+            kind: cause.kind(),
+            severity: content.severity,
+            state: AlertState::Open,
+            raised_at: now,
+            cleared_at: None,
+            user: cause.user().map(str::to_owned),
+            x_m: None,
+            y_m: None,
+            cov_m2: None,
+            claimed: None,
+            evidence: Value::Null,
+            source: AlertSource {
+                kind: self.source_kind.clone(),
+                frame,
+                file: self.source_file.clone(),
+            },
+            acknowledgement: None,
+        };
+        content.write_to(&mut alert);
+        write_recurrences(&mut alert, recurrences);
+        self.events.push(AlertEvent {
+            event: AlertEventKind::Raised,
+            alert: alert.clone(),
+        });
+        let open = OpenAlert {
+            alert,
+            absent_since: None,
+            recurrences,
+            is_restored: false,
+        };
+        self.open.insert(cause, open);
+    }
+
+    /// How often a cause that cleared within the cool-down had come back by then. A beam that comes on again has a new
+    /// track: it is recognised by its place.
+    fn cleared_lately(&mut self, cause: &Cause, content: &Content, now: Timestamp) -> Option<u32> {
+        let cool_down = self.cool_down_s;
+        let is_recent = |c: &ClearedCause| seconds(c.at, now) <= cool_down;
+        let same = match (cause, content.x_m, content.y_m) {
+            (Cause::Track(_), Some(x), Some(y)) => self
+                .cleared
+                .iter()
+                .filter(|(other, c)| matches!(other, Cause::Track(_)) && is_recent(c))
+                .find(|(_, c)| c.place.is_some_and(|[px, py]| (px - x).hypot(py - y) < SAME_PLACE_M))
+                .map(|(other, _)| other.clone()),
+            _ => Some(cause.clone()),
+        };
+        self.cleared.remove(&same?).filter(is_recent).map(|c| c.recurrences)
+    }
+
+    /// Clears after a second of absence; after twice as long each time the cause has come back from half of that or within
+    /// the cool-down, so that a flapping cause stays one open alert.
+    fn absent(&mut self, cause: &Cause, now: Timestamp) {
+        let Some(open) = self.open.get_mut(cause) else {
+            return;
+        };
+        if open.is_restored && !self.has_caught_up {
+            return;
+        }
+        let since = *open.absent_since.get_or_insert(now);
+        if seconds(since, now) >= open.hold_s(self.cool_down_s) {
+            self.clear(cause, now);
+        }
+    }
+
+    fn clear(&mut self, cause: &Cause, now: Timestamp) {
+        let Some(mut open) = self.open.remove(cause) else {
+            return;
+        };
+        open.alert.state = AlertState::Cleared;
+        open.alert.cleared_at = Some(now);
+        let cool_down = self.cool_down_s;
+        if self.cleared.len() >= MAX_CLEARED {
+            self.cleared.retain(|_, c| seconds(c.at, now) <= cool_down);
+        }
+        if self.cleared.len() < MAX_CLEARED {
+            let cleared = ClearedCause {
+                at: now,
+                recurrences: open.recurrences,
+                place: open.alert.x_m.zip(open.alert.y_m).map(|(x, y)| [x, y]),
+            };
+            self.cleared.insert(cause.clone(), cleared);
+        }
+        self.events.push(AlertEvent {
+            event: AlertEventKind::Cleared,
+            alert: open.alert,
+        });
+    }
+
+    fn rename(&mut self, from: &Cause, to: Cause) {
+        if let Some(open) = self.open.remove(from) {
+            self.open.insert(to, open);
+        }
     }
 
     /// Kind, time and a count within the same instant: the same input gives the same ids.
@@ -359,7 +355,7 @@ impl AlertLifecycle {
     }
 }
 
-impl Finding {
+impl Content {
     fn write_to(self, alert: &mut Alert) {
         alert.severity = self.severity;
         alert.x_m = self.x_m;
@@ -370,10 +366,255 @@ impl Finding {
     }
 }
 
-fn note_recurrences(alert: &mut Alert, recurrences: u32) {
+fn user_of(cause: &Cause, kind: AlertKind) -> Option<&str> {
+    match cause {
+        Cause::User(of, user) if *of == kind => Some(user),
+        _ => None,
+    }
+}
+
+fn write_recurrences(alert: &mut Alert, recurrences: u32) {
     if recurrences > 0
         && let Value::Object(evidence) = &mut alert.evidence
     {
         evidence.insert("recurrences".into(), recurrences.into());
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use jiff::SignedDuration;
+    use serde_json::json;
+
+    use super::*;
+    use crate::monitor::alert::Severity;
+
+    fn at(s: f64) -> Timestamp {
+        Timestamp::from_second(1000).unwrap() + SignedDuration::from_secs_f64(s)
+    }
+
+    fn lifecycle() -> AlertLifecycle {
+        AlertLifecycle::new("replay".into(), None, 60.0)
+    }
+
+    fn unseen(user: &str) -> Cause {
+        Cause::User(AlertKind::UserUnseen, user.into())
+    }
+
+    fn present(cause: &Cause, severity: Severity) -> Finding {
+        Finding::present(cause.clone(), Content::new(severity, json!({ "n": 1 })))
+    }
+
+    fn at_place(track: u64, x: f64) -> Finding {
+        let content = Content::new(Severity::Warning, json!({}));
+        let place = nalgebra::Vector2::new(x, 0.0);
+        Finding::present(Cause::Track(track), content.at(place, Default::default()))
+    }
+
+    /// Applies a finding and gives the kinds of the events.
+    fn apply(alerts: &mut AlertLifecycle, finding: Finding, s: f64) -> Vec<AlertEventKind> {
+        alerts.apply(vec![finding], at(s), 7);
+        alerts.take_events().into_iter().map(|e| e.event).collect()
+    }
+
+    /// The cause is absent every 0.1 s from `from` until its alert clears; gives when.
+    fn clears(alerts: &mut AlertLifecycle, cause: &Cause, from: f64) -> f64 {
+        (0..1000)
+            .map(|k| from + 0.1 * f64::from(k))
+            .find(|s| !apply(alerts, Finding::Absent(cause.clone()), *s).is_empty())
+            .expect("it clears")
+    }
+
+    use AlertEventKind::*;
+
+    #[test]
+    fn a_cause_is_one_alert_from_raise_to_clear() {
+        let (mut alerts, cause) = (lifecycle(), unseen("a"));
+        assert_eq!(apply(&mut alerts, present(&cause, Severity::Warning), 0.0), [Raised]);
+        assert_eq!(alerts.raised_at(&cause), Some(at(0.0)));
+        assert_eq!(apply(&mut alerts, present(&cause, Severity::Warning), 1.0), []);
+        assert_eq!(apply(&mut alerts, present(&cause, Severity::Critical), 2.0), [Updated]);
+        // It never becomes milder.
+        assert_eq!(apply(&mut alerts, present(&cause, Severity::Warning), 3.0), []);
+        assert_eq!(alerts.open().next().unwrap().1.severity, Severity::Critical);
+        assert_eq!(apply(&mut alerts, Finding::Absent(cause.clone()), 4.0), []);
+        assert_eq!(apply(&mut alerts, Finding::Absent(cause.clone()), 4.9), []);
+        assert_eq!(apply(&mut alerts, Finding::Absent(cause.clone()), 5.0), [Cleared]);
+        assert!(!alerts.is_open(&cause));
+        assert_eq!(apply(&mut alerts, Finding::Absent(cause), 6.0), []);
+    }
+
+    #[test]
+    fn a_cause_that_comes_back_is_held_open_for_twice_as_long_each_time() {
+        let (mut alerts, cause) = (lifecycle(), unseen("a"));
+        let mut now = 0.0;
+        for hold in [1.0, 2.0, 4.0, 8.0] {
+            apply(&mut alerts, present(&cause, Severity::Warning), now);
+            let cleared = clears(&mut alerts, &cause, now + 0.1);
+            assert!(
+                (cleared - now - 0.1 - hold).abs() < 0.11,
+                "{hold}: {cleared} after {now}"
+            );
+            now = cleared + 1.0;
+        }
+        // After the cool-down it is a new cause.
+        now += 61.0;
+        apply(&mut alerts, present(&cause, Severity::Warning), now);
+        assert!((clears(&mut alerts, &cause, now) - now - 1.0).abs() < 0.11);
+    }
+
+    #[test]
+    fn a_cause_that_comes_back_from_half_of_what_clears_it_counts_as_a_recurrence() {
+        let (mut alerts, cause) = (lifecycle(), unseen("a"));
+        apply(&mut alerts, present(&cause, Severity::Warning), 0.0);
+        for (absent, back, recurrences) in [(1.0, 1.4, None), (2.0, 2.6, Some(1))] {
+            apply(&mut alerts, Finding::Absent(cause.clone()), absent);
+            apply(&mut alerts, present(&cause, Severity::Warning), back);
+            let alert = alerts.open().next().unwrap().1;
+            assert_eq!(alert.evidence["recurrences"].as_u64(), recurrences);
+        }
+    }
+
+    #[test]
+    fn the_hold_is_at_most_the_cool_down() {
+        let mut alerts = AlertLifecycle::new("replay".into(), None, 3.0);
+        let cause = unseen("a");
+        let mut now = 0.0;
+        for _ in 0..5 {
+            apply(&mut alerts, present(&cause, Severity::Warning), now);
+            now = clears(&mut alerts, &cause, now) + 0.5;
+        }
+        apply(&mut alerts, present(&cause, Severity::Warning), now);
+        assert!((clears(&mut alerts, &cause, now) - now - 3.0).abs() < 0.11);
+    }
+
+    #[test]
+    fn a_beam_that_comes_on_again_within_ten_metres_is_the_same_cause() {
+        for (x, recurrences) in [(9.0, Some(1)), (11.0, None)] {
+            let mut alerts = lifecycle();
+            apply(&mut alerts, at_place(1, 0.0), 0.0);
+            clears(&mut alerts, &Cause::Track(1), 1.0);
+            apply(&mut alerts, at_place(2, x), 5.0);
+            let alert = alerts.open().next().unwrap().1;
+            assert_eq!(alert.evidence["recurrences"].as_u64(), recurrences, "{x}");
+        }
+    }
+
+    #[test]
+    fn a_renamed_cause_keeps_its_alert() {
+        let mut alerts = lifecycle();
+        apply(&mut alerts, at_place(1, 0.0), 0.0);
+        let renamed = Finding::Renamed {
+            from: Cause::Track(1),
+            to: Cause::CoLocated("a".into()),
+        };
+        assert_eq!(apply(&mut alerts, renamed, 1.0), []);
+        assert!(!alerts.is_open(&Cause::Track(1)));
+        assert_eq!(alerts.raised_at(&Cause::CoLocated("a".into())), Some(at(0.0)));
+        assert!(alerts.concerns("a") && !alerts.concerns("b"));
+    }
+
+    #[test]
+    fn ids_are_of_kind_time_and_number() {
+        let mut alerts = lifecycle();
+        alerts.apply(
+            vec![
+                at_place(1, 0.0),
+                at_place(2, 50.0),
+                present(&unseen("a"), Severity::Warning),
+            ],
+            at(0.0),
+            7,
+        );
+        let events = alerts.take_events();
+        let ids: Vec<_> = events.iter().map(|e| e.alert.id.as_str()).collect();
+        let time = "19700101T001640000000Z";
+        assert_eq!(
+            ids,
+            [
+                format!("unclaimed_emitter-{time}-0"),
+                format!("unclaimed_emitter-{time}-1"),
+                format!("user_unseen-{time}-0")
+            ]
+        );
+        assert!(events.iter().all(|e| e.alert.source.frame == 7));
+    }
+
+    #[test]
+    fn a_restored_alert_is_cleared_only_by_a_run_that_has_caught_up() {
+        let (mut before, cause) = (lifecycle(), unseen("a"));
+        apply(&mut before, present(&cause, Severity::Warning), 0.0);
+        apply(&mut before, at_place(1, 0.0), 0.0);
+        let mut alerts = lifecycle();
+        for alert in before.start_again() {
+            alerts.restore(alert, || 99);
+        }
+        assert!(alerts.is_open(&cause) && alerts.is_open(&Cause::Track(99)));
+        for k in 0..50 {
+            assert_eq!(
+                apply(&mut alerts, Finding::Absent(cause.clone()), 10.0 + f64::from(k)),
+                []
+            );
+        }
+        alerts.catch_up(true);
+        assert!((clears(&mut alerts, &cause, 60.0) - 61.0).abs() < 0.11);
+    }
+
+    #[test]
+    fn users_without_a_claim_are_absent_and_beams_are_not() {
+        let mut alerts = lifecycle();
+        for finding in [
+            present(&unseen("a"), Severity::Warning),
+            present(&unseen("b"), Severity::Warning),
+            at_place(1, 0.0),
+        ] {
+            apply(&mut alerts, finding, 0.0);
+        }
+        for s in [1.0, 2.0] {
+            alerts.absent_without_claim(|user| user == "b", at(s));
+        }
+        let open: Vec<_> = alerts.open().map(|(cause, _)| cause.clone()).collect();
+        assert_eq!(open, [unseen("b"), Cause::Track(1)]);
+    }
+
+    #[test]
+    fn users_count_as_alerted_lately_for_the_cool_down() {
+        let mut alerts = lifecycle();
+        for user in ["a", "b"] {
+            apply(&mut alerts, present(&unseen(user), Severity::Warning), 0.0);
+        }
+        let cleared = clears(&mut alerts, &unseen("a"), 1.0);
+        let lately = |s: f64| alerts.users_lately_with(AlertKind::UserUnseen, at(s)).len();
+        assert_eq!((lately(cleared + 59.0), lately(cleared + 61.0)), (2, 1));
+        assert_eq!(
+            alerts.users_with(AlertKind::UserUnseen).into_iter().collect::<Vec<_>>(),
+            ["b"]
+        );
+    }
+
+    #[test]
+    fn an_alert_is_acknowledged_once_or_with_a_note_and_can_be_reopened() {
+        let mut alerts = lifecycle();
+        apply(&mut alerts, present(&unseen("a"), Severity::Warning), 0.0);
+        let id = alerts.open().next().unwrap().1.id.clone();
+        let acknowledgement = |note: Option<&str>| Acknowledgement {
+            at: at(1.0),
+            by: None,
+            note: note.map(str::to_owned),
+            withdrawn: None,
+        };
+        let withdrawal = || Withdrawal { at: at(2.0), by: None };
+        assert!(alerts.unacknowledge(&id, withdrawal()).is_none());
+        let event = alerts.acknowledge(&id, acknowledgement(None)).unwrap();
+        assert_eq!(
+            (event.event, event.alert.state),
+            (Acknowledged, AlertState::Acknowledged)
+        );
+        assert!(alerts.acknowledge(&id, acknowledgement(None)).is_none());
+        assert!(alerts.acknowledge(&id, acknowledgement(Some("known"))).is_some());
+        assert!(alerts.acknowledge("none", acknowledgement(None)).is_none());
+        let event = alerts.unacknowledge(&id, withdrawal()).unwrap();
+        assert_eq!((event.event, event.alert.state), (Unacknowledged, AlertState::Open));
+        assert!(event.alert.acknowledgement.unwrap().withdrawn.is_some());
     }
 }

@@ -1,75 +1,79 @@
+//! Which beam is whose is a guess where spots overlap: how wide the guess is, and which claims no frame could show.
+
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn, Vector2};
 
+use super::input::claim_state::ActiveClaim;
+use super::stats::robust::median_high;
+use super::track::association::Association;
+use super::track::detection::{OVERLAP, snr, spot_m};
+use super::track::tracker::{Track, Tracker};
 use crate::estimate::Flags;
-use crate::monitor::input::claim_state::ActiveClaim;
-use crate::monitor::input::claim_timing::median;
-use crate::monitor::monitor::Monitor;
-use crate::monitor::track::detection::snr;
-use crate::monitor::track::tracker::Track;
+use crate::optics::Camera;
 
-/// Spot widths σ within which two spots overlap by a tenth.
-const OVERLAP: f64 = 3.0;
-/// Gain in deviance that a beam must bring over what its neighbours can take of its light: with less it is not told apart from
-/// one neighbour nearer than 0.4 σ, nor from two a σ away on either side (signal-to-noise ratio 200).
-const TOLD_APART: f64 = 100.0;
-/// Neighbours that are asked, nearest first.
-const MOST_NEIGHBOURS: usize = 4;
+/// Gain in deviance that a beam must bring over what its neighbours can take of its light. With less it is not told apart from
+/// one neighbour nearer than 0.4 σ, nor from two a σ away on either side (signal-to-noise ratio 200). Larger excuses users
+/// who are really absent, smaller raises `user_unseen` in crowds.
+const MIN_DEVIANCE: f64 = 100.0;
+/// Neighbours that are considered, nearest first; bounds the cost in a crowd.
+const MAX_NEIGHBOURS: usize = 4;
+/// Standard deviations of a claim about its place that are considered too.
+const CLAIM_REACH: f64 = 2.0;
 
-impl Monitor {
-    /// How far apart two beams disturb each other, m.
-    pub fn overlap_m(&self) -> f64 {
-        OVERLAP * self.spot_m()
-    }
+/// How far from its own place the beam of `track` may be taken for, m: the distance of the farthest other associated beam that
+/// overlaps it and has merged, was missed, or is fitted by a fit that doubts itself. Zero where it stands alone.
+pub(super) fn confusion_m(track: &Track, tracker: &Tracker, association: &Association, overlap_m: f64) -> f64 {
+    let is_doubtful = |t: &Track| t.detection.flags.intersects(Flags::UNRESOLVED | Flags::NON_GAUSSIAN);
+    let here = track.filter.position();
+    let others = tracker.tracks.iter().filter(|t| t.id != track.id);
+    others
+        .filter_map(|t| {
+            let away = (t.filter.position() - here).norm();
+            let is_together = t.merged_into == Some(track.id) || track.merged_into == Some(t.id);
+            let is_unsure = !t.hit || !track.hit || is_doubtful(t) || is_doubtful(track);
+            let may_be = is_together || (away < overlap_m && is_unsure);
+            (may_be && association.contains(t.id)).then_some(away)
+        })
+        .fold(0.0, f64::max)
+}
 
-    /// How far from its own place the beam of `track` may be taken for, m: where another user's beam overlaps it and has melted, was
-    /// missed, or is fitted by a fit that doubts itself, which of them is where is a guess. Nothing where it stands alone.
-    pub fn confusion_m(&self, track: &Track, association: &[Option<u64>]) -> f64 {
-        let doubtful = |t: &Track| t.detection.flags.intersects(Flags::UNRESOLVED | Flags::NON_GAUSSIAN);
-        let (here, overlap) = (track.motion.position(), self.overlap_m());
-        let others = self.tracks.all.iter().filter(|t| t.id != track.id);
-        others
-            .filter_map(|t| {
-                let away = (t.motion.position() - here).norm();
-                let together = t.merged_into == Some(track.id) || track.merged_into == Some(t.id);
-                let unsure = !t.hit || !track.hit || doubtful(t) || doubtful(track);
-                let may_be = together || (away < overlap && unsure);
-                (may_be && association.contains(&Some(t.id))).then_some(away)
-            })
-            .fold(0.0, f64::max)
-    }
-
-    /// Notes which unanswered claims put a beam where it would not be told apart from those that are seen.
-    pub fn mark_unresolvable(&self, active: &mut [ActiveClaim], association: &[Option<u64>]) {
-        for (a, _) in active
-            .iter_mut()
-            .zip(association)
-            .filter(|(_, answer)| answer.is_none())
-        {
-            a.is_unresolvable = self.is_unresolvable(a);
+/// Marks the claims without a beam whose beam, of the user's usual energy (`usual_energy_j`), would not be told apart from those
+/// that are seen.
+pub(super) fn mark_unresolvable(
+    claims: &mut [ActiveClaim],
+    association: &Association,
+    tracker: &Tracker,
+    camera: &Camera,
+    usual_energy_j: impl Fn(&str) -> Option<f64>,
+) {
+    for (i, claim) in claims.iter_mut().enumerate() {
+        if association.track_id(i).is_none() {
+            claim.is_unresolvable = is_unresolvable(claim, tracker, camera, &usual_energy_j);
         }
     }
+}
 
-    /// Those that are seen beside it can take its light by moving and by brightening, up to what is left over.
-    fn is_unresolvable(&self, a: &ActiveClaim) -> bool {
-        let spot_m = self.spot_m();
-        let seen = || self.tracks.all.iter().filter(|t| t.hit).map(|t| &t.detection);
-        let mut near: Vec<Vector2<f64>> = seen().map(|d| (d.position - a.position) / spot_m).collect();
-        near.retain(|p| p.norm() < OVERLAP);
-        near.sort_by(|p, q| p.norm().total_cmp(&q.norm()));
-        near.truncate(MOST_NEIGHBOURS);
-        let Some(neighbours) = Neighbours::new(&near) else {
-            return false;
-        };
-        let past = self.users.get(&a.claim.user).and_then(|u| u.co_location.past_energy());
-        let usual = past
-            .map(|(ln, _)| ln.exp())
-            .or_else(|| median(seen().map(|d| d.energy_j)));
-        let snr = snr(&self.camera, usual.unwrap_or(0.0));
-        let off = 2.0 * a.variance.sqrt() / spot_m;
-        [[0.0, 0.0], [off, 0.0], [-off, 0.0], [0.0, off], [0.0, -off]]
-            .into_iter()
-            .any(|p| snr * snr * neighbours.leave_of(Vector2::from(p)) < TOLD_APART)
-    }
+/// Those that are seen beside it can take its light by moving and by brightening, up to what is left over.
+fn is_unresolvable(
+    claim: &ActiveClaim,
+    tracker: &Tracker,
+    camera: &Camera,
+    usual_energy_j: impl Fn(&str) -> Option<f64>,
+) -> bool {
+    let spot_m = spot_m(camera);
+    let seen = || tracker.tracks.iter().filter(|t| t.hit).map(|t| &t.detection);
+    let mut near: Vec<Vector2<f64>> = seen().map(|d| (d.position - claim.position) / spot_m).collect();
+    near.retain(|p| p.norm() < OVERLAP);
+    near.sort_by(|p, q| p.norm().total_cmp(&q.norm()));
+    near.truncate(MAX_NEIGHBOURS);
+    let Some(neighbours) = Neighbours::new(&near) else {
+        return false;
+    };
+    let usual = usual_energy_j(&claim.claim.user).or_else(|| median_high(seen().map(|d| d.energy_j)));
+    let snr = snr(camera, usual.unwrap_or(0.0));
+    let off = CLAIM_REACH * claim.variance.sqrt() / spot_m;
+    [[0.0, 0.0], [off, 0.0], [-off, 0.0], [0.0, off], [0.0, -off]]
+        .into_iter()
+        .any(|p| snr * snr * neighbours.unexplained(Vector2::from(p)) < MIN_DEVIANCE)
 }
 
 /// Spots and their derivatives along both axes; places in σ.
@@ -91,7 +95,7 @@ impl Neighbours {
     }
 
     /// Share of the squared norm of a spot at `p` that the neighbours cannot take by their energies and places.
-    fn leave_of(&self, p: Vector2<f64>) -> f64 {
+    fn unexplained(&self, p: Vector2<f64>) -> f64 {
         let shared = DVector::from_iterator(self.columns.len(), self.columns.iter().map(|c| product((p, 0), *c)));
         1.0 - shared.dot(&self.gram.solve(&shared))
     }
@@ -111,13 +115,18 @@ fn product((a, i): (Vector2<f64>, usize), (b, j): (Vector2<f64>, usize)) -> f64 
 
 #[cfg(test)]
 mod tests {
+    use jiff::Timestamp;
+
     use super::*;
+    use crate::monitor::input::claim_state::fixture::active_claim;
+    use crate::monitor::track::detection::fixture::detection;
+    use crate::optics;
 
     #[test]
     fn what_neighbours_take_of_a_spot() {
         let left = |others: &[[f64; 2]]| {
             let others: Vec<_> = others.iter().map(|o| Vector2::from(*o)).collect();
-            Neighbours::new(&others).unwrap().leave_of(Vector2::zeros())
+            Neighbours::new(&others).unwrap().unexplained(Vector2::zeros())
         };
         assert!(left(&[[0.0, 0.0]]).abs() < 1e-6);
         let d = 0.1;
@@ -129,5 +138,62 @@ mod tests {
         assert!(left(&[[8.0, 0.0]]) > 0.999);
         // Two on either side take more than the sum of what each takes alone.
         assert!(left(&[[0.9, 0.0], [-0.9, 0.0]]) < 0.1 * left(&[[0.9, 0.0]]));
+    }
+
+    #[test]
+    fn derivatives_of_the_overlap_are_those_of_its_formula() {
+        let (a, b) = (Vector2::new(0.3, -0.4), Vector2::new(-0.5, 0.2));
+        let step = 1e-5;
+        for j in 1..3 {
+            let mut moved = [b, b];
+            moved[0][j - 1] += step;
+            moved[1][j - 1] -= step;
+            for i in 0..3 {
+                let slope = (product((a, i), (moved[0], 0)) - product((a, i), (moved[1], 0))) / (2.0 * step);
+                assert!((slope - product((a, i), (b, j))).abs() < 1e-9, "{i} {j}");
+            }
+        }
+    }
+
+    fn two_beams(away: f64, flags: Flags) -> (Tracker, Association) {
+        let mut tracker = Tracker::new(50.0);
+        let mut beams = [detection(0.0, 0.0), detection(away, 0.0)];
+        beams[1].flags = flags;
+        tracker.step(Timestamp::UNIX_EPOCH, &beams, 0.1);
+        let mut association = Association::none(2);
+        association.assign(0, 1);
+        association.assign(1, 2);
+        (tracker, association)
+    }
+
+    #[test]
+    fn a_beam_may_be_taken_for_a_doubtful_neighbours() {
+        let confusion = |away: f64, flags: Flags| {
+            let (tracker, association) = two_beams(away, flags);
+            confusion_m(&tracker.tracks[0], &tracker, &association, 25.0)
+        };
+        assert_eq!(confusion(20.0, Flags::empty()), 0.0);
+        assert_eq!(confusion(20.0, Flags::UNRESOLVED), 20.0);
+        assert_eq!(confusion(30.0, Flags::UNRESOLVED), 0.0);
+        // A beam that answers no claim is nobody to be taken for.
+        let (tracker, _) = two_beams(20.0, Flags::UNRESOLVED);
+        assert_eq!(
+            confusion_m(&tracker.tracks[0], &tracker, &Association::none(2), 25.0),
+            0.0
+        );
+    }
+
+    #[test]
+    fn a_claim_on_top_of_a_seen_beam_cannot_be_resolved() {
+        let camera = optics::Config::default().camera().unwrap();
+        let (tracker, _) = two_beams(60.0, Flags::empty());
+        let mark = |x: f64| {
+            let mut claims = [active_claim("a", x, 0.0)];
+            // Half a millijoule: a signal-to-noise ratio of some 66.
+            mark_unresolvable(&mut claims, &Association::none(1), &tracker, &camera, |_| Some(5e-4));
+            claims[0].is_unresolvable
+        };
+        assert!(mark(0.5));
+        assert!(!mark(30.0));
     }
 }

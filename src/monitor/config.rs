@@ -1,3 +1,5 @@
+//! `[monitor]`: what the operator sets; and what the monitor is told of its source.
+
 use serde::{Deserialize, Serialize};
 
 /// `[monitor]`: what the operator understands, from which the statistical tests are derived.
@@ -6,13 +8,13 @@ use serde::{Deserialize, Serialize};
 pub struct Config {
     /// A user this far from the claim is still where they say.
     pub tolerated_distance_m: f64,
-    /// The log's clock may be this much off ours, either way: what users on the move tell of it is corrected for.
+    /// Largest offset of the log's clock from ours, either way, that is estimated from moving users and corrected.
     pub tolerated_clock_offset_s: f64,
-    /// A user's light may grow by this factor for good before the rest counts as somebody else's in the same spot.
+    /// Factor by which a user's light may grow for good before the rest counts as a second beam in the same spot.
     pub tolerated_brightening: f64,
-    /// False alerts a month of continuous watching may bring, all kinds together.
+    /// Tolerated false alerts per month of continuous watching, all kinds together.
     pub false_alerts_per_month: f64,
-    /// Seconds from the first sight of a beam nobody claims to its alert; claims may come this much later than beams.
+    /// Seconds from the first detection of a beam nobody claims to its alert. Claims must arrive within 0.65 of it.
     pub decision_s: f64,
     /// Seconds without a usable frame before the sensor counts as lost.
     pub sensor_lost_s: f64,
@@ -23,7 +25,7 @@ pub struct Config {
     /// A common shift of all users up to this is corrected; a larger one is an alert. Half the tolerated distance when
     /// left out.
     pub pose_limit_m: Option<f64>,
-    /// Longest time that a cause which comes and goes is held open before it counts as cleared.
+    /// Longest absence, s, for which an alert whose cause comes and goes is held open.
     pub cool_down_s: f64,
 }
 

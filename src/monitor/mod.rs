@@ -6,6 +6,10 @@ mod alert_lifecycle;
 mod ambiguity;
 mod config;
 mod evidence;
+mod finding;
+#[cfg(test)]
+mod fixture;
+mod frame_context;
 mod input;
 #[expect(clippy::module_inception, reason = "the list of files names the stages")]
 mod monitor;

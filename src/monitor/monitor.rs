@@ -1,92 +1,107 @@
-//! The monitor: one frame after another through the steps that lead to verdicts, one file a step.
-
-use std::collections::BTreeMap;
+//! The stages of a frame, in order. Nothing is decided here: rules read a frame and return findings, and the life cycle alone
+//! raises and clears alerts.
 
 use jiff::Timestamp;
-use nalgebra::{Matrix2, Vector2};
+use nalgebra::Vector2;
 
-use crate::claims::{Beam, ClaimState, Standing, Store, seconds};
-use crate::monitor::alert::{Acknowledgement, Alert, AlertEvent, AlertKind, Withdrawal};
-use crate::monitor::alert_lifecycle::{AlertLifecycle, Cause, Finding};
-use crate::monitor::config::{Config, Source};
-use crate::monitor::input::claim_state::{ActiveClaim, CLAIM_LIFE_S, Reach, User};
-use crate::monitor::input::crowding::Crowding;
-use crate::monitor::input::sensor_health::SensorHealth;
-use crate::monitor::pose::consensus::PoseConsensus;
-use crate::monitor::report::{Observation, Report};
-use crate::monitor::stats::co_location::CoLocationTest;
-use crate::monitor::stats::error_budget::{ErrorBudget, TestFamily};
-use crate::monitor::track::detection::Detection;
-use crate::monitor::track::tracker::{Track, Tracker};
+use super::alert::{Acknowledgement, Alert, AlertEvent, AlertKind, Withdrawal};
+use super::alert_lifecycle::AlertLifecycle;
+use super::ambiguity::mark_unresolvable;
+use super::config::{Config, Source};
+use super::finding::{Cause, Finding};
+use super::frame_context::{FrameContext, Overload};
+use super::input::claim_state::{ActiveClaim, Scope, active_claims, has_claim};
+use super::input::claim_timing::ClaimTiming;
+use super::input::clock_offset::ClockOffset;
+use super::input::crowding::Crowding;
+use super::input::sensor_health::SensorHealth;
+use super::pose::consensus::PoseConsensus;
+use super::pose::witness::witnesses;
+use super::report::{Observation, Report};
+use super::rules::{co_located, inputs, mismatch, pose, unclaimed, unseen};
+use super::stats::error_budget::ErrorBudget;
+use super::summary;
+use super::track::association::{Association, Limits, UserTracks, associate};
+use super::track::detection::Detection;
+use super::track::eligibility::Eligibility;
+use super::track::tracker::{Track, Tracker};
+use crate::claims::{Beam, Store, seconds};
+use crate::estimate::Estimate;
 use crate::optics::Camera;
 
-/// A clock that shows less than this earlier than before has not been set back: frames and failures are stamped apart.
+/// How far back a time may lie before the clock counts as set back, s: frames and failures are stamped apart.
 const SET_BACK_S: f64 = 2.0;
-/// Systematic error of the positions that does not average out, m.
-pub(super) const SYSTEMATIC_M: f64 = 0.05;
-/// A beam and an absence that began within this of each other have one cause, s.
-pub(super) const COINCIDENCE_S: f64 = 1.5;
-/// Users that have been seen, from which on only such ones tell of our pose.
-const KNOWN_WITNESSES: usize = 3;
-/// An alert that lasts this long is critical, s.
-pub(super) const ESCALATE_S: f64 = 10.0;
+/// Largest score of a track in thresholds: beyond it more hits do not outweigh later misses. Not measured.
+const MAX_SCORE: f64 = 1.5;
+/// Time since a user was last seen, beside any blindness, within which they count as visible, s.
+const VISIBLE_S: f64 = 2.0;
+/// Claim period assumed until claims show one, s.
+const ASSUMED_PERIOD_S: f64 = 1.0;
 
 /// The monitor: frames' estimates and claims in, positions and alert events out.
 pub struct Monitor {
-    pub(super) config: Config,
-    pub(super) camera: Camera,
-    pub(super) budget: ErrorBudget,
-    pub(super) default_sigma_m: f64,
-    pub(super) tracks: Tracker,
-    pub(super) users: BTreeMap<String, User>,
-    pub(super) sensor: SensorHealth,
-    pub(super) alerts: AlertLifecycle,
-    pub(super) pose: PoseConsensus,
-    pub(super) first: Option<Timestamp>,
-    pub(super) first_claim: Option<Timestamp>,
-    pub(super) first_usable: Option<Timestamp>,
-    /// Typical seconds between a user's claims, and from a claim's own time to its arrival.
-    pub(super) period_s: Option<f64>,
-    pub(super) delay_s: f64,
-    /// Seconds by which the log's clock is ahead of ours.
-    pub(super) ahead_s: f64,
-    pub(super) time: Option<Timestamp>,
-    pub(super) frame: u64,
-    /// Since when each track has had no claim, by track.
-    pub(super) unassociated_since: BTreeMap<u64, Timestamp>,
-    pub(super) level_unclaimed: f64,
-    /// Names without beams in the frame.
-    pub(super) crowding: Crowding,
-    /// Users of the frame who share the alert of those never seen.
-    pub(super) never_seen: Vec<String>,
+    state: State,
+    memory: Memory,
+    alerts: AlertLifecycle,
+    /// Index of the newest frame.
+    frame: u64,
+}
+
+/// What all rules read: the settings, and what frames and claims have shown.
+struct State {
+    config: Config,
+    camera: Camera,
+    budget: ErrorBudget,
+    /// Standard deviation of claims that state none, m.
+    default_sigma_m: f64,
+    time: Option<Timestamp>,
+    sensor: SensorHealth,
+    timing: ClaimTiming,
+    tracker: Tracker,
+    pose: PoseConsensus,
+    users: UserTracks,
+}
+
+/// What each rule, and the estimate of the log's clock, keeps for itself.
+#[derive(Default)]
+struct Memory {
+    clock: ClockOffset,
+    unclaimed: unclaimed::Memory,
+    mismatch: mismatch::Memory,
+    unseen: unseen::Memory,
+    co_located: co_located::Memory,
+}
+
+/// A frame's claims and their tracks.
+struct Associated {
+    now: Timestamp,
+    claims: Vec<ActiveClaim>,
+    association: Association,
+    claims_quiet_s: Option<(f64, f64)>,
+    overload: Overload,
+    crowding: Crowding,
+    clock_offset_s: f64,
 }
 
 impl Monitor {
     pub fn new(config: &Config, claims: &crate::claims::Config, camera: &Camera, source: Source) -> Self {
         let budget = ErrorBudget::new(config, source.rate_hz);
-        let level_unclaimed = budget.level(TestFamily::Unclaimed, 1.0);
         Self {
-            camera: camera.clone(),
-            default_sigma_m: claims.default_sigma_m,
-            tracks: Tracker::new(1.5 * level_unclaimed),
-            users: BTreeMap::new(),
-            sensor: SensorHealth::default(),
+            state: State {
+                config: config.clone(),
+                camera: camera.clone(),
+                budget,
+                default_sigma_m: claims.default_sigma_m,
+                time: None,
+                sensor: SensorHealth::default(),
+                timing: ClaimTiming::default(),
+                tracker: Tracker::new(MAX_SCORE * unclaimed::threshold(&budget)),
+                pose: PoseConsensus::default(),
+                users: UserTracks::default(),
+            },
+            memory: Memory::default(),
             alerts: AlertLifecycle::new(source.kind, source.file, config.cool_down_s),
-            pose: PoseConsensus::default(),
-            first: None,
-            first_claim: None,
-            first_usable: None,
-            period_s: None,
-            delay_s: 0.0,
-            ahead_s: 0.0,
-            time: None,
             frame: 0,
-            unassociated_since: BTreeMap::new(),
-            level_unclaimed,
-            crowding: Crowding::default(),
-            never_seen: Vec::new(),
-            budget,
-            config: config.clone(),
         }
     }
 
@@ -96,88 +111,51 @@ impl Monitor {
     }
 
     /// Takes one frame. Claims due by its time stand first.
-    pub fn step(&mut self, seen: Observation, claims: &mut Store) -> Report {
+    pub fn step(&mut self, seen: Observation, store: &mut Store) -> Report {
         let now = seen.time;
-        self.restart_if_set_back(now, claims);
-        claims.advance(now);
+        self.begin(now, store);
+        let dt = self.state.time.map_or(0.0, |t| seconds(t, now)).max(0.0);
+        self.state.saw_time(now);
         self.frame = seen.frame;
-        self.first.get_or_insert(now);
-        let dt = self.time.map_or(0.0, |t| seconds(t, now)).max(0.0);
-        self.time = Some(self.time.map_or(now, |t| t.max(now)));
-        let mut active = self.assert(claims, now);
-        let lit = active
-            .iter()
-            .filter(|a| !a.ended)
-            .filter_map(|a| a.last_answered)
-            .filter(|t| seconds(*t, now) < 2.0 + self.sensor.blind_s(now))
-            .count();
-        self.crowding = self.crowding_of(&active, claims, now);
-        self.learn_timing(&active, claims, now);
-        self.alerts.catch_up(self.has_caught_up(now));
-        self.learn_clock();
-        if let Some(estimate) = self.sensor.judge(&seen, lit) {
-            self.first_usable.get_or_insert(now);
-            let detections = Detection::of(estimate, &self.camera);
-            self.tracks.step(now, &detections, dt);
-            self.find_pose(&mut active, dt);
-            let mut association = self.answer(&active, claims);
-            self.mark_unresolvable(&mut active, &association);
-            self.weigh(&active, &association, now);
-            self.note_unassociated(&association, now);
-            self.decide_unclaimed(&active, &mut association, now);
-            self.decide_users(&active, &association, now);
-            self.decide_co_located(&active, &association, now);
-            self.note_answered(&active, &association, claims, now);
+        let mut at = self.claims(now, store);
+        let elsewhere = at.overload.left_out as f64 + store.dropped_lately(now) as f64;
+        at.crowding = Crowding::of_claims(&at.claims, elsewhere, &self.state.camera);
+        let visible_users = self.state.visible_users(&at);
+        self.learn_inputs(&mut at);
+        if let Some(estimate) = self.state.sensor.usable_estimate(&seen, visible_users) {
+            self.state.timing.saw_frame(now);
+            self.track(estimate, &mut at, store, dt);
+            self.remember(&at);
+            self.associate_displaced(&mut at);
+            self.evaluate_beams(&at);
+            at.note_answered(store);
         }
-        self.watch_inputs(&active, claims, now);
-        self.report(&active, seen.frame, now)
+        self.evaluate_inputs(&at);
+        self.report(&at)
     }
 
     /// A frame that the source itself could not deliver whole.
-    pub fn unusable(&mut self, frame: u64, time: Timestamp, reason: &str, claims: &mut Store) -> Report {
-        self.restart_if_set_back(time, claims);
-        claims.advance(time);
+    pub fn unusable(&mut self, frame: u64, time: Timestamp, reason: &str, store: &mut Store) -> Report {
+        self.begin(time, store);
+        self.state.saw_time(time);
         self.frame = frame;
-        self.first.get_or_insert(time);
-        self.time = Some(self.time.map_or(time, |t| t.max(time)));
-        self.sensor.unusable(time, reason);
-        let active = self.assert(claims, time);
-        self.watch_inputs(&active, claims, time);
-        self.report(&active, frame, time)
+        self.state.sensor.unusable(time, reason);
+        let at = self.claims(time, store);
+        self.evaluate_inputs(&at);
+        self.report(&at)
     }
 
     /// Time passes without a frame.
-    pub fn tick(&mut self, now: Timestamp, claims: &mut Store) -> Vec<AlertEvent> {
-        self.restart_if_set_back(now, claims);
-        if self.time.is_some_and(|t| now <= t) {
+    pub fn tick(&mut self, now: Timestamp, store: &mut Store) -> Vec<AlertEvent> {
+        self.restart_if_set_back(now, store);
+        if self.state.time.is_some_and(|t| now <= t) {
             return Vec::new();
         }
-        claims.advance(now);
-        self.first.get_or_insert(now);
-        self.sensor.nothing(now);
-        let active = self.assert(claims, now);
-        self.watch_inputs(&active, claims, now);
+        self.begin(now, store);
+        self.state.sensor.no_frame(now);
+        let at = self.claims(now, store);
+        self.evaluate_inputs(&at);
         self.alerts.take_events()
-    }
-
-    /// Where the clock was set back, what is anchored in times that have not come yet would keep everything waiting for them.
-    /// The monitor starts again, and the alerts that stand go on as over a restart.
-    fn restart_if_set_back(&mut self, now: Timestamp, claims: &mut Store) {
-        if !self.time.is_some_and(|t| seconds(now, t) > SET_BACK_S) {
-            return;
-        }
-        claims.set_back(now);
-        self.tracks.forget();
-        self.users.clear();
-        self.sensor = SensorHealth::default();
-        self.pose = PoseConsensus::default();
-        (self.first, self.first_claim, self.first_usable) = (None, None, None);
-        (self.period_s, self.delay_s, self.ahead_s) = (None, 0.0, 0.0);
-        self.time = None;
-        self.unassociated_since.clear();
-        self.never_seen.clear();
-        let open = self.alerts.start_again();
-        self.restore(open);
     }
 
     /// An operator has taken note. `None` when no open alert has this id, or it is acknowledged already and the new
@@ -194,136 +172,256 @@ impl Monitor {
     /// Takes over the alerts that were open when the last run ended: they go on, or clear when their cause is gone.
     pub fn restore(&mut self, open: Vec<Alert>) {
         for alert in open {
-            let shared = alert.evidence["shares_the_spot_of"].as_str();
-            let cause = match (alert.kind, &alert.user) {
-                (AlertKind::UnclaimedEmitter, None) if shared.is_some() => {
-                    let name = shared.unwrap_or_default().to_owned();
-                    let past = &alert.evidence["energy_over_the_past"];
-                    if let (Some(mean), Some(std)) = (past["past_ln_j"].as_f64(), past["past_ln_std"].as_f64()) {
-                        self.users.entry(name.clone()).or_default().co_location =
-                            CoLocationTest::remembering(mean, std);
-                    }
-                    Cause::Spot(name)
-                }
-                (kind, Some(user)) => {
-                    if kind == AlertKind::PositionMismatch {
-                        let displaced = alert.evidence["answered_from_elsewhere"].as_bool().unwrap_or(false);
-                        let known = self.users.entry(user.clone()).or_default();
-                        (known.mismatched, known.displaced) = (true, displaced);
-                    }
-                    Cause::User(kind, user.clone())
-                }
-                (AlertKind::UnclaimedEmitter, None) => Cause::Track(alert.kind, self.tracks.reserve()),
-                (kind, None) => Cause::Whole(kind),
-            };
-            self.alerts.restore(cause, alert);
+            self.memory.mismatch.restore(&alert);
+            self.memory.co_located.restore(&alert);
+            self.alerts.restore(alert, || self.state.tracker.reserve());
         }
     }
 
-    /// The claims that bear on a frame at `now`, by name.
-    fn assert(&self, claims: &mut Store, now: Timestamp) -> Vec<ActiveClaim> {
-        let tolerated = self.config.tolerated_distance_m;
-        let reach = |s: &Standing| Reach::of(s, now, self.default_sigma_m, tolerated, self.ahead_s);
-        let beams: Vec<Beam> = self.tracks.all.iter().map(|t| self.beam(t)).collect();
-        claims.choose(&beams, |s| self.is_in_reach(s, &reach(s)));
-        let mut active: Vec<ActiveClaim> = claims
-            .chosen()
-            .filter_map(|s| {
-                let (user, reach) = (self.users.get(&s.claim.user), reach(&s));
-                let bears = self.is_held(&s, user) || self.is_in_reach(&s, &reach);
-                bears.then(|| ActiveClaim::new(&s, reach, user))
-            })
-            .collect();
-        for a in &mut active {
-            a.expected = !a.ended && self.must_be_seen(a);
+    /// Lets claims that are due by `now` stand.
+    fn begin(&mut self, now: Timestamp, store: &mut Store) {
+        self.restart_if_set_back(now, store);
+        store.advance(now);
+        self.state.timing.begin(now);
+    }
+
+    /// After the clock was set back, what is anchored in times that have not come yet would keep everything waiting for them: all
+    /// is learned anew, and the alerts that are open go on as over a restart.
+    fn restart_if_set_back(&mut self, now: Timestamp, store: &mut Store) {
+        if !self.state.time.is_some_and(|t| seconds(now, t) > SET_BACK_S) {
+            return;
         }
-        for name in self.alerts.open().filter_map(|(cause, _)| cause.names()) {
-            if let Ok(i) = active.binary_search_by(|a| a.claim.user.as_str().cmp(name)) {
-                active[i].has_alert = true;
+        store.set_back(now);
+        self.state.forget();
+        self.memory = Memory::default();
+        let open = self.alerts.start_again();
+        self.restore(open);
+    }
+
+    /// The claims that bear on a frame at `now`, not associated with any track yet.
+    fn claims(&self, now: Timestamp, store: &mut Store) -> Associated {
+        let clock_offset_s = self.memory.clock.offset_s();
+        let scope = Scope {
+            config: &self.state.config,
+            camera: &self.state.camera,
+            default_sigma_m: self.state.default_sigma_m,
+            clock_offset_s,
+        };
+        let State { tracker, users, .. } = &self.state;
+        let beam = |track: &Track| Beam {
+            position: track.filter.position().into(),
+            is_answered: !self.memory.unclaimed.is_unclaimed(track.id),
+        };
+        let beams: Vec<Beam> = tracker.tracks.iter().map(beam).collect();
+        let user = |user: &str| users.get(user).copied();
+        let claims = active_claims(store, now, scope, &beams, user, |track| tracker.get(track).is_some());
+        Associated {
+            now,
+            overload: Overload {
+                squeezed: store.squeezed(now),
+                left_out: store.left_out(),
+                users: store.len(),
+                max_users: store.max_users(),
+            },
+            crowding: Crowding::default(),
+            association: Association::none(claims.len()),
+            claims,
+            claims_quiet_s: store.quiet_s(now),
+            clock_offset_s,
+        }
+    }
+
+    /// Learns the log's rhythm and clock.
+    fn learn_inputs(&mut self, at: &mut Associated) {
+        let State { config, timing, .. } = &mut self.state;
+        timing.update(&at.claims, &at.crowding, at.claims_quiet_s.is_some(), at.now);
+        self.alerts.catch_up(timing.has_caught_up(at.now, config.decision_s));
+        if self.memory.clock.follow(config.tolerated_clock_offset_s) {
+            self.memory.mismatch.forget_residuals();
+        }
+        at.clock_offset_s = self.memory.clock.offset_s();
+    }
+
+    /// Detections to tracks, our pose, and which track is associated with which claim.
+    fn track(&mut self, estimate: &Estimate, at: &mut Associated, store: &Store, dt: f64) {
+        let State {
+            config,
+            camera,
+            time,
+            timing,
+            tracker,
+            pose,
+            ..
+        } = &mut self.state;
+        tracker.step(at.now, &Detection::of(estimate, camera), dt);
+        let hit = tracker.tracks.iter().filter(|t| t.hit);
+        let beams: Vec<Vector2<f64>> = hit.map(|t| t.filter.position()).collect();
+        let witnesses = witnesses(&at.claims, tracker);
+        let period_s = timing.period_s();
+        pose.update(&beams, &witnesses, dt, period_s.unwrap_or(ASSUMED_PERIOD_S));
+        let displacement = pose.displacement();
+        for claim in &mut at.claims {
+            claim.position += displacement.at(claim.position);
+        }
+        let limits = Limits {
+            tolerated_m: config.tolerated_distance_m,
+            claims_stale_s: config.claims_stale_s,
+            period_s,
+            is_log_stale: self.alerts.is_open(&Cause::System(AlertKind::ClaimsStale)),
+        };
+        let eligibility = Eligibility {
+            now: *time,
+            crowding: at.crowding,
+            alerts: &self.alerts,
+            store,
+            decision_s: config.decision_s,
+            tolerated_m: config.tolerated_distance_m,
+        };
+        at.association = associate(&at.claims, tracker, &limits, &eligibility);
+        mark_unresolvable(&mut at.claims, &at.association, tracker, camera, |user| {
+            self.memory.co_located.usual_energy_j(user)
+        });
+    }
+
+    /// Adds the frame's evidence to what is remembered of each user and track, and forgets users who no longer matter: those
+    /// without a claim and without an open alert.
+    fn remember(&mut self, at: &Associated) {
+        let Self {
+            state, memory, alerts, ..
+        } = self;
+        state.users.update(&at.claims, &at.association, at.now);
+        let frame = state.context(at, alerts);
+        memory.clock.update(&frame, |user| memory.mismatch.is_mismatched(user));
+        memory.mismatch.update(&frame);
+        memory.unclaimed.update(&state.tracker, &at.association, at.now);
+        let matters = |user: &str| has_claim(&at.claims, user) || alerts.concerns(user);
+        state.users.retain(matters);
+        memory.clock.retain(matters);
+        memory.mismatch.retain(matters);
+        memory.co_located.retain(matters);
+    }
+
+    /// A beam that is about to be alerted is associated with the user whose beam vanished as it came, if there is one.
+    fn associate_displaced(&mut self, at: &mut Associated) {
+        let Self {
+            state, memory, alerts, ..
+        } = self;
+        for (track, since) in memory.unclaimed.due(&state.context(at, alerts)) {
+            let is_alerted = |user: &str| alerts.is_open(&Cause::User(AlertKind::UserUnseen, user.to_owned()));
+            let displaced = state.users.displaced(since, &at.claims, &at.association, is_alerted);
+            if let Some(i) = displaced {
+                let user = &at.claims[i].claim.user;
+                at.association.assign(i, track);
+                state.users.relocate(user, track);
+                memory.mismatch.displace(user);
+                memory.unclaimed.remove(track);
             }
         }
+    }
+
+    /// The rules over beams and users. Alerts of beams stand before those of users are decided: they tell whether a beam may be a
+    /// user who answers from elsewhere.
+    fn evaluate_beams(&mut self, at: &Associated) {
+        let Self {
+            state, memory, alerts, ..
+        } = self;
+        let findings = unclaimed::evaluate(&state.context(at, alerts), &mut memory.unclaimed);
+        alerts.apply(findings, at.now, self.frame);
+        let undecided = memory.unclaimed.undecided(alerts);
+        let frame = state.context(at, alerts);
+        let mut findings = mismatch::evaluate(&frame, &mut memory.mismatch);
+        findings.extend(unseen::evaluate(&frame, &mut memory.unseen, &undecided));
+        alerts.apply(by_user(findings), at.now, self.frame);
+        alerts.absent_without_claim(|user| has_claim(&at.claims, user), at.now);
+        let findings = co_located::evaluate(&state.context(at, alerts), &mut memory.co_located);
+        alerts.apply(findings, at.now, self.frame);
+    }
+
+    /// The rules over what the monitor is given.
+    fn evaluate_inputs(&mut self, at: &Associated) {
+        let frame = self.state.context(at, &self.alerts);
+        let findings = [
+            inputs::sensor_lost(&frame),
+            pose::evaluate(&frame),
+            inputs::claims_flooded(&frame),
+            inputs::claims_stale(&frame),
+        ]
+        .concat();
+        self.alerts.apply(findings, at.now, self.frame);
+    }
+
+    fn report(&mut self, at: &Associated) -> Report {
+        let events = self.alerts.take_events();
+        let frame = self.state.context(at, &self.alerts);
+        summary::report(&frame, self.frame, self.memory.unseen.never_seen(), events)
+    }
+}
+
+impl State {
+    fn context<'a>(&'a self, at: &'a Associated, alerts: &'a AlertLifecycle) -> FrameContext<'a> {
+        FrameContext {
+            now: at.now,
+            config: &self.config,
+            camera: &self.camera,
+            budget: &self.budget,
+            sensor: &self.sensor,
+            timing: &self.timing,
+            clock_offset_s: at.clock_offset_s,
+            claims_quiet_s: at.claims_quiet_s,
+            overload: at.overload,
+            crowding: at.crowding,
+            claims: &at.claims,
+            tracker: &self.tracker,
+            association: &at.association,
+            users: &self.users,
+            pose: &self.pose,
+            alerts,
+        }
+    }
+
+    /// The newest time so far.
+    fn saw_time(&mut self, now: Timestamp) {
+        self.time = Some(self.time.map_or(now, |t| t.max(now)));
+    }
+
+    /// Active users whose beam was seen a moment ago, or just before the sensor went blind.
+    fn visible_users(&self, at: &Associated) -> usize {
+        let within_s = VISIBLE_S + self.sensor.blind_s(at.now);
+        let active = at.claims.iter().filter(|a| !a.ended);
         active
+            .filter_map(|a| a.before.last_seen)
+            .filter(|t| seconds(*t, at.now) < within_s)
+            .count()
     }
 
-    fn beam(&self, track: &Track) -> Beam {
-        let p = track.motion.position();
-        Beam {
-            position: [p.x, p.y],
-            is_answered: !self.unassociated_since.contains_key(&track.id),
+    /// Forgets all but the settings.
+    fn forget(&mut self) {
+        self.tracker.forget();
+        self.time = None;
+        self.sensor = SensorHealth::default();
+        self.timing = ClaimTiming::default();
+        self.pose = PoseConsensus::default();
+        self.users = UserTracks::default();
+    }
+}
+
+impl Associated {
+    /// Lets the store know whom it must not forget for others. Among many names one frame's association is no acquaintance.
+    fn note_answered(&self, store: &mut Store) {
+        for (i, claim) in self.claims.iter().enumerate() {
+            if self.association.track_id(i).is_some() && self.crowding.is_evidence(claim) {
+                store.answered(&claim.claim.user, self.now);
+            }
         }
     }
+}
 
-    /// The beam that answered the user's claim is still followed.
-    fn is_held(&self, standing: &Standing, user: Option<&User>) -> bool {
-        let tracked = user.and_then(|u| u.track);
-        standing.claim.state == ClaimState::Active && tracked.is_some_and(|id| self.tracks.get(id).is_some())
+/// Findings about one user next to each other, those about none last.
+fn by_user(mut findings: Vec<Finding>) -> Vec<Finding> {
+    fn key(finding: &Finding) -> (bool, Option<&str>) {
+        let user = finding.cause().user();
+        (user.is_none(), user)
     }
-
-    fn is_in_reach(&self, standing: &Standing, reach: &Reach) -> bool {
-        let claim = standing.claim;
-        if claim.state == ClaimState::Ended {
-            return reach.age_s <= self.config.ended_grace_s;
-        }
-        let reach_m = self.config.tolerated_distance_m + reach.slack_m + 5.0 * reach.variance.sqrt();
-        let place = Vector2::new(claim.x_m, claim.y_m);
-        reach.age_s <= CLAIM_LIFE_S && self.is_near_view(place, reach_m + self.spot_m() * 3.0)
-    }
-
-    /// Whether even a user as far off as is tolerated would show at least part of a spot.
-    fn must_be_seen(&self, a: &ActiveClaim) -> bool {
-        let off = self.config.tolerated_distance_m + a.slack_m + 3.0 * a.variance.sqrt();
-        self.is_near_view(a.position, (self.spot_m() - off).min(0.0))
-    }
-
-    /// Covariance of what all residuals of a user at `p` share: our own pose and what is systematic in the positions.
-    pub(super) fn floor(&self, p: Vector2<f64>) -> Matrix2<f64> {
-        Matrix2::identity() * (SYSTEMATIC_M.powi(2) + self.pose.variance(p))
-    }
-
-    /// Learns our own pose error from the frame and moves the claims by it.
-    fn find_pose(&mut self, active: &mut [ActiveClaim], dt: f64) {
-        let beams: Vec<Vector2<f64>> = self
-            .tracks
-            .all
-            .iter()
-            .filter(|t| t.hit)
-            .map(|t| t.motion.position())
-            .collect();
-        // Claims that no beam ever answered say nothing of our pose, unless there are no others.
-        let (known, invented): (Vec<&ActiveClaim>, Vec<&ActiveClaim>) =
-            active.iter().filter(|a| a.expected).partition(|a| a.was_seen());
-        let heard = if known.len() >= KNOWN_WITNESSES {
-            known
-        } else {
-            [known, invented].concat()
-        };
-        let moved = |a: &ActiveClaim| {
-            let track = self.tracks.get(a.before?)?;
-            Some(track.motion.position() - track.at(a.made)?)
-        };
-        let witnesses: Vec<_> = heard.into_iter().map(|a| a.witness(moved(a))).collect();
-        self.pose.update(&beams, &witnesses, dt, self.period_s.unwrap_or(1.0));
-        let displacement = self.pose.displacement();
-        for a in active {
-            a.position += displacement.at(a.position);
-        }
-    }
-
-    pub(super) fn spot_m(&self) -> f64 {
-        self.camera.spot_sigma_m * self.camera.ground_scale()
-    }
-
-    fn is_near_view(&self, p: Vector2<f64>, margin_m: f64) -> bool {
-        let [x, y] = self.camera.to_sensor([p.x, p.y]);
-        let margin = margin_m / self.camera.ground_scale();
-        x.abs() <= self.camera.x.half_width() + margin && y.abs() <= self.camera.y.half_width() + margin
-    }
-
-    pub(super) fn at_track(&self, mut finding: Finding, track: &Track) -> Finding {
-        let (p, c) = (track.motion.position(), track.motion.position_cov());
-        finding.x_m = Some(p.x);
-        finding.y_m = Some(p.y);
-        finding.cov_m2 = Some([[c[(0, 0)], c[(0, 1)]], [c[(1, 0)], c[(1, 1)]]]);
-        finding
-    }
+    findings.sort_by(|a, b| key(a).cmp(&key(b)));
+    findings
 }

@@ -1,3 +1,5 @@
+//! What the monitor takes from a frame and what it answers.
+
 use jiff::Timestamp;
 use serde::Serialize;
 
@@ -5,7 +7,7 @@ use crate::claims::Claim;
 use crate::estimate::{Error, Estimate};
 use crate::monitor::alert::AlertEvent;
 
-/// What the sensor gave for one frame, as the monitor takes it.
+/// One frame's estimate, or why there is none.
 #[derive(Clone, Copy, Debug)]
 pub struct Observation<'a> {
     pub frame: u64,
@@ -32,7 +34,7 @@ pub struct TrackedPosition {
     pub y_m: f64,
     pub cov_m2: [[f64; 2]; 2],
     pub energy_j: f64,
-    /// The claim it answers to, if any. Never an input to the position.
+    /// The user whose claim it is associated with, if any. Never an input to the position.
     pub user: Option<String>,
     pub status: PositionStatus,
     pub flags: Vec<String>,
@@ -45,7 +47,7 @@ pub struct Report {
     pub time: Timestamp,
     pub frame: u64,
     pub emitters: Vec<TrackedPosition>,
-    /// Active users in view that no beam answers for.
+    /// Active users in view whose claim no beam is associated with.
     pub unseen: Vec<String>,
     #[serde(skip)]
     pub events: Vec<AlertEvent>,

@@ -1,74 +1,110 @@
-use std::collections::BTreeMap;
+//! The report of a frame: every beam with its position, user and status, and who is unseen.
 
-use jiff::Timestamp;
+use std::collections::{BTreeMap, BTreeSet};
 
+use super::alert::{AlertEvent, AlertKind};
+use super::finding::Cause;
+use super::frame_context::FrameContext;
+use super::report::{PositionStatus, Report, TrackedPosition};
+use super::track::tracker::Track;
 use crate::estimate::Flags;
-use crate::monitor::alert::AlertKind;
-use crate::monitor::alert_lifecycle::Cause;
-use crate::monitor::input::claim_state::ActiveClaim;
-use crate::monitor::monitor::Monitor;
-use crate::monitor::report::{PositionStatus, Report, TrackedPosition};
 
-impl Monitor {
-    pub fn report(&mut self, active: &[ActiveClaim], frame: u64, now: Timestamp) -> Report {
-        let events = self.alerts.take_events();
-        let mut owners: BTreeMap<u64, &str> = BTreeMap::new();
-        for a in active {
-            let answered = self.users.get(&a.claim.user).filter(|u| u.unanswered_since.is_none());
-            if let Some(id) = answered.and_then(|u| u.track) {
-                owners.entry(id).or_insert(&a.claim.user);
-            }
+/// The report of frame `index`; `never_seen` share one alert.
+pub(super) fn report(frame: &FrameContext, index: u64, never_seen: &[String], events: Vec<AlertEvent>) -> Report {
+    let mut owners: BTreeMap<u64, &str> = BTreeMap::new();
+    for claim in frame.claims {
+        let user = frame.users.get(&claim.claim.user).filter(|u| u.unseen_since.is_none());
+        if let Some(track) = user.and_then(|u| u.track) {
+            owners.entry(track).or_insert(&claim.claim.user);
         }
-        let emitters = self
-            .tracks
-            .all
+    }
+    let mismatched = frame.alerts.users_with(AlertKind::PositionMismatch);
+    let unseen = frame.alerts.users_with(AlertKind::UserUnseen);
+    let seen = frame.tracker.tracks.iter().filter(|t| t.is_seen());
+    Report {
+        time: frame.now,
+        frame: index,
+        emitters: seen
+            .map(|track| position(frame, track, owners.get(&track.id).copied(), &mismatched))
+            .collect(),
+        unseen: frame
+            .claims
             .iter()
-            .filter(|t| t.is_seen())
-            .map(|t| {
-                let user = owners.get(&t.id).map(|user| (*user).to_owned());
-                let is_open = |kind: AlertKind| match (&user, kind) {
-                    (Some(user), kind) => self.alerts.is_open(&Cause::User(kind, user.clone())),
-                    (None, kind) => self.alerts.is_open(&Cause::Track(kind, t.id)),
-                };
-                let status = match &user {
-                    Some(_) if is_open(AlertKind::PositionMismatch) => PositionStatus::Mismatch,
-                    Some(_) if t.confirmed => PositionStatus::Verified,
-                    None if is_open(AlertKind::UnclaimedEmitter) => PositionStatus::Unclaimed,
-                    _ => PositionStatus::Pending,
-                };
-                let (p, c) = (t.motion.position(), t.motion.position_cov());
-                TrackedPosition {
-                    track: t.id,
-                    x_m: p.x,
-                    y_m: p.y,
-                    cov_m2: [[c[(0, 0)], c[(0, 1)]], [c[(1, 0)], c[(1, 1)]]],
-                    energy_j: t.detection.energy_j,
-                    user,
-                    status,
-                    flags: match t.merged_into.is_some() {
-                        true => (t.detection.flags | Flags::UNRESOLVED).names(),
-                        false => t.detection.flags.names(),
-                    },
-                }
-            })
-            .collect();
-        let is_present = |user: &str| active.binary_search_by(|a| a.claim.user.as_str().cmp(user)).is_ok();
-        let unseen = self
-            .alerts
-            .open()
-            .filter_map(|(cause, _)| match cause {
-                Cause::User(AlertKind::UserUnseen, user) if is_present(user) => Some(user.clone()),
-                _ => None,
-            })
-            .chain(self.never_seen.iter().cloned())
-            .collect();
-        Report {
-            time: now,
-            frame,
-            emitters,
-            unseen,
-            events,
-            claims: active.iter().map(|a| a.claim.clone()).collect(),
-        }
+            .map(|a| &a.claim.user)
+            .filter(|user| unseen.contains(user.as_str()))
+            .chain(never_seen)
+            .cloned()
+            .collect(),
+        events,
+        claims: frame.claims.iter().map(|a| a.claim.clone()).collect(),
+    }
+}
+
+fn position(frame: &FrameContext, track: &Track, user: Option<&str>, mismatched: &BTreeSet<&str>) -> TrackedPosition {
+    let status = match user {
+        Some(user) if mismatched.contains(user) => PositionStatus::Mismatch,
+        Some(_) if track.confirmed => PositionStatus::Verified,
+        None if frame.alerts.is_open(&Cause::Track(track.id)) => PositionStatus::Unclaimed,
+        _ => PositionStatus::Pending,
+    };
+    let (p, c) = (track.filter.position(), track.filter.position_cov());
+    let flags = track.detection.flags;
+    TrackedPosition {
+        track: track.id,
+        x_m: p.x,
+        y_m: p.y,
+        cov_m2: [[c[(0, 0)], c[(0, 1)]], [c[(1, 0)], c[(1, 1)]]],
+        energy_j: track.detection.energy_j,
+        user: user.map(str::to_owned),
+        status,
+        flags: match track.merged_into.is_some() {
+            true => (flags | Flags::UNRESOLVED).names(),
+            false => flags.names(),
+        },
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::monitor::alert::Severity;
+    use crate::monitor::finding::{Content, Finding};
+    use crate::monitor::fixture::Scene;
+
+    #[test]
+    fn a_beam_is_verified_pending_unclaimed_or_mismatched() {
+        let mut scene = Scene::of_users(&[[0.0, 0.0], [50.0, 0.0]]);
+        scene.show(&[[0.0, 0.0], [50.0, 0.0], [0.0, 60.0], [0.0, -60.0]]);
+        let statuses = |scene: &Scene| {
+            let report = report(&scene.context(), 7, &["z".to_owned()], Vec::new());
+            assert_eq!((report.frame, report.unseen), (7, vec!["z".to_owned()]));
+            let of = |e: TrackedPosition| (e.user.unwrap_or_default(), e.status);
+            report.emitters.into_iter().map(of).collect::<Vec<_>>()
+        };
+        use PositionStatus::*;
+        let own = |user: &str, status: PositionStatus| (user.to_owned(), status);
+        assert_eq!(
+            statuses(&scene),
+            [
+                own("u-0", Verified),
+                own("u-1", Verified),
+                own("", Pending),
+                own("", Pending)
+            ]
+        );
+        let raise = |cause: Cause| Finding::present(cause, Content::new(Severity::Warning, serde_json::json!({})));
+        scene.apply(vec![
+            raise(Cause::User(AlertKind::PositionMismatch, "u-1".into())),
+            raise(Cause::Track(3)),
+        ]);
+        assert_eq!(
+            statuses(&scene),
+            [
+                own("u-0", Verified),
+                own("u-1", Mismatch),
+                own("", Unclaimed),
+                own("", Pending)
+            ]
+        );
     }
 }

@@ -58,7 +58,7 @@ struct Compared {
 }
 
 /// Measures every rule with every estimator. `progress` is told of each cell.
-pub fn run(plan: &Plan, progress: &mut dyn FnMut()) -> Result<Vec<Effect>, Error> {
+pub fn run(plan: &Plan, progress: &mut dyn FnMut(&Cell)) -> Result<Vec<Effect>, Error> {
     let mut effects = Vec::new();
     let mut compared: Vec<Vec<Vec<Compared>>> = Vec::new();
     let questions: Vec<_> = (plan.without.iter())
@@ -76,7 +76,7 @@ pub fn run(plan: &Plan, progress: &mut dyn FnMut()) -> Result<Vec<Effect>, Error
             of_cell.push(scenes.iter().enumerate().map(|(k, s)| pair.compare(s, k)).collect());
         }
         compared.push(of_cell);
-        progress();
+        progress(cell);
     }
     for (k, (rule, estimator)) in questions.into_iter().enumerate() {
         let cells = plan

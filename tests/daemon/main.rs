@@ -7,6 +7,7 @@ mod viewers;
 
 use std::path::Path;
 use std::process::Command;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use process::{Daemon, alerts};
@@ -186,7 +187,8 @@ fn what_the_daemon_records_is_reviewed_to_the_same_alert() {
 #[test]
 fn a_camera_that_was_never_there_is_seen_by_rules_and_in_the_log() {
     let dir = tempfile::tempdir().unwrap();
-    let config = "[optics]\njoules_per_count = 1e-9\n[source]\nkind = \"v4l2\"\ndevice = \"/dev/no-such-camera\"\nloop = true\n";
+    let config =
+        "[optics]\njoules_per_count = 1e-9\n[source]\nkind = \"v4l2\"\ndevice = \"/dev/no-such-camera\"\nloop = true\n";
     let daemon = Daemon::start(dir.path(), config);
     daemon.wait_for("/v1/alerts", "lost sensor", |v| {
         alerts(v).iter().any(|a| a["kind"] == "sensor_lost")
@@ -207,4 +209,54 @@ fn a_camera_that_was_never_there_is_seen_by_rules_and_in_the_log() {
     assert_eq!(code, Some(0));
     assert!(log.iter().any(|l| l.contains("source.loop has no effect")), "{log:?}");
     assert!(!log.iter().any(|l| l.contains("first usable frame")), "{log:?}");
+}
+
+/// The small sister of `make siege`: seven hundred new names every .1 s in the log, and requests that add to them.
+#[test]
+fn a_flood_of_invented_names_hides_no_eavesdropper() {
+    const RATE_HZ: f64 = 10.0;
+    let dir = tempfile::tempdir().unwrap();
+    let daemon = siege::names::start(dir.path(), RATE_HZ);
+    let is_over = AtomicBool::new(false);
+    let seen = std::thread::scope(|scope| {
+        scope.spawn(|| {
+            let mut next = 0;
+            while !is_over.load(Ordering::Relaxed) {
+                let lines = siege::names::lines(next..next + 700, jiff::Timestamp::now(), siege::names::anywhere);
+                siege::names::append(dir.path(), &lines);
+                next += 700;
+                std::thread::sleep(Duration::from_millis(100));
+            }
+        });
+        let posted = siege::names::lines(1_000_000..1_001_000, jiff::Timestamp::now(), siege::names::anywhere);
+        let (code, body) = daemon.post("/v1/claims", &posted);
+        let answer: Value = serde_json::from_str(&body).unwrap();
+        let counted = [&answer["accepted"], &answer["refused"]].map(|n| n.as_u64().unwrap_or(0));
+        assert!(matches!(code, 200 | 503), "{code}: {body}");
+        assert_eq!(counted[0] + counted[1], 1000, "{body}");
+        // A stop of the flood must come whatever the daemon does.
+        let seen = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| {
+            daemon.wait_for("/v1/positions", "the eavesdropper's first visit", |v| {
+                v["frame"].as_u64() > Some(80)
+            })
+        }));
+        is_over.store(true, Ordering::Relaxed);
+        seen.unwrap_or_else(|panic| std::panic::resume_unwind(panic))
+    });
+    let frame = seen["frame"].as_u64().unwrap();
+    let alerted = siege::names::times_to_alert(&daemon, RATE_HZ, 0, frame);
+    assert!(matches!(alerted[..], [Some(s), ..] if s <= 1.0), "{alerted:?}");
+    let invented = seen["emitters"].as_array().unwrap().iter().find(|e| {
+        let user = e["user"].as_str().unwrap_or_default();
+        e["status"] == "verified" && user.starts_with("invented")
+    });
+    assert_eq!(invented, None);
+    let flooded = daemon.get("/v1/alerts?kind=claims_flooded").1;
+    let flooded: Value = serde_json::from_str(&flooded).unwrap();
+    assert_eq!(alerts(&flooded).len(), 1, "{flooded}");
+    let evidence = &alerts(&flooded)[0]["evidence"];
+    assert!(
+        evidence["users"].as_u64() <= evidence["max_users"].as_u64(),
+        "{evidence}"
+    );
 }

@@ -1,23 +1,30 @@
 //! The estimators without a learned part: from a frame through peaks, pencil or search to positions.
 
-use std::time::{Duration, Instant};
-
 use crate::estimate::config::KnownPower;
 use crate::estimate::detect::matrix_pencil::PencilSampler;
 use crate::estimate::emitter::{Estimate, Flags};
 use crate::estimate::error::Error;
 use crate::estimate::estimator::Estimator;
 use crate::estimate::estimators::list::{EstimatorSpec, Method};
+use crate::estimate::fit::levenberg_marquardt::{evaluate, fit};
+use crate::estimate::fit::work_budget::WorkBudget;
 use crate::estimate::model::compressed_frame::CompressedFrame;
 use crate::estimate::model::hypothesis::{Hypothesis, Nuisances, PointSource};
 use crate::estimate::model::svd_basis::Basis;
+use crate::estimate::model_order::candidate::Candidate;
+use crate::estimate::model_order::initialise::{add_residual_peaks, initial_hypothesis, initialise};
+use crate::estimate::model_order::map_search::maximum_posterior;
+use crate::estimate::model_order::maximum_likelihood::maximum_likelihood;
 use crate::estimate::model_order::power_prior::PowerPrior;
+use crate::estimate::model_order::refine::shrink;
 use crate::estimate::model_order::reweighting::Reweighting;
-use crate::estimate::model_order::search::Search;
+use crate::estimate::model_order::search::{Search, SearchSpace};
+use crate::estimate::preprocess::noise_variance::VarianceFunction;
 use crate::estimate::preprocess::outliers::NoiseInspection;
 use crate::estimate::preprocess::screening::PreprocessedFrame;
 use crate::estimate::rules::Rules;
-use crate::estimate::uncertainty::localise;
+use crate::estimate::uncertainty::localise::localise;
+use crate::estimate::uncertainty::posterior_mean::posterior_moments;
 use crate::frame::Frame;
 use crate::optics::Camera;
 
@@ -59,51 +66,58 @@ pub(crate) struct AnalyticEstimator {
     noise_bases: Option<([Basis; 2], CompressedFrame)>,
     /// A second search that begins with the pencil, for frames that residual peaks do not explain at once; in `noise_bases` where there
     /// are any.
-    pencil: Option<Search>,
-    budget: Option<Duration>,
-    search: Search,
+    pencil: Option<SearchSpace>,
+    space: SearchSpace,
     compressed: CompressedFrame,
     reweighting: Reweighting,
     prior: Option<PowerPrior>,
+    rules: Rules,
+}
+
+/// What each of a frame's searches may spend.
+struct Budgets<'a> {
+    search: WorkBudget<'a>,
+    pencil: WorkBudget<'a>,
+    reweighting: WorkBudget<'a>,
+}
+
+/// The hypothesis of a frame and the search that it is of.
+struct Found {
+    hypothesis: Hypothesis,
+    is_by_pencil: bool,
+    /// The variance function, where noise that grows with the light was suspected.
+    suspected_variance: Option<VarianceFunction>,
 }
 
 impl AnalyticEstimator {
-    pub fn new(
-        spec: &'static EstimatorSpec,
-        camera: &Camera,
-        budget: Option<Duration>,
-        known: Option<&KnownPower>,
-        rules: Rules,
-    ) -> Self {
+    pub fn new(spec: &'static EstimatorSpec, camera: &Camera, known: Option<&KnownPower>, rules: Rules) -> Self {
         let (bases, noise_bases) = bases(camera);
         let pencil = if rules.pencil_start && spec.chooses_order() {
-            Search::for_pencil_start(noise_bases.as_ref().unwrap_or(&bases).clone(), rules)
+            SearchSpace::for_pencil_start(noise_bases.as_ref().unwrap_or(&bases).clone(), rules)
         } else {
             None
         };
-        let search = Search::new(bases, rules);
-        let noise_bases = noise_bases.map(|bases| (bases, CompressedFrame::default()));
         Self {
             spec,
             camera: camera.clone(),
             frame: PreprocessedFrame::default(),
             inspection: NoiseInspection::default(),
-            noise_bases,
+            noise_bases: noise_bases.map(|bases| (bases, CompressedFrame::default())),
             pencil,
-            budget,
-            search,
+            space: SearchSpace::new(bases, rules),
             compressed: CompressedFrame::default(),
             reweighting: Reweighting::new(camera, rules),
             prior: known
                 .filter(|_| spec.method == Method::MaximumPosterior)
                 .map(|k| PowerPrior::new(k, camera)),
+            rules,
         }
     }
 
     /// Loads the frame into the search's bases; returns the measured noise in units of the configured noise.
     fn inspect(&mut self) -> f64 {
-        let Self { search, compressed, .. } = self;
-        let (bx, by) = (&search.fitter.bx, &search.fitter.by);
+        let Self { space, compressed, .. } = self;
+        let (bx, by) = (&space.bases.x, &space.bases.y);
         if !self.spec.chooses_order() {
             compressed.load(&self.frame, bx, by);
             return 1.0;
@@ -113,89 +127,134 @@ impl AnalyticEstimator {
                 compressed.load(&self.frame, bx, by);
                 self.inspection.run(&mut self.frame, compressed, bx, by)
             }
-            Some(([cx, cy], noise_bases)) => {
-                noise_bases.load(&self.frame, cx, cy);
-                let scale = self.inspection.run(&mut self.frame, noise_bases, cx, cy);
+            Some(([cx, cy], in_noise_bases)) => {
+                in_noise_bases.load(&self.frame, cx, cy);
+                let scale = self.inspection.run(&mut self.frame, in_noise_bases, cx, cy);
                 compressed.load(&self.frame, bx, by);
-                (
-                    compressed.variance,
-                    compressed.mean_variance,
-                    compressed.light_weighted_variance,
-                ) = (
-                    noise_bases.variance,
-                    noise_bases.mean_variance,
-                    noise_bases.light_weighted_variance,
-                );
+                compressed.variance = in_noise_bases.variance;
+                compressed.mean_variance = in_noise_bases.mean_variance;
+                compressed.light_weighted_variance = in_noise_bases.light_weighted_variance;
                 scale
             }
         }
     }
 
+    fn search<'a, 'b>(&'a mut self, budget: &'a mut WorkBudget<'b>) -> Search<'a, 'b> {
+        self.space.search(&self.compressed, &self.frame, budget)
+    }
+
+    /// The frame by the estimator's method.
+    fn find(&mut self, budgets: &mut Budgets) -> Found {
+        let mut search = self.space.search(&self.compressed, &self.frame, &mut budgets.search);
+        let hypothesis = match self.spec.method {
+            Method::Peak { is_subpixel, steps } => {
+                let mut hypothesis = peaks(&mut search, is_subpixel);
+                fit(&mut search.context, &mut hypothesis, steps);
+                hypothesis
+            }
+            Method::Greedy => {
+                let dark = Candidate::from(Hypothesis::empty(Nuisances::default()));
+                let mut candidate = add_residual_peaks(&mut search, dark);
+                shrink(&mut search, &mut candidate);
+                candidate.into_hypothesis()
+            }
+            Method::Pencil { steps } => initialise(&mut search, Nuisances::default(), steps).into_hypothesis(),
+            Method::MaximumLikelihood | Method::MaximumPosterior => {
+                let initial = initial_hypothesis(&mut search);
+                let is_explained = self.compressed.is_explained_by(&initial);
+                let by_pencil = if is_explained {
+                    None
+                } else {
+                    self.try_pencil(&mut budgets.pencil)
+                };
+                return by_pencil.unwrap_or_else(|| self.search_with_outliers(initial, &mut budgets.search));
+            }
+        };
+        Found {
+            hypothesis,
+            is_by_pencil: false,
+            suspected_variance: None,
+        }
+    }
+
     /// The hypothesis from the pencil's positions, if it explains the frame within little work.
-    fn try_pencil(&mut self) -> Option<Hypothesis> {
+    fn try_pencil(&mut self, budget: &mut WorkBudget) -> Option<Found> {
         let compressed = self.noise_bases.as_ref().map_or(&self.compressed, |(_, r)| r);
-        let search = self
-            .pencil
-            .as_mut()
-            .filter(|s| compressed.variance.is_constant() && !s.is_heavily_masked(compressed))?;
-        let limit = search.fitter.limit_work(TRY_WORK);
-        let initial = search.initial_hypothesis(compressed, &self.frame);
+        let mut search = self.pencil.as_mut()?.search(compressed, &self.frame, budget);
+        if !compressed.variance.is_constant() || search.is_heavily_masked() {
+            return None;
+        }
+        let limit = search.context.budget.limit(TRY_WORK);
+        let initial = initial_hypothesis(&mut search);
         if !compressed.is_explained_by(&initial) {
             return None;
         }
-        search.fitter.restore_work_limit(limit);
-        let hypothesis = search.maximum_likelihood(compressed, &self.frame, initial);
-        compressed.is_explained_by(&hypothesis).then_some(hypothesis)
+        search.context.budget.restore_limit(limit);
+        let hypothesis = maximum_likelihood(&mut search, initial);
+        compressed.is_explained_by(&hypothesis).then_some(Found {
+            hypothesis,
+            is_by_pencil: true,
+            suspected_variance: search.suspected_variance,
+        })
     }
 
     /// Maximum likelihood from an initial hypothesis, with isolated outliers masked. Where the part outside the basis is white noise,
     /// outliers are more likely a misfit: they are masked only if that explains the frame at once or nothing else does.
-    fn search_with_outliers(&mut self, initial: Hypothesis) -> Hypothesis {
-        let is_white = self.search.rules().keep_outliers && self.inspection.is_white;
+    fn search_with_outliers(&mut self, initial: Hypothesis, budget: &mut WorkBudget) -> Found {
+        let is_white = self.rules.keep_outliers && self.inspection.is_white;
         let kept = is_white.then(|| (self.frame.clone(), self.compressed.clone()));
-        let limit = self
-            .search
-            .fitter
-            .limit_work(if is_white { TRY_WORK } else { f64::INFINITY });
-        let rest = self.mask_outliers(initial.clone());
-        self.search.fitter.restore_work_limit(limit);
-        let Some((frame, compressed)) = kept.filter(|_| !self.compressed.is_explained_by(&rest)) else {
-            return self.search.maximum_likelihood(&self.compressed, &self.frame, rest);
+        let limit = budget.limit(if is_white { TRY_WORK } else { f64::INFINITY });
+        let rest = self.mask_outliers(initial.clone(), budget);
+        budget.restore_limit(limit);
+        let Some(kept) = kept.filter(|_| !self.compressed.is_explained_by(&rest)) else {
+            return self.maximum_likelihood(rest, budget);
         };
-        let frame = std::mem::replace(&mut self.frame, frame);
-        let compressed = std::mem::replace(&mut self.compressed, compressed);
-        let has_outliers = compressed.masked.len() > self.compressed.masked.len();
-        let limit = self.search.fitter.limit_work(if has_outliers {
+        let masked = (
+            std::mem::replace(&mut self.frame, kept.0),
+            std::mem::replace(&mut self.compressed, kept.1),
+        );
+        let has_outliers = masked.1.masked.len() > self.compressed.masked.len();
+        let limit = budget.limit(if has_outliers {
             KEPT_OUTLIERS_WORK
         } else {
             f64::INFINITY
         });
-        let hypothesis = self.search.maximum_likelihood(&self.compressed, &self.frame, initial);
-        let is_done = !self.search.is_exhausted() && self.compressed.is_explained_by(&hypothesis);
-        self.search.fitter.restore_work_limit(limit);
+        let found = self.maximum_likelihood(initial, budget);
+        let is_done = !budget.is_exhausted() && self.compressed.is_explained_by(&found.hypothesis);
+        budget.restore_limit(limit);
         if !has_outliers || is_done {
-            return hypothesis;
+            return found;
         }
-        (self.frame, self.compressed) = (frame, compressed);
-        self.search.maximum_likelihood(&self.compressed, &self.frame, rest)
+        (self.frame, self.compressed) = masked;
+        self.maximum_likelihood(rest, budget)
+    }
+
+    fn maximum_likelihood(&mut self, initial: Hypothesis, budget: &mut WorkBudget) -> Found {
+        let mut search = self.search(budget);
+        let hypothesis = maximum_likelihood(&mut search, initial);
+        Found {
+            hypothesis,
+            is_by_pencil: false,
+            suspected_variance: search.suspected_variance,
+        }
     }
 
     /// The initial hypothesis after masking isolated outliers.
-    fn mask_outliers(&mut self, mut initial: Hypothesis) -> Hypothesis {
-        let Self { search, compressed, .. } = self;
+    fn mask_outliers(&mut self, mut initial: Hypothesis, budget: &mut WorkBudget) -> Hypothesis {
         for _ in 0..OUTLIER_PASSES {
-            if compressed.is_explained_by(&initial) {
+            if self.compressed.is_explained_by(&initial) {
                 break;
             }
-            let expected = search.fitter.expected_light(compressed, &mut initial);
-            let (bx, by) = (&search.fitter.bx, &search.fitter.by);
-            if !self
-                .inspection
-                .mask_isolated_outliers(&mut self.frame, compressed, expected, bx, by)
-            {
+            let mut search = self.search(budget);
+            let expected = evaluate(&mut search.context, &mut initial).expected_light();
+            let (bx, by) = (&self.space.bases.x, &self.space.bases.y);
+            let has_outliers =
+                self.inspection
+                    .mask_isolated_outliers(&mut self.frame, &mut self.compressed, expected, bx, by);
+            if !has_outliers {
                 break;
             }
-            initial = search.initial_hypothesis(compressed, &self.frame);
+            initial = initial_hypothesis(&mut self.search(budget));
         }
         initial
     }
@@ -206,106 +265,92 @@ impl Estimator for AnalyticEstimator {
         self.spec.name
     }
 
-    fn estimate(&mut self, frame: &Frame) -> Result<Estimate, Error> {
-        let deadline = self.budget.map(|b| Instant::now() + b);
+    fn estimate_until(&mut self, frame: &Frame, is_over: &dyn Fn() -> bool) -> Result<Estimate, Error> {
         self.frame.load(frame, &self.camera)?;
         let scale = self.inspect();
-        self.search.reset(deadline);
-        self.reweighting.search.reset(deadline);
-        if let Some(pencil) = &mut self.pencil {
-            pencil.reset(deadline);
-        }
-        let mut is_by_pencil = false;
-        let is_ml = self.spec.chooses_order();
-        let mut hypothesis = match self.spec.method {
-            Method::Peak { is_subpixel, steps } => {
-                let mut hypothesis = self.search.peaks(&self.compressed, is_subpixel);
-                self.search.fitter.fit(&self.compressed, &mut hypothesis, steps);
-                hypothesis
-            }
-            Method::Greedy => {
-                let dark = Hypothesis::empty(Nuisances::default());
-                let mut hypothesis = self.search.add_residual_peaks(&self.compressed, &self.frame, dark);
-                self.search.propose_shrinkage(&self.compressed, &mut hypothesis);
-                hypothesis
-            }
-            Method::Pencil { steps } => {
-                let plain = Nuisances::default();
-                self.search.initialise(&self.compressed, &self.frame, plain, steps)
-            }
-            Method::MaximumLikelihood | Method::MaximumPosterior => {
-                let initial = self.search.initial_hypothesis(&self.compressed, &self.frame);
-                let is_explained = self.compressed.is_explained_by(&initial);
-                let by_pencil = if is_explained { None } else { self.try_pencil() };
-                is_by_pencil = by_pencil.is_some();
-                by_pencil.unwrap_or_else(|| self.search_with_outliers(initial))
-            }
+        let mut budgets = Budgets {
+            search: WorkBudget::new(is_over),
+            pencil: WorkBudget::new(is_over),
+            reweighting: WorkBudget::new(is_over),
         };
-        let (search, compressed) = match &mut self.pencil {
-            Some(pencil) if is_by_pencil => (pencil, self.noise_bases.as_ref().map_or(&self.compressed, |(_, r)| r)),
-            _ => (&mut self.search, &self.compressed),
+        let Found {
+            mut hypothesis,
+            is_by_pencil,
+            suspected_variance,
+        } = self.find(&mut budgets);
+        let (space, compressed, budget) = match &mut self.pencil {
+            Some(pencil) if is_by_pencil => {
+                let compressed = self.noise_bases.as_ref().map_or(&self.compressed, |(_, r)| r);
+                (pencil, compressed, &mut budgets.pencil)
+            }
+            _ => (&mut self.space, &self.compressed, &mut budgets.search),
         };
-        let known = search
-            .suspected_variance
-            .or((!compressed.variance.is_constant()).then_some(compressed.variance));
-        let is_weighted = is_ml
-            && search.rules().reweighting
-            && (known.is_some() || !compressed.is_explained_by(&hypothesis))
-            && self.reweighting.run(&self.frame, known, &mut hypothesis);
-        let (search, compressed) = if is_weighted {
-            (&mut self.reweighting.search, &self.reweighting.compressed)
+        let variance = suspected_variance.or((!compressed.variance.is_constant()).then_some(compressed.variance));
+        let is_weighted = self.rules.reweighting
+            && self.spec.chooses_order()
+            && (variance.is_some() || !compressed.is_explained_by(&hypothesis))
+            && self
+                .reweighting
+                .run(&self.frame, variance, &mut hypothesis, &mut budgets.reweighting);
+        let (space, compressed, budget) = if is_weighted {
+            let Reweighting { space, compressed } = &mut self.reweighting;
+            (space, &*compressed, &mut budgets.reweighting)
         } else {
-            (search, compressed)
+            (space, compressed, budget)
         };
         let noise_j = scale * self.camera.noise_std_j;
-        let mut posterior_moments = None;
-        if let Some(mut prior) = self.prior.take() {
+        let mut search = space.search(compressed, &self.frame, budget);
+        let mut moments = None;
+        if let Some(prior) = &mut self.prior {
             prior.noise_j = noise_j;
             prior.tempering = compressed.misfit(&hypothesis);
-            search.prior = Some(prior);
-            search.maximum_posterior(compressed, &mut hypothesis);
-            self.prior = search.prior.take();
-            if search.rules().posterior_mean {
-                posterior_moments = search.posterior_moments(compressed, &mut hypothesis);
+            let prior = &*prior;
+            search = search.with_prior(prior);
+            hypothesis = maximum_posterior(&mut search, prior, hypothesis);
+            if self.rules.posterior_mean {
+                moments = posterior_moments(&mut search.context, &mut hypothesis);
             }
         }
-        let is_exhausted = search.is_exhausted();
-        let mut estimate = localise::localise(
-            search,
-            compressed,
+        let is_cut_short = search.is_exhausted();
+        let mut found = localise(
+            &mut search.context,
             &mut hypothesis,
             &self.frame,
             &self.camera,
             noise_j,
-            posterior_moments.as_deref(),
+            moments.as_deref(),
         );
-        estimate.estimator = self.spec.name;
-        estimate.is_cut_short = is_exhausted;
-        let by_pencil = self.pencil.as_ref().map_or(0, |pencil| pencil.fitter.steps);
-        estimate.steps = by_pencil + self.search.fitter.steps + self.reweighting.search.fitter.steps;
-        if is_exhausted {
-            for emitter in &mut estimate.emitters {
+        if is_cut_short {
+            for emitter in &mut found.emitters {
                 emitter.flags |= Flags::OUT_OF_TIME;
             }
         }
-        Ok(estimate)
+        Ok(Estimate {
+            emitters: found.emitters,
+            estimator: self.spec.name,
+            is_cut_short,
+            reduced_chi2: found.reduced_chi2,
+            saturated_share: self.frame.saturated_share(),
+            condition: found.condition,
+            steps: budgets.search.steps + budgets.pencil.steps + budgets.reweighting.steps,
+        })
     }
 }
 
-impl Search {
-    fn peaks(&mut self, compressed: &CompressedFrame, is_subpixel: bool) -> Hypothesis {
-        let mut hypothesis = Hypothesis::empty(Nuisances::default());
-        let peaks = self.matched_filter.peaks(
-            &compressed.coefficients,
-            compressed.mx,
-            compressed.my,
-            self.source_penalty.sqrt(),
-            1.0,
-        );
-        let sources = peaks
-            .iter()
-            .map(|p| PointSource::new(if is_subpixel { p.u } else { p.grid }, p.a));
-        hypothesis.sources.extend(sources);
-        hypothesis
-    }
+/// The matched filter's maxima as sources.
+fn peaks(search: &mut Search, is_subpixel: bool) -> Hypothesis {
+    let compressed = search.compressed();
+    let peaks = search.matched_filter.peaks(
+        &compressed.coefficients,
+        compressed.mx,
+        compressed.my,
+        search.criterion.source_penalty.sqrt(),
+        1.0,
+    );
+    let mut hypothesis = Hypothesis::empty(Nuisances::default());
+    let sources = peaks
+        .iter()
+        .map(|p| PointSource::new(if is_subpixel { p.u } else { p.grid }, p.a));
+    hypothesis.sources.extend(sources);
+    hypothesis
 }

@@ -1,7 +1,5 @@
 //! Builds an estimator from a config.
 
-use std::time::Duration;
-
 use crate::estimate::config::{Config, ConfigError};
 use crate::estimate::estimator::Estimator;
 use crate::estimate::estimators::analytic::AnalyticEstimator;
@@ -27,7 +25,6 @@ pub fn build(config: &Config, camera: &Camera) -> Result<Box<dyn Estimator>, Con
     if let Some(known) = &config.known_power {
         known.validate()?;
     }
-    let budget = config.budget_ms.map(|ms| Duration::from_secs_f64(ms * 1e-3));
     let estimator: Box<dyn Estimator> = match Learned::ALL.into_iter().find(|l| l.name() == name) {
         Some(learned) => Box::new(NetworkEstimator::new(
             learned,
@@ -38,7 +35,6 @@ pub fn build(config: &Config, camera: &Camera) -> Result<Box<dyn Estimator>, Con
         None => Box::new(AnalyticEstimator::new(
             find(name)?,
             camera,
-            budget,
             config.known_power.as_ref(),
             config.rules,
         )),

@@ -6,13 +6,17 @@ use crate::estimate::emitter::Estimate;
 use crate::estimate::error::Error;
 use crate::estimate::estimator::Estimator;
 use crate::estimate::estimators::list::Learned;
+use crate::estimate::fit::levenberg_marquardt::fit;
+use crate::estimate::fit::work_budget::WorkBudget;
 use crate::estimate::model::compressed_frame::CompressedFrame;
 use crate::estimate::model::hypothesis::{Hypothesis, Nuisances, PointSource};
 use crate::estimate::model::svd_basis::Basis;
-use crate::estimate::model_order::search::Search;
+use crate::estimate::model_order::candidate::Candidate;
+use crate::estimate::model_order::refine::shrink;
+use crate::estimate::model_order::search::SearchSpace;
 use crate::estimate::preprocess::screening::PreprocessedFrame;
 use crate::estimate::rules::Rules;
-use crate::estimate::uncertainty::localise;
+use crate::estimate::uncertainty::localise::localise;
 use crate::frame::Frame;
 use crate::optics::{Camera, psf};
 
@@ -26,7 +30,7 @@ pub(crate) struct NetworkEstimator {
     camera: Camera,
     frame: PreprocessedFrame,
     compressed: CompressedFrame,
-    search: Search,
+    space: SearchSpace,
 }
 
 impl NetworkEstimator {
@@ -44,7 +48,7 @@ impl NetworkEstimator {
             camera: camera.clone(),
             frame: PreprocessedFrame::default(),
             compressed: CompressedFrame::default(),
-            search: Search::new([bx, by], rules),
+            space: SearchSpace::new([bx, by], rules),
         })
     }
 }
@@ -54,16 +58,12 @@ impl Estimator for NetworkEstimator {
         self.spec.name()
     }
 
-    fn estimate(&mut self, frame: &Frame) -> Result<Estimate, Error> {
+    /// The network's time is the same for every frame and the fit's steps are few: `_is_over` is not asked.
+    fn estimate_until(&mut self, frame: &Frame, _is_over: &dyn Fn() -> bool) -> Result<Estimate, Error> {
         self.frame.load(frame, &self.camera)?;
-        let Self {
-            search,
-            compressed,
-            camera,
-            ..
-        } = self;
-        compressed.load(&self.frame, &search.fitter.bx, &search.fitter.by);
-        search.reset(None);
+        let camera = &self.camera;
+        self.compressed
+            .load(&self.frame, &self.space.bases.x, &self.space.bases.y);
         let mut hypothesis = Hypothesis::empty(Nuisances::default());
         let sigma = camera.spot_sigma_m;
         for peak in self.network.run(&self.frame.pixels)? {
@@ -78,13 +78,30 @@ impl Estimator for NetworkEstimator {
                 (self.frame.pixels[row * camera.x.n + column] / share).max(0.0),
             ));
         }
+        let mut budget = WorkBudget::new(&|| false);
+        let mut search = self.space.search(&self.compressed, &self.frame, &mut budget);
         if self.spec == Learned::Hybrid {
-            search.fitter.fit(compressed, &mut hypothesis, STEPS);
-            search.propose_shrinkage(compressed, &mut hypothesis);
+            fit(&mut search.context, &mut hypothesis, STEPS);
+            let mut candidate = Candidate::from(hypothesis);
+            shrink(&mut search, &mut candidate);
+            hypothesis = candidate.into_hypothesis();
         }
-        let noise_j = camera.noise_std_j;
-        let mut estimate = localise::localise(search, compressed, &mut hypothesis, &self.frame, camera, noise_j, None);
-        estimate.estimator = self.spec.name();
-        Ok(estimate)
+        let found = localise(
+            &mut search.context,
+            &mut hypothesis,
+            &self.frame,
+            camera,
+            camera.noise_std_j,
+            None,
+        );
+        Ok(Estimate {
+            emitters: found.emitters,
+            estimator: self.name(),
+            is_cut_short: false,
+            reduced_chi2: found.reduced_chi2,
+            saturated_share: self.frame.saturated_share(),
+            condition: found.condition,
+            steps: budget.steps,
+        })
     }
 }

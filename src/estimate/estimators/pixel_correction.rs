@@ -32,7 +32,7 @@ impl Estimator for PixelCorrected {
         self.inner.name()
     }
 
-    fn estimate(&mut self, frame: &Frame) -> Result<Estimate, Error> {
+    fn estimate_until(&mut self, frame: &Frame, is_over: &dyn Fn() -> bool) -> Result<Estimate, Error> {
         let own = match &mut self.frame {
             Some(own) if own.pixels.dim() == frame.pixels.dim() => {
                 own.index = frame.index;
@@ -44,6 +44,6 @@ impl Estimator for PixelCorrected {
             own => own.insert(frame.clone()),
         };
         self.maps.correct(own, self.saturation_j);
-        self.inner.estimate(own)
+        self.inner.estimate_until(own, is_over)
     }
 }

@@ -7,17 +7,18 @@
 //!
 //! In the pixel bases every component is evaluated only within its reach, and pixels may have weights of their own.
 
-use std::time::Instant;
-
 use crate::estimate::dense_linalg::dot;
-use crate::estimate::fit::source_groups;
-use crate::estimate::fit::work_budget::OVERRUN;
-use crate::estimate::model::compressed_frame::CompressedFrame;
-use crate::estimate::model::hypothesis::{Hypothesis, Nuisances, prior_penalty};
-use crate::estimate::model::separable_model::{self, SeparableModel};
-use crate::estimate::model::svd_basis::Basis;
+use crate::estimate::fit::context::FitContext;
+use crate::estimate::fit::damped_step::{predicted_decrease, step};
+use crate::estimate::fit::evaluation::Evaluation;
+use crate::estimate::fit::normal_equations::NormalEquations;
+use crate::estimate::fit::problem::Problem;
+use crate::estimate::fit::scratch::Scratch;
+use crate::estimate::fit::source_groups::{active_set, restrict_frame, restrict_hypothesis, source_groups};
+use crate::estimate::fit::work_budget::{WorkBudget, step_cost};
+use crate::estimate::fit::workspace::Workspace;
+use crate::estimate::model::hypothesis::{Hypothesis, PointSource};
 use crate::estimate::rules::Rules;
-use crate::estimate::uncertainty::posterior_mean::ProfileConstraint;
 
 /// Damping λ: first value, and range.
 const LAMBDA_START: f64 = 1e-3;
@@ -43,240 +44,280 @@ pub(crate) const MAX_STEP_FACTOR: usize = 8;
 pub(crate) const JOINT_STEPS: usize = 2;
 const MAX_REGROUPINGS: usize = 2;
 
-/// The fit's scratch memory. Grows to the largest problem seen and then allocates nothing.
-pub(crate) struct Fitter {
-    pub bx: Basis,
-    pub by: Basis,
-    pub rules: Rules,
-    pub(crate) backgrounds: [[Vec<f64>; 2]; 2],
-    pub(crate) current: SeparableModel,
-    pub(crate) trial: SeparableModel,
-    /// Weighted residual, (my, mx).
-    pub(crate) residual: Vec<f64>,
-    trial_residual: Vec<f64>,
-    /// The predicted frame's derivatives in the widths and the covariance between the axes, (my, mx), plain and weighted.
-    pub(crate) width_derivatives: [Vec<f64>; 3],
-    pub(crate) weighted_derivative: Vec<f64>,
-    /// Holds the positions near a hyperplane, if set.
-    pub profile_constraint: Option<ProfileConstraint>,
-    pub(crate) hessian: Vec<f64>,
-    pub(crate) factor: Vec<f64>,
-    pub(crate) gradient: Vec<f64>,
-    pub(crate) velocity: Vec<f64>,
-    pub(crate) acceleration: Vec<f64>,
-    pub(crate) second_derivative: Vec<f64>,
-    pub(crate) scratch: Vec<f64>,
-    pub(crate) strip: Vec<f64>,
-    pub(crate) amplitude_gram: Vec<f64>,
-    pub(crate) is_free: Vec<bool>,
-    /// Multiplications spent on this frame.
-    pub(crate) work: f64,
-    /// Limit of the work, whatever the hypotheses.
-    pub(crate) work_limit: f64,
-    /// Components of the largest hypothesis of this frame.
-    pub(crate) max_components: f64,
-    /// Steps spent on this frame.
-    pub steps: u64,
-    pub(crate) deadline: Option<Instant>,
+/// Why a fit ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Termination {
+    /// There is no non-linear parameter: the amplitudes are solved.
+    NoParameter,
+    /// The predicted decrease of the next step is negligible.
+    NegligibleDecrease,
+    /// Two successive steps decreased the deviance by little.
+    SmallDecreases,
+    /// Steps so short failed that rounding must be the cause.
+    DampingCeiling,
+    /// The number of steps is spent.
+    StepLimit,
+    /// A poor fit no longer improves.
+    Stalled,
+    /// A deviance below the acceptance threshold is out of reach.
+    OutOfReach,
+    /// The frame's work is spent.
+    OutOfWork,
 }
 
-impl Fitter {
-    pub fn new(bx: Basis, by: Basis, rules: Rules) -> Self {
-        let scratch = vec![0.0; 3 * bx.n.max(by.n)];
-        Self {
-            backgrounds: [separable_model::background(&bx), separable_model::background(&by)],
-            bx,
-            by,
-            rules,
-            current: SeparableModel::default(),
-            trial: SeparableModel::default(),
-            residual: Vec::new(),
-            trial_residual: Vec::new(),
-            width_derivatives: Default::default(),
-            weighted_derivative: Vec::new(),
-            profile_constraint: None,
-            hessian: Vec::new(),
-            factor: Vec::new(),
-            gradient: Vec::new(),
-            velocity: Vec::new(),
-            acceleration: Vec::new(),
-            second_derivative: Vec::new(),
-            scratch,
-            strip: Vec::new(),
-            amplitude_gram: Vec::new(),
-            is_free: Vec::new(),
-            work: 0.0,
-            work_limit: f64::INFINITY,
-            max_components: 0.0,
-            steps: 0,
-            deadline: None,
+impl Termination {
+    /// Whether the fit stands at a minimum of the deviance.
+    pub fn is_converged(self) -> bool {
+        matches!(
+            self,
+            Self::NoParameter | Self::NegligibleDecrease | Self::SmallDecreases | Self::DampingCeiling
+        )
+    }
+
+    /// Whether the fit was given up.
+    pub fn is_aborted(self) -> bool {
+        matches!(self, Self::OutOfReach | Self::OutOfWork)
+    }
+}
+
+/// How far a fit may go.
+#[derive(Clone, Copy)]
+struct Limits {
+    /// Most steps, and up to [`MAX_STEP_FACTOR`] times as many while each is large.
+    steps: usize,
+    /// The fit is aborted as soon as a deviance below this is out of reach.
+    acceptance_threshold: f64,
+}
+
+/// A hypothesis evaluated, with its normal equations; borrowed from the workspace, so that no other fit can come in between.
+pub(crate) struct Linearisation<'w> {
+    pub evaluation: &'w Evaluation,
+    pub equations: &'w NormalEquations,
+    pub scratch: &'w mut Scratch,
+}
+
+/// Fits `hypothesis` from where it stands, at most `steps` steps, and up to [`MAX_STEP_FACTOR`] times as many while each is large.
+pub(crate) fn fit(context: &mut FitContext, hypothesis: &mut Hypothesis, steps: usize) -> Termination {
+    fit_below(context, hypothesis, steps, f64::INFINITY)
+}
+
+/// [`fit`], aborted as soon as a deviance below `acceptance_threshold` is out of reach.
+pub(crate) fn fit_below(
+    context: &mut FitContext,
+    hypothesis: &mut Hypothesis,
+    steps: usize,
+    acceptance_threshold: f64,
+) -> Termination {
+    let problem = context.problem();
+    let last = context.budget.steps + steps as u64;
+    let within = |steps: usize| Limits {
+        steps,
+        acceptance_threshold,
+    };
+    for _ in 0..MAX_REGROUPINGS {
+        if !context.rules.source_groups || context.budget.steps + JOINT_STEPS as u64 >= last {
+            break;
+        }
+        let Some(groups) = source_groups(hypothesis) else {
+            break;
+        };
+        let joint = run(context, problem, hypothesis, within(JOINT_STEPS));
+        if joint.termination.is_aborted() || hypothesis.converged {
+            return joint.termination;
+        }
+        let Workspace {
+            current,
+            equations,
+            step,
+            ..
+        } = &*context.workspace;
+        let active = if joint.has_step {
+            active_set(&groups, step, equations)
+        } else {
+            None
+        };
+        let Some(active) = active else { break };
+        let rest = restrict_frame(problem.compressed, problem.bases, &current.model, &active);
+        let mut subset = restrict_hypothesis(hypothesis, &active);
+        let left = last.saturating_sub(context.budget.steps) as usize;
+        let of_rest = Problem {
+            compressed: &rest,
+            ..problem
+        };
+        let alone = run(context, of_rest, &mut subset, within(left));
+        for (&i, source) in active.iter().zip(&subset.sources) {
+            hypothesis.sources[i] = *source;
+        }
+        if alone.termination.is_aborted() {
+            hypothesis.deviance = subset.deviance;
+            return alone.termination;
         }
     }
+    let left = last.saturating_sub(context.budget.steps) as usize;
+    run(context, problem, hypothesis, within(left)).termination
+}
 
-    /// Fits `hypothesis` from where it stands, at most `steps` steps, and up to [`MAX_STEP_FACTOR`] times as many while each is large.
-    pub fn fit(&mut self, compressed: &CompressedFrame, hypothesis: &mut Hypothesis, steps: usize) {
-        self.fit_below(compressed, hypothesis, steps, f64::INFINITY);
+/// Fits `hypothesis` to `problem`, which may hold a constraint, all sources together.
+pub(crate) fn fit_problem(
+    context: &mut FitContext,
+    problem: Problem,
+    hypothesis: &mut Hypothesis,
+    steps: usize,
+) -> Termination {
+    let limits = Limits {
+        steps,
+        acceptance_threshold: f64::INFINITY,
+    };
+    run(context, problem, hypothesis, limits).termination
+}
+
+/// Evaluates `hypothesis`: solves its amplitudes and sets its deviance.
+pub(crate) fn evaluate<'w>(context: &'w mut FitContext, hypothesis: &mut Hypothesis) -> &'w Evaluation {
+    fit(context, hypothesis, 0);
+    &context.workspace.current
+}
+
+/// Evaluates `hypothesis` in `problem` and sets up its normal equations.
+pub(crate) fn linearise<'w>(
+    problem: Problem,
+    hypothesis: &mut Hypothesis,
+    budget: &mut WorkBudget,
+    workspace: &'w mut Workspace,
+) -> Linearisation<'w> {
+    pulp::Arch::new().dispatch(Linearise {
+        problem,
+        hypothesis,
+        budget,
+        workspace,
+    });
+    let Workspace {
+        current,
+        equations,
+        scratch,
+        ..
+    } = workspace;
+    Linearisation {
+        evaluation: current,
+        equations,
+        scratch,
     }
+}
 
-    /// [`Self::fit`], aborted as soon as a deviance below `acceptance_threshold` is out of reach.
-    pub fn fit_below(
-        &mut self,
-        compressed: &CompressedFrame,
-        hypothesis: &mut Hypothesis,
-        steps: usize,
-        acceptance_threshold: f64,
-    ) {
-        let last = self.steps + steps as u64;
-        for _ in 0..MAX_REGROUPINGS {
-            if !self.rules.source_groups || self.profile_constraint.is_some() || self.steps + JOINT_STEPS as u64 >= last
-            {
-                break;
-            }
-            let Some(groups) = hypothesis.source_groups() else {
-                break;
-            };
-            if !self.run_dispatched(compressed, hypothesis, JOINT_STEPS, acceptance_threshold) || hypothesis.converged {
-                return;
-            }
-            let Some(active) = self.active_set(&groups) else { break };
-            let rest = self.restrict_frame(compressed, &active);
-            let mut subset = source_groups::restrict_hypothesis(hypothesis, &active);
-            let left = last.saturating_sub(self.steps) as usize;
-            let is_completed = self.run_dispatched(&rest, &mut subset, left, acceptance_threshold);
-            for (&i, source) in active.iter().zip(&subset.sources) {
-                hypothesis.sources[i] = *source;
-            }
-            if !is_completed {
-                hypothesis.deviance = subset.deviance;
-                return;
-            }
-        }
-        let left = last.saturating_sub(self.steps) as usize;
-        self.run_dispatched(compressed, hypothesis, left, acceptance_threshold);
-    }
+fn run(context: &mut FitContext, problem: Problem, hypothesis: &mut Hypothesis, limits: Limits) -> Run {
+    pulp::Arch::new().dispatch(Iterate {
+        problem,
+        hypothesis,
+        limits,
+        rules: context.rules,
+        budget: context.budget,
+        workspace: context.workspace,
+    })
+}
 
-    /// `false` where the fit was aborted.
-    fn run_dispatched(
-        &mut self,
-        compressed: &CompressedFrame,
-        hypothesis: &mut Hypothesis,
-        steps: usize,
-        acceptance_threshold: f64,
-    ) -> bool {
-        pulp::Arch::new().dispatch(Job {
-            fitter: self,
-            compressed,
-            hypothesis,
-            steps,
-            acceptance_threshold,
-            wants_information: false,
-        })
-    }
+/// How a run of steps ended, and whether the workspace holds its last step.
+struct Run {
+    termination: Termination,
+    has_step: bool,
+}
 
-    /// Sets the information matrix at `hypothesis` over (x, y, energy) of each source, then nuisances; units σ and noise. Row-major,
-    /// upper triangle; see `Hypothesis::parameters`.
-    pub fn compute_information(&mut self, compressed: &CompressedFrame, hypothesis: &mut Hypothesis) {
-        pulp::Arch::new().dispatch(Job {
-            fitter: self,
-            compressed,
-            hypothesis,
-            steps: 0,
-            acceptance_threshold: f64::INFINITY,
-            wants_information: true,
-        });
-    }
+struct Iterate<'w, 'a, 'b> {
+    problem: Problem<'a>,
+    hypothesis: &'w mut Hypothesis,
+    limits: Limits,
+    rules: Rules,
+    budget: &'w mut WorkBudget<'b>,
+    workspace: &'w mut Workspace,
+}
 
-    /// Weighted residual of `hypothesis` in the bases, (my, mx), with the deviance set.
-    pub fn weighted_residual(&mut self, compressed: &CompressedFrame, hypothesis: &mut Hypothesis) -> &[f64] {
-        self.fit(compressed, hypothesis, 0);
-        &self.residual
-    }
+impl pulp::NullaryFnOnce for Iterate<'_, '_, '_> {
+    type Output = Run;
 
-    /// The light that `hypothesis` predicts, (my, mx).
-    pub fn expected_light(&mut self, compressed: &CompressedFrame, hypothesis: &mut Hypothesis) -> Vec<f64> {
-        self.fit(compressed, hypothesis, 0);
-        let mut sum = vec![0.0; compressed.mx * compressed.my];
-        for i in 0..self.current.components() {
-            self.current.accumulate(i, 0, 0, self.current.amplitude(i), &mut sum);
-        }
-        sum
-    }
-
-    /// `false` where the fit was aborted.
     #[inline(always)]
-    fn iterate(
-        &mut self,
-        compressed: &CompressedFrame,
-        hypothesis: &mut Hypothesis,
-        steps: usize,
-        acceptance_threshold: f64,
-    ) -> bool {
+    fn call(self) -> Run {
+        let Self {
+            problem,
+            hypothesis,
+            limits: Limits {
+                steps,
+                acceptance_threshold,
+            },
+            rules,
+            budget,
+            workspace,
+        } = self;
+        let Workspace {
+            current,
+            trial,
+            equations,
+            step: last_step,
+            scratch,
+        } = workspace;
         let nuisances = hypothesis.nuisances;
-        self.current.sources.clone_from(&hypothesis.sources);
-        self.current.background = hypothesis.background;
-        self.current.width = hypothesis.width;
-        self.current.covariance_xy = hypothesis.covariance_xy;
-        for s in &mut self.current.sources {
-            s.u[0] = s.u[0].clamp(self.bx.min_position(), self.bx.max_position());
-            s.u[1] = s.u[1].clamp(self.by.min_position(), self.by.max_position());
-        }
-        let mut deviance = self.evaluate(compressed, nuisances, false);
-        let parameters = hypothesis.parameters();
+        current.load(problem, hypothesis);
+        let mut deviance = current.evaluate(problem, nuisances, scratch);
+        let has_overlap = has_overlap(&current.model.sources);
         let mut lambda = LAMBDA_START;
         let mut small_decreases = 0;
-        let mut converged = parameters == nuisances.background_terms();
         let mut is_linearised = false;
-        let has_overlap = self.current.sources.iter().enumerate().any(|(i, s)| {
-            self.current.sources[..i].iter().any(|t| {
-                (s.u[0] - t.u[0]).abs() < ACCELERATION_DISTANCE && (s.u[1] - t.u[1]).abs() < ACCELERATION_DISTANCE
-            })
-        });
-        let mut is_completed = true;
         let mut is_fast = false;
         let mut stalled = 0;
-        for k in 0..MAX_STEP_FACTOR * steps {
-            if converged || k >= steps && !is_fast || stalled >= STALLED_STEPS {
-                break;
+        let mut has_step = false;
+        let mut steps_taken = 0;
+        let mut end = (hypothesis.parameters() == nuisances.background_terms()).then_some(Termination::NoParameter);
+        let termination = loop {
+            if let Some(reason) = end {
+                break reason;
             }
-            if self.work > OVERRUN * self.max_work() {
-                is_completed = false;
-                break;
+            if steps_taken >= steps && (!is_fast || steps_taken >= MAX_STEP_FACTOR * steps) {
+                break Termination::StepLimit;
             }
-            self.max_components = self.max_components.max(self.current.components() as f64);
-            self.work += self.step_cost(compressed);
-            self.steps += 1;
+            if stalled >= STALLED_STEPS {
+                break Termination::Stalled;
+            }
+            if budget.is_overrun() {
+                break Termination::OutOfWork;
+            }
+            steps_taken += 1;
+            budget.charge_step(
+                current.model.components(),
+                step_cost(problem.bases, problem.compressed, &current.model),
+            );
             if !is_linearised {
-                self.compute_normal_equations(compressed, nuisances);
+                equations.compute(problem, nuisances, current, scratch);
                 is_linearised = true;
             }
-            let moved = self.step(compressed, nuisances, lambda, has_overlap);
-            if moved && lambda <= LAMBDA_START {
-                let expected = dot(&self.velocity[..parameters], &self.gradient[..parameters]);
+            has_step = step(equations, lambda, &mut scratch.factor, last_step);
+            if has_step && has_overlap {
+                last_step.accelerate(problem, current, equations, scratch);
+            }
+            if has_step && lambda <= LAMBDA_START {
+                let expected = dot(&last_step.velocity, &equations.gradient);
                 if expected < NEGLIGIBLE_DECREASE {
-                    converged = true;
-                    break;
+                    break Termination::NegligibleDecrease;
                 }
                 let is_unreachable = |decrease: f64| deviance - ABORT_FACTOR * decrease > acceptance_threshold;
                 // Damping hides the decrease along ill-determined directions.
-                if self.rules.abort_fits
+                if rules.abort_fits
                     && is_unreachable(expected)
-                    && is_unreachable(self.predicted_decrease(parameters))
+                    && is_unreachable(predicted_decrease(equations, scratch))
                 {
-                    is_completed = false;
-                    break;
+                    break Termination::OutOfReach;
                 }
             }
-            let accepted = moved && {
-                let next = self.evaluate(compressed, nuisances, true);
+            let mut is_accepted = false;
+            if has_step {
+                last_step.take(problem, nuisances.widths(), &current.model, &mut trial.model);
+                let next = trial.evaluate(problem, nuisances, scratch);
                 let decrease = deviance - next;
-                if decrease >= 0.0 {
+                is_accepted = decrease >= 0.0;
+                if is_accepted {
                     small_decreases = if decrease < CONVERGED_DECREASE && lambda < 1e-3 {
                         small_decreases + 1
                     } else {
                         0
                     };
-                    let is_poor_fit = self.rules.stop_stalled_fits && next > POOR_FIT_FACTOR * compressed.data_count;
-                    is_fast = self.rules.extend_fast_fits && decrease > FAST_SHARE * deviance;
+                    let is_poor_fit = rules.stop_stalled_fits && next > POOR_FIT_FACTOR * problem.compressed.data_count;
+                    is_fast = rules.extend_fast_fits && decrease > FAST_SHARE * deviance;
                     stalled = if is_poor_fit && decrease < STALLED_SHARE * deviance {
                         stalled + 1
                     } else {
@@ -284,94 +325,63 @@ impl Fitter {
                     };
                     deviance = next;
                 }
-                decrease >= 0.0
-            };
-            if accepted {
-                std::mem::swap(&mut self.current, &mut self.trial);
-                std::mem::swap(&mut self.residual, &mut self.trial_residual);
+            }
+            if is_accepted {
+                std::mem::swap(current, trial);
                 lambda = (lambda * 0.15).max(LAMBDA_FLOOR);
                 is_linearised = false;
-                converged = small_decreases >= 2;
+                end = (small_decreases >= 2).then_some(Termination::SmallDecreases);
             } else {
                 lambda *= 4.0;
-                // Steps this short fail by rounding, not by curvature.
-                if lambda > LAMBDA_CEILING {
-                    converged = true;
-                }
+                end = (lambda > LAMBDA_CEILING).then_some(Termination::DampingCeiling);
             }
-        }
-        hypothesis.sources.clone_from(&self.current.sources);
-        hypothesis.background = self.current.background;
-        hypothesis.width = self.current.width;
-        hypothesis.covariance_xy = self.current.covariance_xy;
-        hypothesis.deviance =
-            deviance - prior_penalty(&hypothesis.sources) - self.constraint_deviance(&hypothesis.sources);
+        };
+        current.store(problem, deviance, hypothesis);
         // A fit of no steps only evaluates the deviance.
-        hypothesis.converged = converged || steps == 0 && hypothesis.converged;
-        is_completed
-    }
-
-    /// Evaluates the current or the trial model, solves its amplitudes, and returns the penalised deviance.
-    #[inline(always)]
-    fn evaluate(&mut self, compressed: &CompressedFrame, nuisances: Nuisances, is_trial: bool) -> f64 {
-        let separable = if is_trial { &mut self.trial } else { &mut self.current };
-        let backgrounds = [&self.backgrounds[0], &self.backgrounds[1]];
-        separable.place(
-            [&self.bx, &self.by],
-            backgrounds,
-            compressed,
-            nuisances,
-            &mut self.scratch,
-        );
-        self.solve_amplitudes(compressed, is_trial);
-        let sources = if is_trial {
-            &self.trial.sources
-        } else {
-            &self.current.sources
-        };
-        prior_penalty(sources) + self.constraint_deviance(sources) + self.compute_residual(compressed, is_trial)
-    }
-
-    /// Sets the weighted residual of the current or the trial model and returns its deviance.
-    #[inline(always)]
-    fn compute_residual(&mut self, compressed: &CompressedFrame, is_trial: bool) -> f64 {
-        let (separable, residual) = if is_trial {
-            (&self.trial, &mut self.trial_residual)
-        } else {
-            (&self.current, &mut self.residual)
-        };
-        residual.clear();
-        residual.extend_from_slice(&compressed.coefficients);
-        for i in 0..separable.components() {
-            separable.accumulate(i, 0, 0, -separable.amplitude(i), residual);
-        }
-        compressed.apply_weights(residual, [&self.bx, &self.by], true, &mut self.scratch)
+        hypothesis.converged = termination.is_converged() || steps == 0 && hypothesis.converged;
+        Run { termination, has_step }
     }
 }
 
-struct Job<'a> {
-    fitter: &'a mut Fitter,
-    compressed: &'a CompressedFrame,
-    hypothesis: &'a mut Hypothesis,
-    steps: usize,
-    acceptance_threshold: f64,
-    wants_information: bool,
+/// Whether two sources are so near that a step needs acceleration.
+fn has_overlap(sources: &[PointSource]) -> bool {
+    sources.iter().enumerate().any(|(i, s)| {
+        sources[..i]
+            .iter()
+            .any(|t| (s.u[0] - t.u[0]).abs() < ACCELERATION_DISTANCE && (s.u[1] - t.u[1]).abs() < ACCELERATION_DISTANCE)
+    })
 }
 
-impl pulp::NullaryFnOnce for Job<'_> {
-    /// `false` where the fit was aborted.
-    type Output = bool;
+struct Linearise<'w, 'a, 'b> {
+    problem: Problem<'a>,
+    hypothesis: &'w mut Hypothesis,
+    budget: &'w mut WorkBudget<'b>,
+    workspace: &'w mut Workspace,
+}
+
+impl pulp::NullaryFnOnce for Linearise<'_, '_, '_> {
+    type Output = ();
 
     #[inline(always)]
-    fn call(self) -> bool {
-        let is_completed = self
-            .fitter
-            .iterate(self.compressed, self.hypothesis, self.steps, self.acceptance_threshold);
-        if self.wants_information {
-            self.fitter.work += self.fitter.step_cost(self.compressed);
-            self.fitter
-                .compute_normal_equations(self.compressed, self.hypothesis.nuisances);
-        }
-        is_completed
+    fn call(self) {
+        let Self {
+            problem,
+            hypothesis,
+            budget,
+            workspace,
+        } = self;
+        let Workspace {
+            current,
+            equations,
+            scratch,
+            ..
+        } = workspace;
+        let nuisances = hypothesis.nuisances;
+        current.load(problem, hypothesis);
+        let deviance = current.evaluate(problem, nuisances, scratch);
+        current.store(problem, deviance, hypothesis);
+        hypothesis.converged |= hypothesis.parameters() == nuisances.background_terms();
+        budget.charge(step_cost(problem.bases, problem.compressed, &current.model));
+        equations.compute(problem, nuisances, current, scratch);
     }
 }

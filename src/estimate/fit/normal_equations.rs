@@ -1,31 +1,67 @@
-//! The normal equations: gradient and information matrix of a hypothesis.
+//! The normal equations of a hypothesis: gradient Jᵀr and information JᵀJ over (x, y, energy) of each source, then background, then
+//! widths, in units of σ and of the noise.
 
 use crate::estimate::dense_linalg::{axpy, dot};
-use crate::estimate::fit::levenberg_marquardt::Fitter;
-use crate::estimate::model::compressed_frame::CompressedFrame;
+use crate::estimate::fit::evaluation::Evaluation;
+use crate::estimate::fit::problem::Problem;
+use crate::estimate::fit::scratch::Scratch;
 use crate::estimate::model::hypothesis::Nuisances;
 
-impl Fitter {
-    /// Sets gradient Jᵀr and information JᵀJ of the current model.
+/// Gradient and information at one hypothesis.
+#[derive(Default)]
+pub(crate) struct NormalEquations {
+    pub sources: usize,
+    pub parameters: usize,
+    /// JᵀJ, (p, p) row-major; only the upper triangle and the sources' 3 × 3 blocks are set.
+    pub information: Vec<f64>,
+    pub gradient: Vec<f64>,
+    /// The predicted frame's derivatives in the logarithms of the widths and in the covariance between the axes, (my, mx).
+    width_derivatives: [Vec<f64>; 3],
+    width_count: usize,
+}
+
+impl NormalEquations {
+    /// Of sources alone, with a gradient of zero.
+    #[cfg(test)]
+    pub fn of_sources(information: Vec<f64>) -> Self {
+        let parameters = information.len().isqrt();
+        Self {
+            sources: parameters / 3,
+            parameters,
+            information,
+            gradient: vec![0.0; parameters],
+            ..Self::default()
+        }
+    }
+
+    /// The predicted frame's derivatives in the fitted widths, (my, mx) each.
     #[inline(always)]
-    pub(crate) fn compute_normal_equations(&mut self, compressed: &CompressedFrame, nuisances: Nuisances) {
+    pub fn widths(&self) -> &[Vec<f64>] {
+        &self.width_derivatives[..self.width_count]
+    }
+
+    /// Sets gradient and information of an evaluated hypothesis.
+    #[inline(always)]
+    pub fn compute(&mut self, problem: Problem, nuisances: Nuisances, at: &Evaluation, scratch: &mut Scratch) {
+        let (compressed, model) = (problem.compressed, &at.model);
         let (mx, my) = (compressed.mx, compressed.my);
-        let n = self.current.sources.len();
+        let n = model.sources.len();
         let p = 3 * n + nuisances.count();
-        let separable = &self.current;
-        let components = separable.components();
-        let h = &mut self.hessian;
+        let widths = nuisances.widths();
+        (self.sources, self.parameters, self.width_count) = (n, p, widths);
+        let components = model.components();
+        let h = &mut self.information;
         h.resize(p * p, 0.0);
         let g = &mut self.gradient;
-        g.resize(p.max(g.len()), 0.0);
+        g.resize(p, 0.0);
         let runs = compressed.masked.runs();
         for i in 0..components {
-            let ai = separable.amplitude(i);
+            let ai = model.amplitude(i);
             for j in i..components {
-                let aj = separable.amplitude(j);
-                let mut c = separable.gram_block(i, j, &compressed.weights, &mut self.strip);
+                let aj = model.amplitude(j);
+                let mut c = model.gram_block(i, j, &compressed.weights, &mut scratch.strip);
                 if !runs.is_empty() {
-                    let taken = separable.gram_block_over_runs(i, j, runs, &mut self.strip);
+                    let taken = model.gram_block_over_runs(i, j, runs, &mut scratch.strip);
                     for k in 0..9 {
                         c[k] -= taken[k];
                     }
@@ -55,17 +91,16 @@ impl Fitter {
                 }
             }
         }
-        separable.transposed_jacobian_times(&self.residual, &mut self.strip, &mut g[..p]);
-        for (i, source) in separable.sources.iter().enumerate() {
+        model.transposed_jacobian_times(&at.residual, &mut scratch.strip, g);
+        for (i, source) in model.sources.iter().enumerate() {
             if let Some(power) = source.power {
                 h[(3 * i + 2) * (p + 1)] += power.precision;
                 g[3 * i + 2] += power.precision * (power.mean - source.a);
             }
         }
-        if let Some(profile_constraint) = &self.profile_constraint {
-            profile_constraint.add_normal_equations(&separable.sources, g, h, p);
+        if let Some(constraint) = problem.constraint {
+            constraint.add_normal_equations(&model.sources, g, h, p);
         }
-        let widths = nuisances.widths();
         let first_width = p - widths;
         for d in &mut self.width_derivatives[..widths] {
             d.clear();
@@ -73,33 +108,32 @@ impl Fitter {
         }
         // ∂/∂ln w of a source is w² f″ (the heat equation).
         for i in 0..if widths > 0 { n } else { 0 } {
-            let [ax, ay] = separable.width.map(|w| separable.sources[i].a * w * w);
-            separable.accumulate(i, 2, 0, ax, &mut self.width_derivatives[0]);
-            separable.accumulate(i, 0, 2, ay, &mut self.width_derivatives[(widths - 1).min(1)]);
+            let [ax, ay] = model.width.map(|w| model.sources[i].a * w * w);
+            model.accumulate(i, 2, 0, ax, &mut self.width_derivatives[0]);
+            model.accumulate(i, 0, 2, ay, &mut self.width_derivatives[(widths - 1).min(1)]);
             if widths > 2 {
-                separable.accumulate(i, 1, 1, separable.sources[i].a, &mut self.width_derivatives[2]);
+                model.accumulate(i, 1, 1, model.sources[i].a, &mut self.width_derivatives[2]);
             }
         }
+        scratch.vector.resize(p, 0.0);
         for w in 0..widths {
-            let weighted = &mut self.weighted_derivative;
+            let weighted = &mut scratch.matrix;
             weighted.clone_from(&self.width_derivatives[w]);
-            compressed.apply_weights(weighted, [&self.bx, &self.by], false, &mut self.scratch);
+            compressed.apply_weights(weighted, problem.bases.axes(), false, &mut scratch.profiles);
             let column = first_width + w;
-            let shared = &mut self.velocity;
-            shared.resize(p.max(shared.len()), 0.0);
-            separable.transposed_jacobian_times(weighted, &mut self.strip, shared);
+            let shared = &mut scratch.vector;
+            model.transposed_jacobian_times(weighted, &mut scratch.strip, shared);
             for i in 0..first_width {
                 h[i * p + column] = shared[i];
             }
             for v in 0..=w {
                 h[(first_width + v) * p + column] = dot(weighted, &self.width_derivatives[v]);
             }
-            g[first_width + w] = dot(&self.width_derivatives[w], &self.residual);
+            g[first_width + w] = dot(&self.width_derivatives[w], &at.residual);
         }
         for bad in compressed.masked.scattered() {
-            let row = &mut self.velocity;
-            row.resize(p.max(row.len()), 0.0);
-            separable.jacobian_row_at([bad.x, bad.y], row);
+            let row = &mut scratch.vector;
+            model.jacobian_row_at([bad.x, bad.y], row);
             for i in 0..first_width {
                 if row[i] != 0.0 {
                     let s = -row[i];

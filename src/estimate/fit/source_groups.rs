@@ -1,8 +1,11 @@
 //! Source grouping: groups that no longer move are subtracted from the frame, and only the active set is fitted on.
 
-use crate::estimate::fit::levenberg_marquardt::Fitter;
+use crate::estimate::fit::damped_step::Step;
+use crate::estimate::fit::normal_equations::NormalEquations;
+use crate::estimate::model::bases::Bases;
 use crate::estimate::model::compressed_frame::CompressedFrame;
-use crate::estimate::model::hypothesis::{Hypothesis, Nuisances, PointSource};
+use crate::estimate::model::hypothesis::{Hypothesis, Nuisances};
+use crate::estimate::model::separable_model::SeparableModel;
 
 /// A source is at rest when its squared step over the step's variance is below this.
 const AT_REST: f64 = 1e-2;
@@ -11,68 +14,102 @@ const MIN_SOURCES: usize = 4;
 /// Sources within this distance, σ, belong to one group.
 const GROUP_DISTANCE: f64 = 4.0;
 
-impl Hypothesis {
-    /// The sources in groups that can be fitted separately (single linkage); `None` where there is one group, or parameters are shared.
-    pub(crate) fn source_groups(&self) -> Option<Vec<Vec<usize>>> {
-        let n = self.sources.len();
-        if n < MIN_SOURCES || self.nuisances != Nuisances::default() || self.sources.iter().any(|s| s.power.is_some()) {
-            return None;
-        }
-        let is_linked = |i: usize, j: usize| {
-            let d = [0, 1].map(|k| self.sources[i].u[k] - self.sources[j].u[k]);
-            d[0].hypot(d[1]) < GROUP_DISTANCE
-        };
-        let mut groups: Vec<Vec<usize>> = Vec::new();
-        for i in 0..n {
-            let (linked, mut apart): (Vec<_>, Vec<_>) = groups
-                .into_iter()
-                .partition(|g: &Vec<usize>| g.iter().any(|&j| is_linked(i, j)));
-            let mut group = linked.concat();
-            group.push(i);
-            apart.push(group);
-            groups = apart;
-        }
-        (groups.len() > 1).then_some(groups)
+/// The sources in groups that can be fitted separately (single linkage); `None` where there is one group, or parameters are shared.
+pub(crate) fn source_groups(hypothesis: &Hypothesis) -> Option<Vec<Vec<usize>>> {
+    let sources = &hypothesis.sources;
+    if sources.len() < MIN_SOURCES
+        || hypothesis.nuisances != Nuisances::default()
+        || sources.iter().any(|s| s.power.is_some())
+    {
+        return None;
     }
+    let is_linked = |i: usize, j: usize| {
+        let d = [0, 1].map(|k| sources[i].u[k] - sources[j].u[k]);
+        d[0].hypot(d[1]) < GROUP_DISTANCE
+    };
+    let mut groups: Vec<Vec<usize>> = Vec::new();
+    for i in 0..sources.len() {
+        let (linked, mut apart): (Vec<_>, Vec<_>) = groups
+            .into_iter()
+            .partition(|g: &Vec<usize>| g.iter().any(|&j| is_linked(i, j)));
+        let mut group = linked.concat();
+        group.push(i);
+        apart.push(group);
+        groups = apart;
+    }
+    (groups.len() > 1).then_some(groups)
 }
 
-impl Fitter {
-    /// The sources of groups that the last step moved; `None` without a step, and where they are more than half of all.
-    pub(crate) fn active_set(&self, groups: &[Vec<usize>]) -> Option<Vec<usize>> {
-        let n = self.current.sources.len();
-        if self.velocity.len() != 3 * n {
-            return None;
-        }
-        let is_active = |i: usize| {
-            let along = |k: usize| self.hessian[(3 * i + k) * (3 * n + 1)] * self.velocity[3 * i + k].powi(2);
-            !(along(0) + along(1) < AT_REST)
-        };
-        let active: Vec<usize> = groups
-            .iter()
-            .filter(|g| g.iter().any(|&i| is_active(i)))
-            .flatten()
-            .copied()
-            .collect();
-        (!active.is_empty() && 2 * active.len() <= n).then_some(active)
-    }
+/// The sources of groups that a step moved; `None` where that is none, and where they are more than half of all. Only without nuisances.
+pub(crate) fn active_set(groups: &[Vec<usize>], step: &Step, equations: &NormalEquations) -> Option<Vec<usize>> {
+    let (n, p) = (equations.sources, equations.parameters);
+    let is_active = |i: usize| {
+        let along = |k: usize| equations.information[(3 * i + k) * (p + 1)] * step.velocity[3 * i + k].powi(2);
+        !(along(0) + along(1) < AT_REST)
+    };
+    let active: Vec<usize> = groups
+        .iter()
+        .filter(|g| g.iter().any(|&i| is_active(i)))
+        .flatten()
+        .copied()
+        .collect();
+    (!active.is_empty() && 2 * active.len() <= n).then_some(active)
+}
 
-    /// `compressed` less all sources of the current model but those at `kept`.
-    pub(crate) fn restrict_frame(&self, compressed: &CompressedFrame, kept: &[usize]) -> CompressedFrame {
-        let mut subset = compressed.clone();
-        for i in (0..self.current.sources.len()).filter(|i| !kept.contains(i)) {
-            let amplitude = self.current.amplitude(i);
-            self.current.accumulate(i, 0, 0, -amplitude, &mut subset.coefficients);
-        }
-        subset.update_weighted([&self.bx, &self.by]);
-        subset
+/// `compressed` less all sources of a model but those at `kept`.
+pub(crate) fn restrict_frame(
+    compressed: &CompressedFrame,
+    bases: &Bases,
+    model: &SeparableModel,
+    kept: &[usize],
+) -> CompressedFrame {
+    let mut subset = compressed.clone();
+    for i in (0..model.sources.len()).filter(|i| !kept.contains(i)) {
+        model.accumulate(i, 0, 0, -model.amplitude(i), &mut subset.coefficients);
     }
+    subset.update_weighted(bases.axes());
+    subset
 }
 
 /// The sources of `hypothesis` at `kept`.
 pub(crate) fn restrict_hypothesis(hypothesis: &Hypothesis, kept: &[usize]) -> Hypothesis {
-    let sources: Vec<PointSource> = kept.iter().map(|&i| hypothesis.sources[i]).collect();
     Hypothesis {
-        sources,
+        sources: kept.iter().map(|&i| hypothesis.sources[i]).collect(),
         ..hypothesis.clone()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::estimate::model::hypothesis::PointSource;
+
+    #[test]
+    fn chains_of_close_sources_are_groups_and_only_the_moving_ones_are_active() {
+        let mut hypothesis = Hypothesis::empty(Nuisances::default());
+        // 0, 2 and 3 are a chain 3 σ apart; 1 and 4 stand alone.
+        let at = [[0.0, 0.0], [20.0, 0.0], [3.0, 0.0], [3.0, 3.0], [-20.0, 5.0]];
+        hypothesis.sources = at.map(|u| PointSource::new(u, 100.0)).to_vec();
+        let mut groups = source_groups(&hypothesis).expect("several groups");
+        for group in &mut groups {
+            group.sort_unstable();
+        }
+        groups.sort();
+        assert_eq!(groups, [vec![0, 2, 3], vec![1], vec![4]]);
+        let information = (0..225).map(|k| if k % 16 == 0 { 100.0 } else { 0.0 });
+        let equations = NormalEquations::of_sources(information.collect());
+        let mut step = Step {
+            velocity: vec![1e-3; 15],
+            ..Step::default()
+        };
+        assert_eq!(active_set(&groups, &step, &equations), None, "all are at rest");
+        // A tenth of a standard deviation along y.
+        step.velocity[3 * 4 + 1] = 1.1e-2;
+        assert_eq!(active_set(&groups, &step, &equations), Some(vec![4]));
+        step.velocity[3 * 2] = 1.1e-2;
+        assert_eq!(active_set(&groups, &step, &equations), None, "more than half move");
+        hypothesis.sources[0].u = [0.0, -20.0];
+        hypothesis.nuisances.background = true;
+        assert_eq!(source_groups(&hypothesis), None, "a background is shared");
     }
 }

@@ -1,9 +1,8 @@
-//! The computation budget of a frame: multiplications, which are reproducible, and a deadline where one is set.
+//! The computation budget of a frame: multiplications, which are reproducible, and the caller's test of whether time is up.
 
-use std::time::Instant;
-
-use crate::estimate::fit::levenberg_marquardt::Fitter;
+use crate::estimate::model::bases::Bases;
 use crate::estimate::model::compressed_frame::CompressedFrame;
+use crate::estimate::model::separable_model::SeparableModel;
 
 /// Multiplications allowed a frame of a few sources: reproducible, unlike a clock.
 const MAX_WORK: f64 = 1e8;
@@ -11,68 +10,135 @@ const MAX_WORK: f64 = 1e8;
 const MANY_SOURCES: f64 = 8.0;
 const MAX_WORK_FACTOR: f64 = 5.0;
 /// A fit in progress is aborted at this multiple of the allowance.
-pub(crate) const OVERRUN: f64 = 1.2;
+const OVERRUN: f64 = 1.2;
 
-impl Fitter {
-    /// Starts a new frame's budget.
-    pub fn reset(&mut self, deadline: Option<Instant>) {
-        self.work = 0.0;
-        self.work_limit = f64::INFINITY;
-        self.max_components = 0.0;
-        self.steps = 0;
-        self.deadline = deadline;
+/// What a frame has cost and what it may cost.
+pub(crate) struct WorkBudget<'a> {
+    /// Multiplications spent.
+    spent: f64,
+    /// Limit of the work, whatever the hypotheses.
+    limit: f64,
+    /// Components of the largest hypothesis.
+    max_components: f64,
+    /// Steps of fits taken.
+    pub steps: u64,
+    is_over: &'a dyn Fn() -> bool,
+}
+
+impl<'a> WorkBudget<'a> {
+    /// A new frame's budget; `is_over` says whether its time is up.
+    pub fn new(is_over: &'a dyn Fn() -> bool) -> Self {
+        Self {
+            spent: 0.0,
+            limit: f64::INFINITY,
+            max_components: 0.0,
+            steps: 0,
+            is_over,
+        }
+    }
+
+    pub fn charge(&mut self, multiplications: f64) {
+        self.spent += multiplications;
+    }
+
+    /// Charges one step of a fit of `components` components.
+    pub fn charge_step(&mut self, components: usize, multiplications: f64) {
+        self.max_components = self.max_components.max(components as f64);
+        self.spent += multiplications;
+        self.steps += 1;
     }
 
     /// Leaves at least this share of the allowance for what follows.
-    pub fn reserve_work(&mut self, share: f64) {
-        self.work = self.work.min((1.0 - share) * self.max_work());
+    pub fn reserve(&mut self, share: f64) {
+        self.spent = self.spent.min((1.0 - share) * self.allowance());
     }
 
-    /// Limits what follows to this share of `MAX_WORK`. Returns the limit before, for [`Fitter::restore_work_limit`].
-    pub fn limit_work(&mut self, share: f64) -> f64 {
-        let within = self.work_limit.min(self.work + share * MAX_WORK);
-        std::mem::replace(&mut self.work_limit, within)
+    /// Limits what follows to this share of `MAX_WORK`. Returns the limit before, for [`WorkBudget::restore_limit`].
+    pub fn limit(&mut self, share: f64) -> f64 {
+        let within = self.limit.min(self.spent + share * MAX_WORK);
+        std::mem::replace(&mut self.limit, within)
     }
 
-    pub fn restore_work_limit(&mut self, limit: f64) {
-        self.work_limit = limit;
+    pub fn restore_limit(&mut self, limit: f64) {
+        self.limit = limit;
     }
 
-    pub(crate) fn max_work(&self) -> f64 {
-        (MAX_WORK * (self.max_components / MANY_SOURCES).clamp(1.0, MAX_WORK_FACTOR).powi(2)).min(self.work_limit)
+    fn allowance(&self) -> f64 {
+        (MAX_WORK * (self.max_components / MANY_SOURCES).clamp(1.0, MAX_WORK_FACTOR).powi(2)).min(self.limit)
     }
 
-    /// Whether the frame's work is spent, or its deadline has passed.
+    /// Whether the frame's work is spent, or its time is up.
     pub fn is_exhausted(&self) -> bool {
-        self.work > self.max_work() || self.deadline.is_some_and(|d| Instant::now() >= d)
+        self.spent > self.allowance() || (self.is_over)()
     }
 
-    /// Multiplications of one step.
-    pub(crate) fn step_cost(&self, compressed: &CompressedFrame) -> f64 {
-        let components = self.current.components() as f64;
-        let parameters = 3.0 * components;
-        let masked = &compressed.masked;
-        let runs = match masked.runs().len() {
-            0 => 0.0,
-            n => components * components * (4 * self.bx.n + 16 * n) as f64,
+    /// Whether even a fit in progress has to end.
+    pub fn is_overrun(&self) -> bool {
+        self.spent > OVERRUN * self.allowance()
+    }
+}
+
+/// Multiplications of one step of a fit.
+pub(crate) fn step_cost(bases: &Bases, compressed: &CompressedFrame, model: &SeparableModel) -> f64 {
+    let components = model.components() as f64;
+    let parameters = 3.0 * components;
+    let masked = &compressed.masked;
+    let runs = match masked.runs().len() {
+        0 => 0.0,
+        n => components * components * (4 * bases.x.n + 16 * n) as f64,
+    };
+    let scattered = masked.scattered().len() as f64 * (2.0 * parameters + 0.5 * parameters * parameters);
+    let unusable = runs + scattered + 2.0 * masked.project_out_cost(compressed.mx, compressed.my);
+    let pairs = if compressed.weights.is_empty() {
+        0.0
+    } else {
+        3.0 * components
+    };
+    let terms = model.terms_per_source();
+    let smears = if terms > 1.0 {
+        8.0 * (terms * components).powi(2) * (compressed.mx + compressed.my) as f64
+    } else {
+        0.0
+    };
+    unusable
+        + smears
+        + (9.0 + pairs) * model.footprint()
+        + 40.0 * components * (compressed.mx + compressed.my) as f64
+        + 9.0 * components.powi(3)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn work_ends_a_frame_and_a_limit_ends_a_part_of_it() {
+        let mut budget = WorkBudget::new(&|| false);
+        budget.charge(0.5 * MAX_WORK);
+        assert!(!budget.is_exhausted());
+        let before = budget.limit(0.1);
+        budget.charge(0.11 * MAX_WORK);
+        assert!(budget.is_exhausted() && !budget.is_overrun(), "a tenth is spent");
+        budget.restore_limit(before);
+        assert!(!budget.is_exhausted());
+        budget.charge(0.5 * MAX_WORK);
+        assert!(budget.is_exhausted());
+        budget.charge_step(16, 0.0);
+        assert!(!budget.is_exhausted(), "twice the sources may cost four times as much");
+        budget.charge(4.0 * MAX_WORK);
+        assert!(budget.is_overrun());
+        budget.reserve(0.25);
+        assert!(!budget.is_exhausted(), "a quarter is left");
+    }
+
+    #[test]
+    fn time_ends_a_frame_whatever_it_has_cost() {
+        let calls = std::cell::Cell::new(0);
+        let is_over = || {
+            calls.set(calls.get() + 1);
+            calls.get() > 2
         };
-        let scattered = masked.scattered().len() as f64 * (2.0 * parameters + 0.5 * parameters * parameters);
-        let unusable = runs + scattered + 2.0 * masked.project_out_cost(compressed.mx, compressed.my);
-        let pairs = if compressed.weights.is_empty() {
-            0.0
-        } else {
-            3.0 * components
-        };
-        let terms = self.current.terms_per_source();
-        let smears = if terms > 1.0 {
-            8.0 * (terms * components).powi(2) * (compressed.mx + compressed.my) as f64
-        } else {
-            0.0
-        };
-        unusable
-            + smears
-            + (9.0 + pairs) * self.current.footprint()
-            + 40.0 * components * (compressed.mx + compressed.my) as f64
-            + 9.0 * components.powi(3)
+        let budget = WorkBudget::new(&is_over);
+        assert!(!budget.is_exhausted() && !budget.is_exhausted() && budget.is_exhausted());
     }
 }

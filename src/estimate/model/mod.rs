@@ -1,5 +1,6 @@
 //! What a hypothesis predicts: the PSF on one axis, its compressed basis, and sums of separable terms.
 
+pub mod bases;
 pub mod compressed_frame;
 pub mod hypothesis;
 pub mod psf_table;

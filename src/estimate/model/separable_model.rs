@@ -3,10 +3,10 @@
 //! A source whose PSF is aligned with the axes is one term. A rotated ellipse is no product of profiles: it is an aligned PSF smeared
 //! along a diagonal, which Gauss–Hermite quadrature (Abramowitz and Stegun, 1964, 25.4.46) turns into a sum of five.
 
+use crate::estimate::model::bases::Bases;
 use crate::estimate::model::compressed_frame::CompressedFrame;
 use crate::estimate::model::hypothesis::{Nuisances, PointSource};
 use crate::estimate::model::separable_terms::SeparableTerms;
-use crate::estimate::model::svd_basis::Basis;
 use crate::estimate::preprocess::masked_pixels::Run;
 
 /// Nodes in σ of the smear, and weights; exact for the first nine moments.
@@ -33,15 +33,6 @@ pub(crate) struct SeparableModel {
     pub covariance_xy: f64,
     components: usize,
     terms: SeparableTerms,
-}
-
-/// Constant and sloped profiles along one axis, of about a source's norm, so that the normal equations are well scaled.
-pub(crate) fn background(b: &Basis) -> [Vec<f64>; 2] {
-    let (half, norm) = (0.5 * b.n as f64, (b.n as f64).sqrt());
-    let mut pair = [vec![0.0; b.stride], vec![0.0; b.stride]];
-    b.compress((0..b.n).map(|_| 1.0 / norm), &mut pair[0]);
-    b.compress((0..b.n).map(|k| (k as f64 + 0.5 - half) / half / norm), &mut pair[1]);
-    pair
 }
 
 impl SeparableModel {
@@ -72,14 +63,9 @@ impl SeparableModel {
 
     /// Evaluates all terms for the present sources, widths and background.
     #[inline(always)]
-    pub fn place(
-        &mut self,
-        axes: [&Basis; 2],
-        backgrounds: [&[Vec<f64>; 2]; 2],
-        compressed: &CompressedFrame,
-        nuisances: Nuisances,
-        scratch: &mut [f64],
-    ) {
+    pub fn place(&mut self, bases: &Bases, compressed: &CompressedFrame, nuisances: Nuisances, scratch: &mut Vec<f64>) {
+        let axes = bases.axes();
+        scratch.resize(scratch.len().max(3 * bases.x.n.max(bases.y.n)), 0.0);
         let n = self.sources.len();
         let quadrature = self.quadrature(0);
         self.components = n + nuisances.background_terms();
@@ -96,7 +82,7 @@ impl SeparableModel {
         for b in 0..nuisances.background_terms() {
             let kinds = [usize::from(b == 1), usize::from(b == 2)];
             self.terms
-                .push_profiles([0, 1].map(|k| backgrounds[k][kinds[k]].as_slice()));
+                .push_profiles([0, 1].map(|k| bases.backgrounds[k][kinds[k]].as_slice()));
         }
         self.terms.evaluate_lines(axes, &compressed.masked.lines);
     }

@@ -1,8 +1,18 @@
 //! The number of emitters: hypotheses are proposed, fitted and compared.
 
+pub mod candidate;
+pub mod criterion;
+pub mod evidence;
+pub mod initialise;
 pub mod map_search;
+pub mod maximum_likelihood;
+pub mod nuisance_proposals;
 pub mod nuisance_selection;
 pub mod power_prior;
 pub mod proposals;
+#[cfg(test)]
+mod proposals_test;
+pub mod pruning;
+pub mod refine;
 pub mod reweighting;
 pub mod search;

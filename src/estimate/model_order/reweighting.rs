@@ -1,10 +1,14 @@
 //! Heteroscedastic reweighting: noise that grows with the light (shot noise, gain scatter) is estimated from a fit's residual, every
 //! pixel is weighted by its inverse variance, and the hypothesis is refitted.
 
+use crate::estimate::fit::context::FitContext;
+use crate::estimate::fit::levenberg_marquardt::evaluate;
+use crate::estimate::fit::work_budget::WorkBudget;
 use crate::estimate::model::compressed_frame::CompressedFrame;
 use crate::estimate::model::hypothesis::Hypothesis;
 use crate::estimate::model::svd_basis::Basis;
-use crate::estimate::model_order::search::Search;
+use crate::estimate::model_order::maximum_likelihood::refit_reweighted;
+use crate::estimate::model_order::search::SearchSpace;
 use crate::estimate::preprocess::noise_variance::VarianceFunction;
 use crate::estimate::preprocess::screening::PreprocessedFrame;
 use crate::estimate::rules::Rules;
@@ -17,7 +21,7 @@ const ROUNDS: usize = 3;
 
 /// A search in the pixel bases, where each pixel has a weight.
 pub(crate) struct Reweighting {
-    pub search: Search,
+    pub space: SearchSpace,
     pub compressed: CompressedFrame,
 }
 
@@ -25,7 +29,7 @@ impl Reweighting {
     pub fn new(camera: &Camera, rules: Rules) -> Self {
         let basis = |axis| Basis::pixels(axis, camera.spot_sigma_m);
         Self {
-            search: Search::new([&camera.x, &camera.y].map(basis), rules),
+            space: SearchSpace::new([&camera.x, &camera.y].map(basis), rules),
             compressed: CompressedFrame::default(),
         }
     }
@@ -37,50 +41,53 @@ impl Reweighting {
         frame: &PreprocessedFrame,
         variance: Option<VarianceFunction>,
         hypothesis: &mut Hypothesis,
+        budget: &mut WorkBudget,
     ) -> bool {
-        let Self { search, compressed } = self;
-        let nx = search.fitter.bx.n;
-        compressed.load(frame, &search.fitter.bx, &search.fitter.by);
+        let Self { space, compressed } = self;
+        compressed.load(frame, &space.bases.x, &space.bases.y);
         let mut next = hypothesis.clone();
-        let residual = search.fitter.weighted_residual(compressed, &mut next).to_vec();
+        let mut search = space.search(compressed, frame, budget);
+        let (residual, mut signal) = predict(&mut search.context, &mut next);
         let even = search.score(&next);
-        let signal = search.fitter.expected_light(compressed, &mut next);
-        let mut variance = variance.unwrap_or_else(|| {
-            VarianceFunction::fit(
-                frame,
-                [compressed.rank[0], compressed.mx],
-                &residual,
-                &signal,
-                next.sources.len(),
-            )
-        });
+        let sources = next.sources.len();
+        let mut variance = variance.unwrap_or_else(|| fit_variance(frame, compressed, &residual, &signal, sources));
         if variance.is_constant() {
             return false;
         }
-        let mut signal = signal;
         for _ in 0..PASSES {
-            let mx = compressed.mx;
+            let (nx, mx) = (space.bases.x.n, compressed.mx);
             let at = |k: usize| k / nx * mx + k % nx;
-            let fitter = &search.fitter;
-            compressed.set_weights(frame, [&fitter.bx, &fitter.by], |k| variance.at(signal[at(k)]));
-            search.refit_reweighted(compressed, &mut next, ROUNDS);
-            signal = search.fitter.expected_light(compressed, &mut next);
-            let mut residual = search.fitter.weighted_residual(compressed, &mut next).to_vec();
+            compressed.set_weights(frame, space.bases.axes(), |k| variance.at(signal[at(k)]));
+            let mut search = space.search(compressed, frame, budget);
+            next = refit_reweighted(&mut search, next, ROUNDS);
+            let (mut residual, light) = predict(&mut search.context, &mut next);
             for (r, w) in residual.iter_mut().zip(&compressed.weights) {
                 *r /= w.max(1e-300);
             }
-            variance = VarianceFunction::fit(
-                frame,
-                [compressed.rank[0], compressed.mx],
-                &residual,
-                &signal,
-                next.sources.len(),
-            );
+            variance = fit_variance(frame, compressed, &residual, &light, next.sources.len());
+            signal = light;
         }
-        let is_better = search.score(&next) + compressed.log_det + VarianceFunction::PENALTY < even;
+        let score = space.search(compressed, frame, budget).score(&next);
+        let is_better = score + compressed.log_det + VarianceFunction::PENALTY < even;
         if is_better {
             *hypothesis = next;
         }
         is_better
     }
+}
+
+/// The weighted residual of `hypothesis` and the light that it predicts, (my, mx).
+fn predict(context: &mut FitContext, hypothesis: &mut Hypothesis) -> (Vec<f64>, Vec<f64>) {
+    let at = evaluate(context, hypothesis);
+    (at.residual.clone(), at.expected_light())
+}
+
+fn fit_variance(
+    frame: &PreprocessedFrame,
+    compressed: &CompressedFrame,
+    residual: &[f64],
+    signal: &[f64],
+    sources: usize,
+) -> VarianceFunction {
+    VarianceFunction::fit(frame, [compressed.rank[0], compressed.mx], residual, signal, sources)
 }

@@ -1,416 +1,195 @@
-//! The search for the number of emitters: hypotheses are fitted jointly and compared by a penalised likelihood.
+//! A frame under search: what hypotheses are fitted to, compared by and proposed from, and the step that every proposal ends in: fit,
+//! compare, accept.
 
-use std::time::Instant;
-
-use crate::estimate::detect::matched_filter::MatchedFilter;
-use crate::estimate::detect::matrix_pencil::{MatrixPencil, PencilSampler};
-use crate::estimate::fit::levenberg_marquardt::Fitter;
+use crate::estimate::detect::matched_filter::{MatchedFilter, Peak};
+use crate::estimate::detect::matrix_pencil::PencilSampler;
+use crate::estimate::fit::context::FitContext;
+use crate::estimate::fit::levenberg_marquardt::{fit, fit_below};
+use crate::estimate::fit::work_budget::WorkBudget;
+use crate::estimate::fit::workspace::Workspace;
+use crate::estimate::model::bases::Bases;
 use crate::estimate::model::compressed_frame::CompressedFrame;
-use crate::estimate::model::hypothesis::{Hypothesis, Nuisances, PointSource, Width};
+use crate::estimate::model::hypothesis::Hypothesis;
 use crate::estimate::model::svd_basis::Basis;
-use crate::estimate::model_order::nuisance_selection::{BACKGROUND_AND_WIDTH, has_paired_sources};
+use crate::estimate::model_order::candidate::Candidate;
+use crate::estimate::model_order::criterion::{Criterion, source_penalty};
+use crate::estimate::model_order::evidence::fit_with_prior;
 use crate::estimate::model_order::power_prior::PowerPrior;
-use crate::estimate::model_order::proposals::CovarianceCache;
 use crate::estimate::preprocess::noise_variance::VarianceFunction;
 use crate::estimate::preprocess::screening::PreprocessedFrame;
 use crate::estimate::rules::Rules;
 
 /// Steps of a candidate's fit before it is compared.
 pub(crate) const TRIAL_STEPS: usize = 30;
-/// Extra emitters accepted before testing a background or width.
-const ACCEPTED_EXTRA: usize = 2;
-/// Steps of a fit from the pencil's positions.
-const PENCIL_FIT_STEPS: usize = 100;
-/// Rounds of proposals, and rounds before nuisances are tried.
-pub(crate) const ROUNDS: usize = 8;
-pub(crate) const EARLY_ROUNDS: usize = 3;
-/// Misfit in standard deviations from which nuisances are tried.
-const MISFIT_DEVIATIONS: f64 = 5.0;
-/// Slack on the acceptance bound for the unknown evidence term.
-const ACCEPTANCE_SLACK: f64 = 30.0;
-/// Overlapping sources above this number are first tested for nuisances.
-const MAX_CLUSTER: usize = 10;
+/// Steps of the last fit before a hypothesis is reported.
+const CONVERGE_STEPS: usize = 200;
+/// Least distance of two residual peaks of one round, σ.
+const PEAK_DISTANCE: f64 = 2.5;
+/// A source is first assigned to a user unless −2 ln probability rises by more than this.
+pub(crate) const ASSIGNMENT_SLACK: f64 = 60.0;
 /// Largest masked fraction for which the matrix pencil and rotated ellipses are used: the pencil sees the fill values.
 const MAX_MASKED_SHARE: f64 = 0.03;
-/// Least decrease of the deviance for a nuisance parameter.
-pub(crate) const NUISANCE_PENALTY: f64 = 5.0;
 
-/// The search for the number of sources in one pair of bases.
-pub(crate) struct Search {
-    pub fitter: Fitter,
+/// What searches of one frame after another share: the bases, the detectors made for them, scratch memory.
+pub(crate) struct SearchSpace {
+    pub bases: Bases,
     pub matched_filter: MatchedFilter,
     /// The matrix pencil, where spots are wide enough against the sensor.
-    pub(crate) pencil: Option<PencilSampler>,
+    pencil: Option<PencilSampler>,
     /// Least decrease of the deviance for a source.
     pub source_penalty: f64,
-    /// Noise variance weighted by the frame's light: multiplies all penalties.
-    pub noise_inflation: f64,
-    /// The variance function, where noise that grows with the light explains a frame better than more sources.
-    pub suspected_variance: Option<VarianceFunction>,
-    /// The prior of energies, for the maximum a posteriori.
-    pub prior: Option<PowerPrior>,
-    pub(crate) residual: Vec<f64>,
-    pub(crate) covariance_cache: CovarianceCache,
+    pub rules: Rules,
+    pub workspace: Workspace,
 }
 
-impl Search {
+impl SearchSpace {
     pub fn new([bx, by]: [Basis; 2], rules: Rules) -> Self {
         let pencil = PencilSampler::new(&bx, &by);
-        Self::with(pencil, bx, by, rules)
+        Self::with(pencil, [bx, by], rules)
     }
 
-    /// For a first try by the pencil where [`Search::new`] begins with residual peaks.
+    /// For a first try by the pencil where [`SearchSpace::new`] begins with residual peaks.
     pub fn for_pencil_start([bx, by]: [Basis; 2], rules: Rules) -> Option<Self> {
         let pencil = PencilSampler::for_pencil_start(&bx, &by)?;
-        Some(Self::with(Some(pencil), bx, by, rules))
+        Some(Self::with(Some(pencil), [bx, by], rules))
     }
 
-    fn with(pencil: Option<PencilSampler>, bx: Basis, by: Basis, rules: Rules) -> Self {
-        let fitter = Fitter::new(bx, by, rules);
-        let matched_filter = MatchedFilter::new(&fitter.bx, &fitter.by);
-        let area = |b: &Basis| b.edges[b.n] - b.edges[0];
-        // The matched filter has about area/σ² independent positions; the penalty keeps the probability that any of
-        // them exceeds it in an empty frame below 1e-3.
-        let source_penalty = (10.0 + 2.0 * (area(&fitter.bx) * area(&fitter.by)).ln()).max(14.0);
+    fn with(pencil: Option<PencilSampler>, bases: [Basis; 2], rules: Rules) -> Self {
+        let bases = Bases::new(bases);
         Self {
-            fitter,
-            matched_filter,
+            matched_filter: MatchedFilter::new(&bases.x, &bases.y),
             pencil,
-            source_penalty,
-            noise_inflation: 1.0,
-            suspected_variance: None,
-            prior: None,
-            residual: Vec::new(),
-            covariance_cache: CovarianceCache::default(),
+            source_penalty: source_penalty(&bases),
+            rules,
+            workspace: Workspace::default(),
+            bases,
         }
     }
 
-    /// Starts a new frame.
-    pub fn reset(&mut self, deadline: Option<Instant>) {
-        self.fitter.reset(deadline);
-        self.noise_inflation = 1.0;
-        self.suspected_variance = None;
-        self.covariance_cache = CovarianceCache::default();
-    }
-
-    pub(crate) fn rules(&self) -> Rules {
-        self.fitter.rules
-    }
-
-    /// Whether the frame's budget of work or time is spent.
-    pub fn is_exhausted(&self) -> bool {
-        self.fitter.is_exhausted()
-    }
-
-    /// Deviance below which `next` scores better than `best`.
-    pub(crate) fn acceptance_threshold(&self, best: &Hypothesis, next: &Hypothesis) -> f64 {
-        let penalty = match &self.prior {
-            None => self.penalty(next),
-            // The evidence term is known only after the fit: one more source of a known power may even lower it.
-            Some(_) if best.sources.is_empty() => return f64::INFINITY,
-            Some(_) => {
-                best.log_evidence_term * (next.sources.len() as f64 / best.sources.len() as f64).min(1.0)
-                    - ACCEPTANCE_SLACK
-            }
-        };
-        self.score(best) - penalty
-    }
-
-    /// The criterion: −2 ln likelihood plus the penalties of sources and nuisances; with a power prior, −2 ln of the posterior
-    /// probability.
-    pub fn score(&self, hypothesis: &Hypothesis) -> f64 {
-        hypothesis.deviance + hypothesis.prior_penalty() + self.penalty(hypothesis)
-    }
-
-    fn penalty(&self, hypothesis: &Hypothesis) -> f64 {
-        if self.prior.is_some() {
-            return self.noise_inflation * hypothesis.log_evidence_term;
-        }
-        let nuisances = NUISANCE_PENALTY * hypothesis.nuisances.count() as f64;
-        // A pair explains one elliptical spot too, and is likelier than an elliptical PSF: an ellipse costs a source more.
-        let penalised = hypothesis.sources.len() + usize::from(hypothesis.nuisances.width == Width::RotatedEllipse);
-        self.noise_inflation * (self.source_penalty * penalised as f64 + nuisances)
-    }
-
-    /// Maximum likelihood with the number of emitters unknown. Nuisances are fitted only where the frame cannot be
-    /// explained without, and then within every hypothesis.
-    pub fn maximum_likelihood(
-        &mut self,
-        compressed: &CompressedFrame,
-        frame: &PreprocessedFrame,
-        initial: Hypothesis,
-    ) -> Hypothesis {
-        self.noise_inflation = compressed.light_weighted_variance;
-        let plain = initial.nuisances;
-        let first = initial.clone();
-        let mut hypothesis = if self.pencil.is_some() {
-            initial
-        } else {
-            self.add_residual_peaks(compressed, frame, initial)
-        };
-        if self.suspected_variance.is_some() {
-            return hypothesis;
-        }
-        let mut is_settled = compressed.is_explained_by(&hypothesis);
-        if is_settled {
-            self.refine(compressed, &mut hypothesis, ROUNDS);
-        } else {
-            self.reinitialise(compressed, &mut hypothesis);
-        }
-        let is_far = compressed.misfit(&hypothesis) > 1.0 + MISFIT_DEVIATIONS * (2.0 / compressed.data_count).sqrt();
-        if is_far
-            || hypothesis.nuisances != plain
-            || self.has_unequal_energies(&hypothesis) && self.nuisances_can_replace_sources(compressed, &hypothesis)
-        {
-            if self.rules().select_nuisances {
-                self.select_nuisances(compressed, frame, &mut hypothesis);
-            }
-            is_settled = false;
-        }
-        // An elliptical PSF takes several sources for one emitter.
-        let may_be_turned = match self.pencil {
-            None => has_paired_sources(&hypothesis),
-            Some(_) => {
-                !is_settled
-                    && self.has_unequal_energies(&hypothesis)
-                    && 3 * hypothesis.sources.len() > 4 * first.sources.len()
-            }
-        };
-        let is_unexplained = !is_settled && !compressed.is_explained_by(&hypothesis);
-        if self.rules().rotated_ellipse && (may_be_turned || is_unexplained) {
-            self.try_rotated_ellipse(compressed, frame, first, &mut hypothesis);
-            is_settled = false;
-        }
-        if !is_settled {
-            self.fitter.reserve_work(0.3);
-            self.refine(compressed, &mut hypothesis, ROUNDS);
-        }
-        self.drop_nuisances(compressed, &mut hypothesis);
-        if self.rules().prune_spurious && !compressed.is_explained_by(&hypothesis) {
-            self.prune_spurious(compressed, frame, &mut hypothesis);
-        }
-        self.converge(compressed, &mut hypothesis);
-        hypothesis
-    }
-
-    /// Escapes a local minimum: frees nuisances, refits, removes them, then applies proposals. A result with more than one further source
-    /// is discarded. Where only the fit with nuisances explains the frame, they stay.
-    fn reinitialise(&mut self, compressed: &CompressedFrame, hypothesis: &mut Hypothesis) {
-        let first = hypothesis.clone();
-        let mut wide = None;
-        if self.rules().free_nuisances && self.pencil.is_some() {
-            let mut free = first.clone();
-            free.nuisances = BACKGROUND_AND_WIDTH;
-            self.fitter.fit(compressed, &mut free, TRIAL_STEPS);
-            wide = Some(free.clone()).filter(|w| compressed.is_explained_by(w));
-            free.restrict_nuisances(first.nuisances);
-            self.fitter.fit(compressed, &mut free, TRIAL_STEPS);
-            if self.score(&free) < self.score(hypothesis) {
-                *hypothesis = free;
-            }
-        }
-        if !compressed.is_explained_by(hypothesis) && first.sources.len() <= MAX_CLUSTER {
-            self.refine(compressed, hypothesis, EARLY_ROUNDS);
-        }
-        if hypothesis.sources.len() > first.sources.len() + 1 {
-            *hypothesis = first;
-        }
-        if let Some(mut wide) = wide.filter(|_| !compressed.is_explained_by(hypothesis)) {
-            self.refine(compressed, &mut wide, EARLY_ROUNDS);
-            if !self.has_unequal_energies(&wide) && self.score(&wide) < self.score(hypothesis) {
-                *hypothesis = wide;
-            }
-        }
-    }
-
-    /// The initial hypothesis: the pencil's sources, or the residual peaks of one round, with a background where one is visible. Good
-    /// enough to find isolated outliers in the residual.
-    pub fn initial_hypothesis(&mut self, compressed: &CompressedFrame, frame: &PreprocessedFrame) -> Hypothesis {
-        self.noise_inflation = compressed.light_weighted_variance;
-        if self.pencil.is_some() {
-            return self.initialise(compressed, frame, Nuisances::default(), PENCIL_FIT_STEPS);
-        }
-        let mut hypothesis = Hypothesis::empty(Nuisances {
-            background: self.has_visible_background(frame),
-            width: Width::Known,
-        });
-        let peaks = self.residual_peaks(compressed, &mut hypothesis);
-        let least = peaks.first().map_or(0.0, |p| 0.1 * p.significance);
-        let sources = peaks
-            .iter()
-            .take_while(|p| p.significance >= least)
-            .take(compressed.max_sources());
-        hypothesis.sources = sources.map(|p| PointSource::new(p.u, p.a)).collect();
-        self.fitter.fit(compressed, &mut hypothesis, TRIAL_STEPS);
-        hypothesis
-    }
-
-    /// Adds peaks of the residual to `hypothesis` until none is significant, refitting all emitters each time.
-    pub fn add_residual_peaks(
-        &mut self,
-        compressed: &CompressedFrame,
-        frame: &PreprocessedFrame,
-        mut hypothesis: Hypothesis,
-    ) -> Hypothesis {
-        while hypothesis.sources.len() < compressed.max_sources()
-            && (hypothesis.sources.is_empty() || !compressed.is_explained_by(&hypothesis))
-        {
-            let room = compressed.max_sources() - hypothesis.sources.len();
-            let mut next = hypothesis.clone();
-            let peaks = self.residual_peaks(compressed, &mut hypothesis);
-            let least = peaks.first().map_or(0.0, |p| 0.1 * p.significance);
-            let strong = peaks.iter().take_while(|p| p.significance >= least).take(room);
-            next.sources.extend(strong.map(|p| PointSource::new(p.u, p.a)));
-            if next.sources.len() == hypothesis.sources.len() {
-                break;
-            }
-            self.fitter.fit(compressed, &mut next, TRIAL_STEPS);
-            // Apparent sources may be a background or another width: the better score decides.
-            if !compressed.is_explained_by(&next) || next.sources.len() > hypothesis.sources.len() + ACCEPTED_EXTRA {
-                let wider = self.with_more_nuisances(compressed, &hypothesis, &next);
-                if let Some(wider) = wider.filter(|w| self.score(w) < self.score(&next)) {
-                    next = wider;
-                }
-            }
-            if !compressed.is_explained_by(&next) {
-                self.suspected_variance = self.test_variance_growth(compressed, frame, &mut hypothesis, &next);
-            }
-            if self.suspected_variance.is_some() || self.score(&next) > self.score(&hypothesis) {
-                break;
-            }
-            hypothesis = next;
-            if self.is_exhausted() {
-                break;
-            }
-        }
-        hypothesis
-    }
-
-    pub(crate) fn is_heavily_masked(&self, compressed: &CompressedFrame) -> bool {
-        compressed.masked.len() as f64 > MAX_MASKED_SHARE * (self.fitter.bx.n * self.fitter.by.n) as f64
-    }
-
-    /// Fits the pencil's positions for rising numbers of sources until the frame is explained.
-    fn initialise_by_pencil(
-        &mut self,
-        compressed: &CompressedFrame,
-        nuisances: Nuisances,
-        polish: usize,
-    ) -> Option<Hypothesis> {
-        if self.is_heavily_masked(compressed) {
-            return None;
-        }
-        let pencil = self
-            .pencil
-            .as_mut()?
-            .analyse(compressed, &self.fitter.bx, &self.fitter.by)?;
-        let sure = pencil.singular_value_ratio.iter().take_while(|&&s| s > 4.0).count();
-        let likely = pencil.singular_value_ratio.iter().take_while(|&&s| s > 0.5).count();
-        let last = (likely + 2).min(pencil.most()).min(compressed.max_sources());
-        let mut best = Hypothesis::empty(nuisances);
-        self.fitter.fit(compressed, &mut best, TRIAL_STEPS);
-        // A background and another width have singular values of their own.
-        let is_plain = nuisances == Nuisances::default();
-        let (first, beyond) = if is_plain { (sure, 2) } else { (sure / 3, 3) };
-        self.fit_pencil_orders(
-            compressed,
-            &pencil,
-            &mut best,
-            nuisances,
-            first.max(1)..=last.min(sure.max(3) + beyond),
-            polish,
-        );
-        Some(best)
-    }
-
-    /// Fits the pencil's positions for each count until `best`, which keeps the better score, explains the frame.
-    fn fit_pencil_orders(
-        &mut self,
-        compressed: &CompressedFrame,
-        pencil: &MatrixPencil,
-        best: &mut Hypothesis,
-        nuisances: Nuisances,
-        counts: std::ops::RangeInclusive<usize>,
-        polish: usize,
-    ) {
-        let patience = if nuisances == Nuisances::default() { 1 } else { 3 };
-        let mut worse = 0;
-        for count in counts {
-            if compressed.is_explained_by(best) || worse == patience || !best.sources.is_empty() && self.is_exhausted()
-            {
-                break;
-            }
-            let Some(seeds) = pencil.seeds(count) else { break };
-            let mut hypothesis = Hypothesis::empty(nuisances);
-            hypothesis
-                .sources
-                .extend(seeds.into_iter().map(|u| PointSource::new(u, 0.0)));
-            self.fitter.fit(compressed, &mut hypothesis, polish);
-            if self.score(&hypothesis) < self.score(best) {
-                *best = hypothesis;
-                worse = 0;
-            } else if best.nuisances == nuisances {
-                worse += 1;
-            }
-        }
-    }
-
-    /// A hypothesis from the pencil where spots overlap, from residual peaks elsewhere.
-    pub fn initialise(
-        &mut self,
-        compressed: &CompressedFrame,
-        frame: &PreprocessedFrame,
-        nuisances: Nuisances,
-        polish: usize,
-    ) -> Hypothesis {
-        self.initialise_by_pencil(compressed, nuisances, polish)
-            .unwrap_or_else(|| {
-                let mut dark = Hypothesis::empty(nuisances);
-                self.fitter.fit(compressed, &mut dark, TRIAL_STEPS);
-                self.add_residual_peaks(compressed, frame, dark)
-            })
-    }
-
-    /// Refits `hypothesis` under new weights: nuisances where the frame is not explained, then proposals.
-    pub fn refit_reweighted(&mut self, compressed: &CompressedFrame, hypothesis: &mut Hypothesis, rounds: usize) {
-        self.fitter.fit(compressed, hypothesis, TRIAL_STEPS);
-        if !compressed.is_explained_by(hypothesis)
-            && let Some(wider) = self.with_more_nuisances(compressed, hypothesis, hypothesis)
-        {
-            *hypothesis = wider;
-        }
-        self.refine(compressed, hypothesis, rounds);
-        self.drop_nuisances(compressed, hypothesis);
-    }
-
-    /// The variance function, where it explains the frame better than `rival` does; only in the pixel bases.
-    fn test_variance_growth(
-        &mut self,
-        compressed: &CompressedFrame,
-        frame: &PreprocessedFrame,
-        hypothesis: &mut Hypothesis,
-        rival: &Hypothesis,
-    ) -> Option<VarianceFunction> {
-        let is_even = self.fitter.bx.is_pixels && self.fitter.by.is_pixels && compressed.weights.is_empty();
-        if !self.rules().reweighting || !is_even || rival.deviance < 0.5 * hypothesis.deviance {
-            return None;
-        }
-        let residual = self.fitter.weighted_residual(compressed, hypothesis).to_vec();
-        let signal = self.fitter.expected_light(compressed, hypothesis);
-        let variance = VarianceFunction::fit(
+    /// A search of one frame by the penalised likelihood. `compressed` is `frame` in the space's bases.
+    pub fn search<'a, 'b>(
+        &'a mut self,
+        compressed: &'a CompressedFrame,
+        frame: &'a PreprocessedFrame,
+        budget: &'a mut WorkBudget<'b>,
+    ) -> Search<'a, 'b> {
+        Search {
+            criterion: Criterion {
+                source_penalty: self.source_penalty,
+                noise_inflation: compressed.light_weighted_variance,
+                prior: None,
+            },
+            context: FitContext {
+                bases: &self.bases,
+                compressed,
+                rules: self.rules,
+                budget,
+                workspace: &mut self.workspace,
+            },
             frame,
-            [compressed.rank[0], compressed.mx],
-            &residual,
-            &signal,
-            hypothesis.sources.len(),
-        );
-        let nx = self.fitter.bx.n;
-        let cost: f64 = (0..frame.is_masked.len())
-            .filter(|&k| !frame.is_masked[k])
-            .map(|k| k / nx * compressed.mx + k % nx)
-            .map(|k| variance.at(signal[k]).ln() + residual[k].powi(2) / variance.at(signal[k]))
-            .sum();
-        let score = self.score(hypothesis) - hypothesis.deviance + cost + VarianceFunction::PENALTY;
-        (score < self.score(rival)).then_some(variance)
+            matched_filter: &mut self.matched_filter,
+            pencil: self.pencil.as_mut(),
+            suspected_variance: None,
+        }
+    }
+}
+
+/// The search for the number of sources in one frame.
+pub(crate) struct Search<'a, 'b> {
+    pub context: FitContext<'a, 'b>,
+    pub frame: &'a PreprocessedFrame,
+    pub criterion: Criterion<'a>,
+    pub matched_filter: &'a mut MatchedFilter,
+    pub pencil: Option<&'a mut PencilSampler>,
+    /// The variance function, where noise that grows with the light explains the frame better than more sources.
+    pub suspected_variance: Option<VarianceFunction>,
+}
+
+impl<'a> Search<'a, '_> {
+    /// The same search by the evidence under a prior of energies.
+    pub fn with_prior(mut self, prior: &'a PowerPrior) -> Self {
+        self.criterion.prior = Some(prior);
+        self
+    }
+
+    pub fn compressed(&self) -> &'a CompressedFrame {
+        self.context.compressed
+    }
+
+    pub fn rules(&self) -> Rules {
+        self.context.rules
+    }
+
+    pub fn is_exhausted(&self) -> bool {
+        self.context.budget.is_exhausted()
+    }
+
+    pub fn score(&self, hypothesis: &Hypothesis) -> f64 {
+        self.criterion.score(hypothesis)
+    }
+
+    /// Whether the noise alone explains what a hypothesis leaves.
+    pub fn is_explained_by(&self, hypothesis: &Hypothesis) -> bool {
+        self.compressed().is_explained_by(hypothesis)
+    }
+
+    /// Whether too many pixels are masked for the matrix pencil and for rotated ellipses.
+    pub fn is_heavily_masked(&self) -> bool {
+        let pixels = self.context.bases.x.n * self.context.bases.y.n;
+        self.compressed().masked.len() as f64 > MAX_MASKED_SHARE * pixels as f64
+    }
+
+    /// Fits for a comparison.
+    pub fn fit_trial(&mut self, hypothesis: &mut Hypothesis) {
+        fit(&mut self.context, hypothesis, TRIAL_STEPS);
+    }
+
+    /// Fits to convergence.
+    pub fn converge(&mut self, candidate: &mut Candidate) {
+        if !candidate.converged {
+            fit(&mut self.context, candidate, CONVERGE_STEPS);
+        }
+    }
+
+    /// Fits `next` under the criterion, and no further than it can score better than `rival`.
+    pub fn fit_against(&mut self, rival: &Hypothesis, next: &mut Hypothesis) {
+        let threshold = self.criterion.acceptance_threshold(rival, next);
+        match self.criterion.prior {
+            None => {
+                fit_below(&mut self.context, next, TRIAL_STEPS, threshold);
+            }
+            Some(prior) => fit_with_prior(&mut self.context, prior, next, TRIAL_STEPS, threshold, ASSIGNMENT_SLACK),
+        }
+    }
+
+    /// Fits `next` and keeps it if it scores better.
+    pub fn try_accept(&mut self, candidate: &mut Candidate, mut next: Hypothesis) -> bool {
+        if next.sources.len() > self.compressed().max_sources() || self.is_exhausted() {
+            return false;
+        }
+        self.fit_against(candidate, &mut next);
+        let is_better = self.score(&next) < self.score(candidate) - 1e-6;
+        if is_better {
+            *candidate = next.into();
+        }
+        is_better
+    }
+
+    /// Keeps `next`, which is fitted, if it scores better.
+    pub fn keep_better(&self, candidate: &mut Candidate, next: Candidate) {
+        if self.score(&next) < self.score(candidate) {
+            *candidate = next;
+        }
+    }
+
+    /// Peaks of the residual, the most significant first. The part of a peak that other sources have absorbed comes back in the joint
+    /// fit: the threshold is lower than a source's penalty.
+    pub fn residual_peaks(&mut self, candidate: &mut Candidate) -> Vec<Peak> {
+        let (mx, my) = (self.compressed().mx, self.compressed().my);
+        let threshold = 0.7 * self.criterion.threshold().sqrt();
+        let residual = &candidate.evaluation(&mut self.context).residual;
+        self.matched_filter
+            .peaks(residual, mx, my, threshold, PEAK_DISTANCE)
+            .to_vec()
     }
 }

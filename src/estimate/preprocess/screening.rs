@@ -78,6 +78,11 @@ impl PreprocessedFrame {
         Ok(())
     }
 
+    /// Share of pixels at or above saturation.
+    pub fn saturated_share(&self) -> f64 {
+        self.saturated as f64 / self.pixels.len() as f64
+    }
+
     /// Masks one more pixel; the caller fills it.
     pub fn mask(&mut self, x: usize, y: usize, nx: usize) {
         if !std::mem::replace(&mut self.is_masked[y * nx + x], true) {

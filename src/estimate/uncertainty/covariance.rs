@@ -1,61 +1,83 @@
-//! The covariance, condition number and determinant of an information matrix.
+//! The covariance, condition number and determinant of normal equations.
 
 use crate::estimate::dense_linalg::{cholesky, invert};
-use crate::estimate::fit::levenberg_marquardt::Fitter;
+use crate::estimate::fit::normal_equations::NormalEquations;
 
 /// Relative increase of the diagonal of an information matrix before it is factorised: singular ones are regularised.
 pub(crate) const RIDGE: f64 = 1e-13;
 
-impl Fitter {
-    /// Inverse of an information matrix of `n` parameters with `prior` precision added to the sources' positions.
-    pub fn covariance(&mut self, n: usize, sources: usize, prior: f64, out: &mut Vec<f64>) -> bool {
-        self.factor.clear();
-        self.factor.extend_from_slice(&self.hessian[..n * n]);
-        for i in 0..sources {
-            self.factor[3 * i * n + 3 * i] += prior;
-            self.factor[(3 * i + 1) * n + 3 * i + 1] += prior;
+/// The inverse of an information matrix, (p, p) row-major.
+#[derive(Clone, Debug)]
+pub(crate) struct Covariance {
+    pub parameters: usize,
+    pub matrix: Vec<f64>,
+}
+
+impl Covariance {
+    /// `None` where the information is singular. `prior` is a precision added to the sources' positions.
+    pub fn new(equations: &NormalEquations, prior: f64) -> Option<Self> {
+        let n = equations.parameters;
+        let mut factor = equations.information.clone();
+        for i in 0..equations.sources {
+            factor[3 * i * n + 3 * i] += prior;
+            factor[(3 * i + 1) * n + 3 * i + 1] += prior;
         }
         for i in 0..n {
-            self.factor[i * n + i] *= 1.0 + RIDGE;
+            factor[i * n + i] *= 1.0 + RIDGE;
         }
-        out.clear();
-        out.resize(n * n, 0.0);
-        let factor = &mut self.factor;
-        pulp::Arch::new().dispatch(Inverse { factor, n, out })
-    }
-
-    /// Condition number (1-norm) of an information matrix of `n` parameters, scaled to a unit diagonal (van der Sluis, 1969: no
-    /// other scaling does much better), given its inverse.
-    pub fn condition_number(&self, n: usize, inverse: &[f64]) -> f64 {
-        let scale = |i: usize| self.hessian[i * n + i].max(1e-300).sqrt();
-        let column = |j: usize| {
-            let (mut direct, mut inverted) = (0.0, 0.0);
-            for i in 0..n {
-                let h = self.hessian[i.min(j) * n + i.max(j)];
-                direct += (h / (scale(i) * scale(j))).abs();
-                inverted += (inverse[i * n + j] * scale(i) * scale(j)).abs();
-            }
-            (direct, inverted)
+        let mut matrix = vec![0.0; n * n];
+        let inverse = Inverse {
+            factor: &mut factor,
+            n,
+            out: &mut matrix,
         };
-        let (direct, inverted) = (0..n)
-            .map(column)
-            .fold((0.0f64, 0.0f64), |most, c| (most.0.max(c.0), most.1.max(c.1)));
-        (direct * inverted).max(1.0)
+        let is_regular = pulp::Arch::new().dispatch(inverse);
+        is_regular.then_some(Self { parameters: n, matrix })
     }
 
-    /// ln det of an information matrix of `n` parameters over the places and energies of its sources, with each source's `floor` added
-    /// to the precisions.
-    pub fn log_det(&mut self, n: usize, floor: &[[f64; 3]]) -> Option<f64> {
-        let size = 3 * floor.len();
-        self.factor.clear();
-        for i in 0..size {
-            self.factor.extend_from_slice(&self.hessian[i * n..i * n + size]);
-            self.factor[i * size + i] *= 1.0 + RIDGE;
-            self.factor[i * size + i] += floor[i / 3][i % 3];
-        }
-        let is_regular = cholesky(&mut self.factor, size);
-        is_regular.then(|| (0..size).map(|i| 2.0 * self.factor[i * size + i].ln()).sum())
+    /// Covariance of parameter `r` of source `i` with parameter `c` of source `j`: 0 and 1 are the position, 2 the energy.
+    pub fn at(&self, i: usize, r: usize, j: usize, c: usize) -> f64 {
+        self.matrix[(3 * i + r) * self.parameters + 3 * j + c]
     }
+
+    /// Covariance of the positions of two sources, or of one with itself, σ².
+    pub fn block(&self, i: usize, j: usize) -> [[f64; 2]; 2] {
+        [0, 1].map(|r| [0, 1].map(|c| self.at(i, r, j, c)))
+    }
+}
+
+/// Condition number (1-norm) of the information matrix, scaled to a unit diagonal (van der Sluis, 1969: no other scaling does much
+/// better), given its inverse.
+pub(crate) fn condition_number(equations: &NormalEquations, inverse: &Covariance) -> f64 {
+    let (n, information) = (equations.parameters, &equations.information);
+    let scale = |i: usize| information[i * n + i].max(1e-300).sqrt();
+    let column = |j: usize| {
+        let (mut direct, mut inverted) = (0.0, 0.0);
+        for i in 0..n {
+            let h = information[i.min(j) * n + i.max(j)];
+            direct += (h / (scale(i) * scale(j))).abs();
+            inverted += (inverse.matrix[i * n + j] * scale(i) * scale(j)).abs();
+        }
+        (direct, inverted)
+    };
+    let (direct, inverted) = (0..n)
+        .map(column)
+        .fold((0.0f64, 0.0f64), |most, c| (most.0.max(c.0), most.1.max(c.1)));
+    (direct * inverted).max(1.0)
+}
+
+/// ln det of the information over the positions and energies of the sources, with each source's `floor` added to the precisions.
+/// `None` where it is singular.
+pub(crate) fn log_det(equations: &NormalEquations, floor: &[[f64; 3]]) -> Option<f64> {
+    let (n, size) = (equations.parameters, 3 * floor.len());
+    let mut factor = Vec::with_capacity(size * size);
+    for i in 0..size {
+        factor.extend_from_slice(&equations.information[i * n..i * n + size]);
+        factor[i * size + i] *= 1.0 + RIDGE;
+        factor[i * size + i] += floor[i / 3][i % 3];
+    }
+    let is_regular = cholesky(&mut factor, size);
+    is_regular.then(|| (0..size).map(|i| 2.0 * factor[i * size + i].ln()).sum())
 }
 
 struct Inverse<'a> {
@@ -74,5 +96,41 @@ impl pulp::NullaryFnOnce for Inverse<'_> {
             invert(self.factor, self.n, self.out);
         }
         is_regular
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// One source with the information diag(4, 1, 0.25) and a coupling of 1 between x and y.
+    fn equations(coupling: f64) -> NormalEquations {
+        NormalEquations::of_sources(vec![4.0, coupling, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.25])
+    }
+
+    #[test]
+    fn the_covariance_of_three_parameters_by_hand() {
+        let found = Covariance::new(&equations(1.0), 0.0).expect("regular");
+        // [[4, 1], [1, 1]]⁻¹ = [[1, −1], [−1, 4]]/3.
+        for (k, expected) in [1.0, -1.0, -1.0, 4.0].into_iter().enumerate() {
+            assert!((found.at(0, k / 2, 0, k % 2) - expected / 3.0).abs() < 1e-9);
+        }
+        assert!((found.at(0, 2, 0, 2) - 4.0).abs() < 1e-9);
+        // Scaled to a unit diagonal: [[1, ½], [½, 1]] has the 1-norm 3/2, its inverse 2.
+        assert!((condition_number(&equations(1.0), &found) - 3.0).abs() < 1e-9);
+        let det = log_det(&equations(1.0), &[[0.0; 3]]).expect("regular");
+        assert!((det - 0.75f64.ln()).abs() < 1e-9, "(4 · 1 − 1 · 1) · ¼");
+        let floored = log_det(&equations(0.0), &[[0.0, 1.0, 0.75]]).expect("regular");
+        assert!((floored - 8.0f64.ln()).abs() < 1e-9, "4 · 2 · 1");
+    }
+
+    #[test]
+    fn a_prior_makes_positions_regular_that_are_not() {
+        // Eigenvalues of [[4, 3], [3, 1]] have both signs.
+        assert!(Covariance::new(&equations(3.0), 0.0).is_none());
+        assert!(log_det(&equations(3.0), &[[0.0; 3]]).is_none());
+        let held = Covariance::new(&equations(3.0), 2.0).expect("regular");
+        // [[6, 3], [3, 3]]⁻¹ = [[3, −3], [−3, 6]]/9.
+        assert!((held.at(0, 0, 0, 1) + 1.0 / 3.0).abs() < 1e-9);
     }
 }

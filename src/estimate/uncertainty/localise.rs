@@ -1,13 +1,15 @@
 //! From a fitted hypothesis to positions on the ground, each with its covariance and flags.
 
-use crate::estimate::emitter::{Emitter, Estimate, Flags, SecondMomentScore};
-use crate::estimate::model::compressed_frame::CompressedFrame;
+use crate::estimate::emitter::{Emitter, Flags, SecondMomentScore};
+use crate::estimate::fit::context::FitContext;
+use crate::estimate::fit::levenberg_marquardt::linearise;
 use crate::estimate::model::hypothesis::Hypothesis;
-use crate::estimate::model_order::search::Search;
 use crate::estimate::preprocess::screening::PreprocessedFrame;
-use crate::estimate::uncertainty::covariance::RIDGE;
+use crate::estimate::uncertainty::covariance::{Covariance, RIDGE, condition_number};
 use crate::estimate::uncertainty::pixel_posterior;
 use crate::estimate::uncertainty::posterior_mean::PosteriorMoments;
+use crate::estimate::uncertainty::profile_nonlinearity::is_likelihood_quadratic;
+use crate::estimate::uncertainty::split_score_test::{second_moment_scores, split_proposal};
 use crate::optics::Camera;
 
 /// A masked pixel within this distance, σ, sets a flag.
@@ -23,19 +25,42 @@ const DOUBTFUL: f64 = 10.0;
 /// Sources within this distance, σ, of an unresolved one may be displaced by it.
 const INFLUENCE_DISTANCE: f64 = 2.5;
 
+/// The emitters of a hypothesis, and how well it explains the frame.
+pub(crate) struct Localised {
+    pub emitters: Vec<Emitter>,
+    /// Weighted squared residual per degree of freedom.
+    pub reduced_chi2: f64,
+    /// Condition number of the information matrix; infinite where it is singular.
+    pub condition: f64,
+}
+
 /// Turns `hypothesis` into emitters with covariance and flags.
 pub(crate) fn localise(
-    search: &mut Search,
-    compressed: &CompressedFrame,
+    context: &mut FitContext,
     hypothesis: &mut Hypothesis,
     frame: &PreprocessedFrame,
     camera: &Camera,
     noise_j: f64,
     posterior_moments: Option<&[PosteriorMoments]>,
-) -> Estimate {
+) -> Localised {
     let n = hypothesis.sources.len();
     let p = hypothesis.parameters();
-    search.fitter.compute_information(compressed, hypothesis);
+    let (bases, compressed) = (context.bases, context.compressed);
+    let (bx, by) = (&bases.x, &bases.y);
+    let (low, high) = ([bx.edges[0], by.edges[0]], [bx.edges[bx.n], by.edges[by.n]]);
+    let pitch = [bx.pitch(), by.pitch()];
+    // The fit may place a source past the sensor's edges.
+    let [extent_x, extent_y] = bases.reach();
+    let extent = extent_x.max(extent_y);
+    let prior = 12.0 / (extent * extent);
+    let problem = context.problem();
+    let mut at = linearise(problem, hypothesis, context.budget, context.workspace);
+    let covariance = Covariance::new(at.equations, prior);
+    let condition = (covariance.as_ref()).map_or(f64::INFINITY, |c| condition_number(at.equations, c));
+    let scores = match &covariance {
+        Some(c) => second_moment_scores(problem, &mut at, c, context.budget),
+        None => vec![SecondMomentScore::default(); n],
+    };
     let freedom = (compressed.data_count - p as f64).max(1.0);
     // The masked pixels' downdate may leave a small negative number.
     let reduced_chi2 = hypothesis.deviance.max(0.0) / freedom;
@@ -44,31 +69,16 @@ pub(crate) fn localise(
         hypothesis.deviance > expected + compressed.light_weighted_variance * (5.0 * (2.0 * freedom).sqrt() + 5.0);
     // A misfit inflates the covariance.
     let inflation = if is_poor { hypothesis.deviance / expected } else { 1.0 };
-    let (bx, by) = (&search.fitter.bx, &search.fitter.by);
-    let (low, high) = ([bx.edges[0], by.edges[0]], [bx.edges[bx.n], by.edges[by.n]]);
-    let pitch = [bx.pitch(), by.pitch()];
-    // The fit may place a source past the sensor's edges.
-    let extent = (bx.max_position() - bx.min_position()).max(by.max_position() - by.min_position());
-    let prior = 12.0 / (extent * extent);
-    let mut cov = Vec::new();
-    let is_regular = search.fitter.covariance(p, n, prior, &mut cov);
-    let condition = if is_regular {
-        search.fitter.condition_number(p, &cov)
-    } else {
-        f64::INFINITY
-    };
-    let scores = match is_regular {
-        true => search.fitter.second_moment_scores(compressed, hypothesis, &cov),
-        false => vec![SecondMomentScore::default(); n],
-    };
     let block = |i: usize, j: usize| {
-        if is_regular {
-            [0, 1].map(|r| [0, 1].map(|c| cov[(3 * i + r) * p + 3 * j + c]))
-        } else {
-            let v = if i == j { extent * extent / 12.0 } else { 0.0 };
-            [[v, 0.0], [0.0, v]]
-        }
+        covariance.as_ref().map_or_else(
+            || {
+                let v = if i == j { extent * extent / 12.0 } else { 0.0 };
+                [[v, 0.0], [0.0, v]]
+            },
+            |c| c.block(i, j),
+        )
     };
+    let is_regular = covariance.is_some();
     let is_merged = |i: usize| {
         let own = block(i, i);
         (0..n).filter(|&j| j != i).any(|j| {
@@ -80,17 +90,19 @@ pub(crate) fn localise(
             d2 * d2 < RESOLVED * RESOLVED * inflation * along
         })
     };
-    let may_be_two = |i: usize| scores[i].split(i).is_some_and(|s| s.gain > DOUBTFUL * inflation);
+    let may_be_two = |i: usize| split_proposal(&scores[i], i).is_some_and(|s| s.gain > DOUBTFUL * inflation);
     let is_doubtful: Vec<bool> = (0..n).map(|i| !is_regular || is_merged(i) || may_be_two(i)).collect();
     let is_near = |i: usize, j: usize| {
         let d = [0, 1].map(|k| hypothesis.sources[i].u[k] - hypothesis.sources[j].u[k]);
         d[0].hypot(d[1]) < INFLUENCE_DISTANCE
     };
     let is_crowded = |i: usize| (0..n).any(|j| j != i && is_near(i, j));
-    let is_likelihood_quadratic: Vec<bool> = (0..n)
-        .map(|i| !is_regular || !is_crowded(i) || search.is_likelihood_quadratic(compressed, hypothesis, &cov, i))
+    let is_quadratic: Vec<bool> = (0..n)
+        .map(|i| match &covariance {
+            Some(c) if is_crowded(i) => is_likelihood_quadratic(context, hypothesis, c, i),
+            _ => true,
+        })
         .collect();
-    let (bx, by) = (&search.fitter.bx, &search.fitter.by);
     let sigma = camera.spot_sigma_m;
     let emitters = (0..n)
         .map(|i| {
@@ -117,7 +129,7 @@ pub(crate) fn localise(
             }
             let own = block(i, i);
             flags.set(Flags::UNRESOLVED, (0..n).any(|j| is_doubtful[j] && is_near(i, j)));
-            flags.set(Flags::NON_GAUSSIAN, !is_likelihood_quadratic[i]);
+            flags.set(Flags::NON_GAUSSIAN, !is_quadratic[i]);
             let (mut u, mut own) = (source.u, own);
             for k in 0..if is_regular { 2 } else { 0 } {
                 if let Some(s) = pixel_posterior::pixel_posterior([bx, by], k, &source) {
@@ -139,11 +151,7 @@ pub(crate) fn localise(
             let sensor_m = u.map(|u| u * sigma);
             let scale = sigma * sigma * inflation;
             let [x_m, y_m] = camera.to_ground(sensor_m);
-            let energy_variance = if is_regular {
-                cov[(3 * i + 2) * p + 3 * i + 2]
-            } else {
-                source.a * source.a
-            };
+            let energy_variance = (covariance.as_ref()).map_or(source.a * source.a, |c| c.at(i, 2, i, 2));
             Emitter {
                 x_m,
                 y_m,
@@ -157,13 +165,9 @@ pub(crate) fn localise(
             }
         })
         .collect();
-    Estimate {
+    Localised {
         emitters,
-        estimator: "",
-        is_cut_short: false,
         reduced_chi2,
-        saturated_share: frame.saturated as f64 / frame.pixels.len() as f64,
         condition,
-        steps: search.fitter.steps,
     }
 }

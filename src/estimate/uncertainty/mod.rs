@@ -1,7 +1,8 @@
-//! What a fit is worth: covariances, bounds, tests of the model, positions on the ground.
+//! What a fit is worth: covariance, bound, score test, posterior moments, and positions on the ground.
 
 pub mod covariance;
 pub mod cramer_rao;
+pub mod ill_determined;
 pub mod localise;
 pub mod pixel_posterior;
 pub mod posterior_mean;

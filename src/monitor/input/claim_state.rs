@@ -1,26 +1,34 @@
-use jiff::Timestamp;
+//! The active claims of a frame: where each puts its user, how exactly, and whether a beam must be seen there.
+
+use jiff::{SignedDuration, Timestamp};
 use nalgebra::{Matrix2, Vector2};
 
-use crate::claims::{Claim, ClaimState, Standing, seconds};
-use crate::monitor::input::clock_offset::ClockOffset;
-use crate::monitor::pose::displacement::Witness;
-use crate::monitor::stats::claim_consistency::ClaimConsistency;
-use crate::monitor::stats::co_location::CoLocationTest;
+use crate::claims::{Beam, Claim, ClaimState, Standing, Store, seconds};
+use crate::monitor::config::Config;
+use crate::monitor::track::detection::{OVERLAP, spot_m};
+use crate::monitor::track::user_track::UserTrack;
+use crate::optics::Camera;
 
-/// A user may leave their last claim by this much a second without a new one, beyond the pace they claimed, m/s.
+/// Speed at which a user may leave their last claim without a new one, beyond the one they claimed, m/s: a walk. Larger widens
+/// what is tolerated between claims, smaller raises a mismatch for who sets off. Not measured.
 const FREE_SPEED_M_S: f64 = 3.0;
-/// Paces above this are not believed when they widen what is tolerated, m/s.
-const FASTEST_M_S: f64 = 20.0;
-/// A claim older than this answers for no beam that is not already known to be the user's, s.
+/// Largest claimed speed that widens what is tolerated, m/s: an attacker writes it. Smaller raises mismatches for users in cars.
+const MAX_SPEED_M_S: f64 = 20.0;
+/// Age past which a claim is associated only with a beam that is already known to be its user's, s. Longer lets an old claim cover
+/// for a stranger, shorter makes strangers of users who seldom claim. Not measured.
 pub const CLAIM_LIFE_S: f64 = 60.0;
+/// Smallest standard deviation of a claim that is believed, m.
+const MIN_SIGMA_M: f64 = 0.01;
+/// Largest movement since a claim, m, that widens the association: beyond it every beam would do.
+const MAX_SLACK_M: f64 = 60.0;
 
-/// A user's claim as it bears on the frame at hand.
+/// A user's newest claim as it bears on the frame at hand.
 #[derive(Clone, Debug)]
 pub struct ActiveClaim {
     pub claim: Claim,
-    /// Where the claim puts the beam; our own pose error is added once the frame has told it.
+    /// Where the claim puts the beam, m; moved by our own pose error once the frame has shown it.
     pub position: Vector2<f64>,
-    /// Variance per axis.
+    /// Variance per axis, m².
     pub variance: f64,
     /// When the claim was made, by our clock; never after the frame.
     pub made: Timestamp,
@@ -31,56 +39,116 @@ pub struct ActiveClaim {
     /// The beam must be seen if the claim holds.
     pub expected: bool,
     pub ended: bool,
-    /// No beam answers, and one at the claimed place would not be told apart from its neighbours.
+    /// No beam is associated, and one at the claimed place would not be told apart from its neighbours.
     pub is_unresolvable: bool,
+    /// Seconds between the user's last two claims.
     pub period_s: Option<f64>,
     pub came: Timestamp,
-    /// As remembered when the frame came: the beam that answered last, the same where it answered in the frame before, since when none
-    /// does, when one did last, and whether the user is known by it.
-    pub before: Option<u64>,
-    pub owns: Option<u64>,
-    pub unanswered_since: Option<Timestamp>,
-    pub last_answered: Option<Timestamp>,
-    pub is_established: bool,
-    /// An alert names the user.
-    pub has_alert: bool,
+    /// The user's beam as it was known before this frame.
+    pub before: UserTrack,
+}
+
+/// What is needed to tell which claims bear on a frame.
+#[derive(Clone, Copy, Debug)]
+pub struct Scope<'a> {
+    pub config: &'a Config,
+    pub camera: &'a Camera,
+    /// Standard deviation of claims that state none, m.
+    pub default_sigma_m: f64,
+    /// Seconds by which the log's clock is ahead of ours.
+    pub clock_offset_s: f64,
+}
+
+/// The claims that bear on a frame at `now`, by user: those in or near the view, and those of users whose beam `is_followed`. The
+/// store chooses which of them the frame has time for: those of known users, and of the others those nearest to a beam. `user`
+/// gives what is known of a user's beam.
+pub fn active_claims(
+    store: &mut Store,
+    now: Timestamp,
+    scope: Scope,
+    beams: &[Beam],
+    user: impl Fn(&str) -> Option<UserTrack>,
+    is_followed: impl Fn(u64) -> bool,
+) -> Vec<ActiveClaim> {
+    store.choose(beams, |standing| {
+        scope.is_in_reach(standing, &Reach::of(standing, now, &scope))
+    });
+    let mut claims: Vec<ActiveClaim> = store
+        .chosen()
+        .filter_map(|standing| {
+            let (reach, user) = (
+                Reach::of(&standing, now, &scope),
+                user(&standing.claim.user).unwrap_or_default(),
+            );
+            let is_active = standing.claim.state == ClaimState::Active;
+            let bears = (is_active && user.track.is_some_and(&is_followed)) || scope.is_in_reach(&standing, &reach);
+            bears.then(|| ActiveClaim::new(&standing, reach, user))
+        })
+        .collect();
+    for claim in &mut claims {
+        claim.expected = !claim.ended && scope.must_be_seen(claim);
+    }
+    claims.sort_by(|a, b| a.claim.user.cmp(&b.claim.user));
+    claims
+}
+
+/// Whether the user is among `claims`, which are by user.
+pub fn has_claim(claims: &[ActiveClaim], user: &str) -> bool {
+    claims
+        .binary_search_by(|claim| claim.claim.user.as_str().cmp(user))
+        .is_ok()
 }
 
 /// What a claim's age and stated error make of the place it names.
 #[derive(Clone, Copy, Debug)]
-pub struct Reach {
-    /// When the claim was made, by our clock; never after the frame.
-    pub made: Timestamp,
-    pub age_s: f64,
-    /// Variance per axis.
-    pub variance: f64,
-    /// How far the user may have gone since, m.
-    pub slack_m: f64,
+struct Reach {
+    made: Timestamp,
+    age_s: f64,
+    variance: f64,
+    slack_m: f64,
 }
 
 impl Reach {
-    /// `largest_sigma_m` bounds what a claim may say of its own error: a lie there must not hide a lie about the place.
-    /// The log's clock is `ahead_s` ahead of ours.
-    pub fn of(standing: &Standing, now: Timestamp, default_sigma_m: f64, largest_sigma_m: f64, ahead_s: f64) -> Self {
+    /// A claim's own error is believed only up to the tolerated distance: a lie there must not hide a lie about the place.
+    fn of(standing: &Standing, now: Timestamp, scope: &Scope) -> Self {
         let claim = standing.claim;
-        let ahead = jiff::SignedDuration::from_millis((ahead_s * 1e3).round() as i64);
-        let made = claim.time.saturating_sub(ahead).map_or(now, |made| made.min(now));
+        let offset = SignedDuration::from_millis((scope.clock_offset_s * 1e3).round() as i64);
+        let made = claim.time.saturating_sub(offset).map_or(now, |made| made.min(now));
         let age_s = seconds(made, now);
-        let sigma = claim.sigma_m.unwrap_or(default_sigma_m).clamp(0.01, largest_sigma_m);
+        let sigma = claim
+            .sigma_m
+            .unwrap_or(scope.default_sigma_m)
+            .clamp(MIN_SIGMA_M, scope.config.tolerated_distance_m);
         Self {
             made,
             age_s,
             variance: sigma * sigma,
-            slack_m: (FREE_SPEED_M_S + standing.pace_m_s.min(FASTEST_M_S)) * age_s,
+            slack_m: (FREE_SPEED_M_S + standing.pace_m_s.min(MAX_SPEED_M_S)) * age_s,
         }
     }
 }
 
-impl ActiveClaim {
-    /// `user` is what is remembered of the user when the frame comes.
-    pub fn new(standing: &Standing, reach: Reach, user: Option<&User>) -> Self {
+impl Scope<'_> {
+    fn is_in_reach(&self, standing: &Standing, reach: &Reach) -> bool {
         let claim = standing.claim;
-        let before = user.and_then(|u| u.track);
+        if claim.state == ClaimState::Ended {
+            return reach.age_s <= self.config.ended_grace_s;
+        }
+        let reach_m = self.config.tolerated_distance_m + reach.slack_m + 5.0 * reach.variance.sqrt();
+        let place = Vector2::new(claim.x_m, claim.y_m);
+        reach.age_s <= CLAIM_LIFE_S && is_near_view(self.camera, place, reach_m + spot_m(self.camera) * OVERLAP)
+    }
+
+    /// Whether even a user as far off as is tolerated would show at least part of a spot.
+    fn must_be_seen(&self, claim: &ActiveClaim) -> bool {
+        let off = self.config.tolerated_distance_m + claim.slack_m + 3.0 * claim.variance.sqrt();
+        is_near_view(self.camera, claim.position, (spot_m(self.camera) - off).min(0.0))
+    }
+}
+
+impl ActiveClaim {
+    fn new(standing: &Standing, reach: Reach, before: UserTrack) -> Self {
+        let claim = standing.claim;
         Self {
             position: Vector2::new(claim.x_m, claim.y_m),
             variance: reach.variance,
@@ -93,74 +161,151 @@ impl ActiveClaim {
             period_s: standing.period_s,
             came: standing.came,
             before,
-            owns: before.filter(|_| user.is_some_and(|u| u.unanswered_since.is_none())),
-            unanswered_since: user.and_then(|u| u.unanswered_since),
-            last_answered: user.and_then(|u| u.last_answered),
-            is_established: user.is_some_and(User::is_established),
-            has_alert: false,
             claim: claim.clone(),
         }
     }
 
-    /// A beam has answered the user's claims before.
-    pub fn was_seen(&self) -> bool {
-        self.last_answered.is_some()
-    }
-
-    /// The claim as a witness of our own pose: reach for its error and for a step since it was made, where the user's beam
-    /// does not tell how far it has `moved` since.
-    pub fn witness(&self, moved: Option<Vector2<f64>>) -> Witness {
-        let step_m = match moved {
-            Some(_) => 0.0,
-            None => 0.3 * self.slack_m.min(10.0),
-        };
-        Witness {
-            claimed: Vector2::new(self.claim.x_m, self.claim.y_m) + moved.unwrap_or_default(),
-            variance: self.variance,
-            reach_m: 0.5 + 3.0 * self.variance.sqrt() + step_m,
-        }
-    }
-
-    /// Covariance for asking which beam answers the claim.
-    pub fn spread(&self, tolerated_m: f64) -> Matrix2<f64> {
-        let slack = 0.5 * self.slack_m.min(60.0);
+    /// Covariance for the association with a beam: half of what the user may have gone and may be off counts as a standard
+    /// deviation.
+    pub fn association_cov(&self, tolerated_m: f64) -> Matrix2<f64> {
+        let slack = 0.5 * self.slack_m.min(MAX_SLACK_M);
         Matrix2::identity() * (self.variance + slack * slack + 0.25 * tolerated_m * tolerated_m)
     }
 }
 
-/// A user whose claim a beam has answered for this long is known by it, s: longer than a chance meeting of two who walk lasts.
-const ESTABLISHED_S: f64 = 3.0;
+fn is_near_view(camera: &Camera, p: Vector2<f64>, margin_m: f64) -> bool {
+    let [x, y] = camera.to_sensor([p.x, p.y]);
+    let margin = margin_m / camera.ground_scale();
+    x.abs() <= camera.x.half_width() + margin && y.abs() <= camera.y.half_width() + margin
+}
 
-impl User {
-    /// A beam has answered the claim for long enough that the two are taken to belong together.
-    fn is_established(&self) -> bool {
-        let answered = self.first_answered.zip(self.last_answered);
-        answered.is_some_and(|(first, last)| seconds(first, last) >= ESTABLISHED_S)
+#[cfg(test)]
+pub mod fixture {
+    use super::*;
+
+    /// A claim of 0.3 m, made in this very moment, of a user whose beam is expected at (`x`, `y`), m.
+    pub fn active_claim(user: &str, x: f64, y: f64) -> ActiveClaim {
+        let claim = Claim {
+            time: Timestamp::UNIX_EPOCH,
+            user: user.into(),
+            x_m: x,
+            y_m: y,
+            sigma_m: Some(0.3),
+            power_w: None,
+            state: ClaimState::Active,
+        };
+        ActiveClaim {
+            position: Vector2::new(x, y),
+            variance: 0.09,
+            made: claim.time,
+            age_s: 0.0,
+            slack_m: 0.0,
+            expected: true,
+            ended: false,
+            is_unresolvable: false,
+            period_s: Some(1.0),
+            came: claim.time,
+            before: UserTrack::default(),
+            claim,
+        }
     }
 }
 
-/// What the monitor remembers of a user.
-#[derive(Clone, Debug, Default)]
-pub struct User {
-    /// The beam that answered last.
-    pub track: Option<u64>,
-    pub residuals: ClaimConsistency,
-    pub clock: ClockOffset,
-    /// First frame since which no beam answers.
-    pub unanswered_since: Option<Timestamp>,
-    /// ln likelihood ratio of "absent" to "missed by chance".
-    pub absence: f64,
-    /// Frames in a row with the beam outside what is tolerated.
-    pub outside: u32,
-    pub first_answered: Option<Timestamp>,
-    pub last_answered: Option<Timestamp>,
-    pub mismatched: bool,
-    /// A beam elsewhere took the user's place when they vanished.
-    pub displaced: bool,
-    /// Whether the beam is two.
-    pub co_location: CoLocationTest,
-    /// Since when there are signs that it is: the present is not taken for the past.
-    pub suspected_since: Option<Timestamp>,
-    /// When an emitter that had its own alert was last beside the beam.
-    pub accompanied: Option<Timestamp>,
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::claims;
+    use crate::optics;
+
+    fn at(s: i64) -> Timestamp {
+        Timestamp::from_second(s).unwrap()
+    }
+
+    /// The active claims at `now` s after these claims of one user at (t, x), s and m.
+    fn active(
+        made: &[(i64, f64)],
+        state: ClaimState,
+        now: i64,
+        clock_offset_s: f64,
+        followed: bool,
+    ) -> Vec<ActiveClaim> {
+        let mut store = Store::new(&claims::Config::default());
+        for (t, x) in made {
+            let claim = Claim {
+                time: at(*t),
+                user: "a".into(),
+                x_m: *x,
+                y_m: 0.0,
+                sigma_m: Some(1000.0),
+                power_w: None,
+                state,
+            };
+            store.insert(claim, at(*t));
+        }
+        if followed {
+            store.answered("a", at(now));
+        }
+        let scope = Scope {
+            config: &Config::default(),
+            camera: &optics::Config::default().camera().unwrap(),
+            default_sigma_m: 1.0,
+            clock_offset_s,
+        };
+        let user = UserTrack {
+            track: Some(7),
+            ..UserTrack::default()
+        };
+        active_claims(
+            &mut store,
+            at(now),
+            scope,
+            &[],
+            |_| Some(user),
+            |track| followed && track == 7,
+        )
+    }
+
+    #[test]
+    fn a_claim_ages_and_its_stated_error_is_bounded() {
+        let active = active(&[(10, 0.0), (12, 4.0)], ClaimState::Active, 15, 0.0, false);
+        let claim = &active[0];
+        assert_eq!((claim.age_s, claim.variance, claim.period_s), (3.0, 25.0, Some(2.0)));
+        // A walk of 3 m/s on top of the 2 m/s that were claimed.
+        assert_eq!(claim.slack_m, 15.0);
+    }
+
+    #[test]
+    fn a_clock_ahead_of_ours_makes_claims_older_and_none_is_from_the_future() {
+        let age = |offset: f64| active(&[(10, 0.0)], ClaimState::Active, 11, offset, false)[0].age_s;
+        assert_eq!(age(0.5), 1.5);
+        assert_eq!(age(-5.0), 0.0);
+    }
+
+    #[test]
+    fn claims_out_of_view_bear_on_nothing_unless_their_beam_is_followed() {
+        // The default view reaches 125 m; errors of 5 m count five times.
+        let of = |x: f64, followed: bool| active(&[(10, x)], ClaimState::Active, 10, 0.0, followed);
+        assert!(of(100.0, false)[0].expected);
+        assert!(!of(130.0, false)[0].expected);
+        assert!(of(400.0, false).is_empty());
+        assert_eq!(of(400.0, true).len(), 1);
+    }
+
+    #[test]
+    fn an_ended_claim_bears_for_its_grace() {
+        let of = |now: i64| active(&[(10, 0.0)], ClaimState::Ended, now, 0.0, true);
+        assert!(of(13)[0].ended && !of(13)[0].expected);
+        assert!(of(14).is_empty());
+    }
+
+    #[test]
+    fn the_association_widens_with_age_up_to_a_bound() {
+        let mut claim = fixture::active_claim("a", 0.0, 0.0);
+        let variance = |claim: &ActiveClaim| claim.association_cov(4.0)[(0, 0)];
+        assert!((variance(&claim) - 4.09).abs() < 1e-12);
+        claim.slack_m = 6.0;
+        assert!((variance(&claim) - 13.09).abs() < 1e-12);
+        claim.slack_m = 1e9;
+        assert!((variance(&claim) - 904.09).abs() < 1e-9);
+    }
 }

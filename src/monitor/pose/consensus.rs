@@ -2,16 +2,31 @@
 
 use nalgebra::Vector2;
 
-use crate::monitor::pose::displacement::{Displacement, Witness};
-use crate::monitor::pose::search::{Pair, agreeing, median, search, search_turned, turn_of};
+use super::displacement::Displacement;
+use super::search::{Pair, agreeing, search, search_turned, turn_of};
+use super::witness::Witness;
+use crate::monitor::stats::claim_consistency::COMMON_SHARE;
+use crate::monitor::stats::robust::median_vector;
+
+/// Share of the users in view that must agree: with fewer than a third of them lying no false displacement finds its quorum.
+const QUORUM: f64 = 2.0 / 3.0;
+/// Users that must agree on a shift, and on a shift with a turn, at least.
+const MIN_AGREEING: usize = 3;
+const MIN_AGREEING_TURNED: usize = 5;
+/// Time over which claims' errors are averaged, s. Longer is more exact, shorter follows a pose that wanders. Not measured; the
+/// soaks' pose wanders by 0.5 m within seconds to minutes.
+const SMOOTHING_S: f64 = 20.0;
+/// Standard deviations from which a turn is applied, and down to which it stays so.
+const APPLY_TURN: f64 = 5.0;
+const KEEP_TURN: f64 = 3.0;
 
 /// The displacement that all beams share against all claims, once enough users agree on it.
 ///
-/// One is believed only where two thirds of the users in view, and three at least (five for one with a turn), have a beam
+/// One is accepted only where two thirds of the users in view, and three at least (five for one with a turn), have a beam
 /// at it, each within its own reach. A liar is one witness whatever they claim: with fewer than a third of the users lying,
 /// no false displacement finds its quorum. The shift is the component-wise median over the witnesses that agree (breakdown point
 /// one half: Huber, 1981, §1.4) and the turn their repeated median (one half too: Siegel, 1982); both move by a fraction of
-/// one claim's error. A turn is applied only where it stands out of its own error.
+/// one claim's error. A turn is applied only where it is significant.
 #[derive(Clone, Debug, Default)]
 pub struct PoseConsensus {
     /// The best shift alone, and the best displacement with a turn.
@@ -26,25 +41,11 @@ pub struct PoseConsensus {
     averaged_s: f64,
 }
 
-const QUORUM: f64 = 2.0 / 3.0;
-const FEWEST: usize = 3;
-const FEWEST_TURNED: usize = 5;
-/// Claims' errors are averaged over this time, s.
-const SMOOTHING_S: f64 = 20.0;
-/// Standard deviations from which a turn is applied, and down to which it stays so.
-const TURNS: f64 = 5.0;
-const STAYS_TURNED: f64 = 3.0;
-/// Share of the variance of claims that is common to neighbours in time, and so outlives the averaging.
-const COMMON_SHARE: f64 = crate::monitor::stats::claim_consistency::COMMON_SHARE;
-
 impl PoseConsensus {
     pub fn displacement(&self) -> Displacement {
         match self.is_turned {
             true => self.turned,
-            false => Displacement {
-                shift: self.shift,
-                ..Displacement::default()
-            },
+            false => Displacement::of_shift(self.shift),
         }
     }
 
@@ -54,15 +55,15 @@ impl PoseConsensus {
         self.variance + turned * p.norm_squared()
     }
 
-    /// Users that agree on the displacement, of how many.
+    /// Users that agree on the displacement, and all users that are asked.
     pub fn support(&self) -> (usize, usize) {
         (self.agreeing, self.witnesses)
     }
 
-    /// Takes one frame's beams, m, after `dt` seconds; each user claims every `period_s`.
+    /// Takes one frame's beams, m, `dt` seconds after the one before; each user claims every `period_s`.
     pub fn update(&mut self, beams: &[Vector2<f64>], witnesses: &[Witness], dt: f64, period_s: f64) {
         self.witnesses = witnesses.len();
-        let quorum = ((witnesses.len() as f64 * QUORUM).ceil() as usize).max(FEWEST);
+        let quorum = ((witnesses.len() as f64 * QUORUM).ceil() as usize).max(MIN_AGREEING);
         if witnesses.len() < quorum || beams.len() < quorum {
             self.agreeing = 0;
             return;
@@ -70,8 +71,9 @@ impl PoseConsensus {
         let mut pairs = agreeing(beams, witnesses, &self.displacement());
         let mut is_new = false;
         if pairs.len() < quorum {
-            // What we believe is no longer so: perhaps another displacement is.
-            let turned = || search_turned(beams, witnesses).filter(|found| found.1.len() >= quorum.max(FEWEST_TURNED));
+            // The displacement so far no longer holds; another may.
+            let turned =
+                || search_turned(beams, witnesses).filter(|found| found.1.len() >= quorum.max(MIN_AGREEING_TURNED));
             let found = search(beams, witnesses)
                 .filter(|found| found.1.len() >= quorum)
                 .map(|found| (found, false))
@@ -89,7 +91,7 @@ impl PoseConsensus {
         let claims = (2.0 * self.averaged_s.min(SMOOTHING_S) / period_s.max(0.01)).max(1.0);
         let kept = COMMON_SHARE + (1.0 - COMMON_SHARE) / claims;
         self.variance = std::f64::consts::FRAC_PI_2 * mean_variance / pairs.len() as f64 * kept;
-        self.judge_turn(&pairs);
+        self.decide_turn(&pairs);
     }
 
     fn average(&mut self, pairs: &[Pair], dt: f64, is_new: bool) {
@@ -100,8 +102,8 @@ impl PoseConsensus {
             false if dt > 0.0 => (dt / self.averaged_s.min(SMOOTHING_S)).clamp(0.0, 1.0),
             false => return,
         };
-        self.shift += (median(pairs.iter().map(|p| p.offset)) - self.shift) * gain;
-        if pairs.len() >= FEWEST_TURNED {
+        self.shift += (median_vector(pairs.iter().map(|p| p.offset)) - self.shift) * gain;
+        if pairs.len() >= MIN_AGREEING_TURNED {
             let found = turn_of(pairs);
             let mean = &mut self.turned;
             mean.shift += (found.shift - mean.shift) * gain;
@@ -110,19 +112,19 @@ impl PoseConsensus {
         }
     }
 
-    /// Applies the turn where it stands out of its own error.
-    fn judge_turn(&mut self, pairs: &[Pair]) {
-        if pairs.len() < FEWEST_TURNED {
+    /// Applies the turn where it is significant.
+    fn decide_turn(&mut self, pairs: &[Pair]) {
+        if pairs.len() < MIN_AGREEING_TURNED {
             self.is_turned = false;
             return;
         }
         let n = pairs.len() as f64;
         let centre = pairs.iter().map(|p| p.claimed).sum::<Vector2<f64>>() / n;
         let spread = pairs.iter().map(|p| (p.claimed - centre).norm_squared()).sum::<f64>();
-        // Of least squares, times what the median is worse.
+        // That of least squares, times π/2 for a median.
         self.turn_variance = self.variance * n / spread.max(1.0) * std::f64::consts::FRAC_PI_2;
         let away = self.turned.scale.hypot(self.turned.turn) / self.turn_variance.sqrt();
-        self.is_turned = away > if self.is_turned { STAYS_TURNED } else { TURNS };
+        self.is_turned = away > if self.is_turned { KEEP_TURN } else { APPLY_TURN };
     }
 }
 

@@ -3,3 +3,4 @@
 pub(super) mod consensus;
 pub(super) mod displacement;
 pub(super) mod search;
+pub(super) mod witness;

@@ -1,6 +1,10 @@
+//! The search for the displacement that most witnesses agree on.
+
 use nalgebra::Vector2;
 
-use crate::monitor::pose::displacement::{Displacement, Witness};
+use super::displacement::Displacement;
+use super::witness::Witness;
+use crate::monitor::stats::robust::median_vector;
 
 /// A claim and how far from it its beam was found.
 #[derive(Clone, Copy, Debug)]
@@ -9,13 +13,14 @@ pub struct Pair {
     pub offset: Vector2<f64>,
 }
 
-/// Shifts are searched for up to this, m, and turns up to this, rad.
+/// Largest shift, m, and turn or scale, rad, that are searched for.
 const SEARCH_M: f64 = 60.0;
 const SEARCH_TURN: f64 = 0.15;
-/// Witnesses that take part in a search, which costs their fourth power, and pairs of them that propose a turn.
+/// Witnesses that take part in a search, which costs their fourth power, and pairs of them that propose a turn. More find a pose
+/// among more liars; these bound the time of a frame.
 const MOST_SEARCHED: usize = 16;
 const MOST_PAIRS: usize = 8;
-/// Claims nearer to each other say nothing of a turn, m.
+/// Distance below which two claims do not show a turn, m: their errors would.
 const BASELINE_M: f64 = 10.0;
 
 /// The witnesses that find a beam of their own at `displaced`.
@@ -48,14 +53,11 @@ pub fn search(beams: &[Vector2<f64>], witnesses: &[Witness]) -> Option<(Displace
         .iter()
         .flat_map(|w| beams.iter().map(move |b| b - w.claimed))
         .filter(|s| s.norm() <= SEARCH_M)
-        .map(|shift| Displacement {
-            shift,
-            ..Displacement::default()
-        });
+        .map(Displacement::of_shift);
     let best = best(candidates, beams, searched)?;
     // The candidate carries one claim's error; the median of those that agree with it does not.
     let refined = Displacement {
-        shift: median(agreeing(beams, searched, &best).iter().map(|p| p.offset)),
+        shift: median_vector(agreeing(beams, searched, &best).iter().map(|p| p.offset)),
         ..best
     };
     Some((refined, agreeing(beams, witnesses, &refined)))
@@ -116,10 +118,10 @@ fn through(a: (Vector2<f64>, Vector2<f64>), b: (Vector2<f64>, Vector2<f64>)) -> 
     Some(found)
 }
 
-/// Shift, scale and turn by repeated medians (Siegel, 1982): over each witness the median of what it says with each other,
+/// Shift, scale and turn by repeated medians (Siegel, 1982): over each witness the median of what it gives with each other,
 /// then over witnesses.
 pub fn turn_of(pairs: &[Pair]) -> Displacement {
-    let mut said = Vec::with_capacity(pairs.len());
+    let mut slopes = Vec::with_capacity(pairs.len());
     for (i, a) in pairs.iter().enumerate() {
         let others = pairs.iter().enumerate().filter(|(j, _)| *j != i).filter_map(|(_, b)| {
             let d = through((a.claimed, a.offset), (b.claimed, b.offset))?;
@@ -127,33 +129,87 @@ pub fn turn_of(pairs: &[Pair]) -> Displacement {
         });
         let others: Vec<_> = others.collect();
         if !others.is_empty() {
-            said.push(median(others.into_iter()));
+            slopes.push(median_vector(others.into_iter()));
         }
     }
-    let middle = median(said.into_iter());
+    let middle = median_vector(slopes.into_iter());
     let turned = Displacement {
         shift: Vector2::zeros(),
         scale: middle.x,
         turn: middle.y,
     };
     Displacement {
-        shift: median(pairs.iter().map(|p| p.offset - turned.at(p.claimed))),
+        shift: median_vector(pairs.iter().map(|p| p.offset - turned.at(p.claimed))),
         ..turned
     }
 }
 
-/// Component-wise; zero of none.
-pub fn median(offsets: impl Iterator<Item = Vector2<f64>>) -> Vector2<f64> {
-    let offsets: Vec<_> = offsets.collect();
-    let middle = |axis: usize| {
-        let mut values: Vec<f64> = offsets.iter().map(|o| o[axis]).collect();
-        values.sort_by(f64::total_cmp);
-        let n = values.len();
-        match n {
-            0 => 0.0,
-            _ if n % 2 == 1 => values[n / 2],
-            _ => 0.5 * (values[n / 2 - 1] + values[n / 2]),
-        }
-    };
-    Vector2::new(middle(0), middle(1))
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn witnesses(claims: &[[f64; 2]]) -> Vec<Witness> {
+        claims
+            .iter()
+            .map(|c| Witness {
+                claimed: Vector2::from(*c),
+                variance: 0.09,
+                reach_m: 1.0,
+            })
+            .collect()
+    }
+
+    fn beams(places: &[[f64; 2]]) -> Vec<Vector2<f64>> {
+        places.iter().map(|p| Vector2::from(*p)).collect()
+    }
+
+    #[test]
+    fn a_beam_agrees_with_one_witness_only() {
+        let witnesses = witnesses(&[[0.0, 0.0], [0.5, 0.0], [20.0, 0.0]]);
+        let pairs = agreeing(&beams(&[[0.2, 0.0], [22.0, 0.0]]), &witnesses, &Displacement::default());
+        assert_eq!(pairs.len(), 1);
+        assert_eq!(pairs[0].offset, Vector2::new(0.2, 0.0));
+    }
+
+    #[test]
+    fn the_shift_that_most_agree_on_is_found() {
+        let claims = witnesses(&[[0.0, 0.0], [30.0, 0.0], [0.0, 40.0], [-50.0, 0.0]]);
+        let beams = beams(&[[7.0, 1.0], [37.2, 1.0], [6.8, 41.0], [-50.0, 0.0]]);
+        let (found, pairs) = search(&beams, &claims).unwrap();
+        assert_eq!(pairs.len(), 3);
+        // Component-wise median of (7, 1), (7.2, 1) and (6.8, 1).
+        assert!((found.shift - Vector2::new(7.0, 1.0)).norm() < 1e-9, "{found:?}");
+    }
+
+    #[test]
+    fn two_places_and_their_offsets_give_turn_and_scale() {
+        let offset = |p: Vector2<f64>| Vector2::new(0.1 * p.x - 0.02 * p.y + 1.0, 0.02 * p.x + 0.1 * p.y - 2.0);
+        let (a, b) = (Vector2::new(10.0, 5.0), Vector2::new(-30.0, 20.0));
+        let found = through((a, offset(a)), (b, offset(b))).unwrap();
+        assert!((found.scale - 0.1).abs() < 1e-12 && (found.turn - 0.02).abs() < 1e-12);
+        assert!((found.shift - Vector2::new(1.0, -2.0)).norm() < 1e-12);
+        assert!(through((a, offset(a)), (a + Vector2::new(9.0, 0.0), offset(a))).is_none());
+    }
+
+    #[test]
+    fn a_turn_survives_a_liar_of_five() {
+        let truth = Displacement {
+            shift: Vector2::new(1.0, 2.0),
+            scale: 0.01,
+            turn: -0.03,
+        };
+        let claims = [[0.0, 0.0], [50.0, 0.0], [0.0, 60.0], [-70.0, 10.0], [20.0, -80.0]];
+        let mut pairs: Vec<Pair> = claims
+            .iter()
+            .map(|c| Vector2::from(*c))
+            .map(|claimed| Pair {
+                claimed,
+                offset: truth.at(claimed),
+            })
+            .collect();
+        pairs[0].offset += Vector2::new(30.0, -9.0);
+        let found = turn_of(&pairs);
+        assert!((found.scale - truth.scale).abs() < 1e-12 && (found.turn - truth.turn).abs() < 1e-12);
+        assert!((found.shift - truth.shift).norm() < 1e-9, "{found:?}");
+    }
 }

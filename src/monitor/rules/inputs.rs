@@ -1,169 +1,229 @@
-use jiff::Timestamp;
-use nalgebra::Vector2;
+//! `sensor_lost`, `claims_stale` and `claims_flooded`: the frames or the claims that everything rests on have stopped, or are more than
+//! there is room for.
+
 use serde_json::json;
 
-use crate::claims::{Store, WINDOW_S, seconds};
+use crate::claims::{WINDOW_S, seconds};
 use crate::monitor::alert::{AlertKind, Severity};
-use crate::monitor::alert_lifecycle::{Cause, Finding};
-use crate::monitor::input::claim_state::ActiveClaim;
-use crate::monitor::monitor::{ESCALATE_S, Monitor};
-use crate::monitor::rules::mismatch::claimed;
-use crate::monitor::stats::claim_consistency::neg_log_p;
-use crate::monitor::stats::error_budget::TestFamily;
+use crate::monitor::evidence::claimed;
+use crate::monitor::finding::{Cause, Content, Finding};
+use crate::monitor::frame_context::{FrameContext, Overload};
 
-/// Claims in a row that may be lost, and how much longer than the whole log one user may be silent.
-const MOST_LOST: f64 = 20.0;
+/// Claim periods for which the whole log may be quiet, where they are longer than `claims_stale_s`.
+const QUIET_PERIODS: f64 = 5.0;
+/// Claim periods for which one user may be silent while their beam and the log go on: thirty claims in a hundred lost at random
+/// leave a gap of twenty once in 10¹⁰. Longer lets a user's claims be held back for longer.
+const SILENT_PERIODS: f64 = 20.0;
+/// How much longer one user may be silent than the whole log, in `claims_stale_s`.
 const USER_PATIENCE: f64 = 4.0;
+/// A user whose beam was seen within this is still on, s.
+const LIT_S: f64 = 1.0;
+/// Silence of the log in units of its limit from which it is critical.
+const CRITICAL_RATIO: f64 = 6.0;
 
-impl Monitor {
-    /// The health of what we are given: frames and claims.
-    pub fn watch_inputs(&mut self, active: &[ActiveClaim], claims: &Store, now: Timestamp) {
-        let lost = Cause::Whole(AlertKind::SensorLost);
-        let blind_s = self.sensor.blind_s(now);
-        if blind_s >= self.config.sensor_lost_s {
-            let finding = Finding::new(Severity::Critical, self.sensor.evidence(now));
-            self.alerts.report(&lost, finding, now, self.frame);
-        } else if blind_s == 0.0 {
-            self.alerts.absent(&lost, now);
-        }
-        self.watch_pose(now);
-        self.watch_flood(claims, now);
-        let stale = Cause::Whole(AlertKind::ClaimsStale);
-        let period = self.period_s.unwrap_or(0.0);
-        let limit = self.config.claims_stale_s.max(5.0 * period);
-        let log_is_stale =
-            self.alerts.is_open(&stale) || claims.quiet_s(now).is_some_and(|(came, made)| came.max(made) > limit);
-        self.watch_users_claims(active, log_is_stale, now);
-        match claims.quiet_s(now) {
-            Some((came, made)) if came.max(made) > limit && self.expects_claims(active) => {
-                let severity = if came.max(made) > 6.0 * limit {
-                    Severity::Critical
-                } else {
-                    Severity::Warning
-                };
-                let evidence = json!({
-                    "newest_came_s_ago": came,
-                    "newest_made_s_ago": made,
-                    "limit_s": limit,
-                    "typical_period_s": period,
-                });
-                self.alerts
-                    .report(&stale, Finding::new(severity, evidence), now, self.frame);
-            }
-            _ => self.alerts.absent(&stale, now),
-        }
+const SENSOR: Cause = Cause::System(AlertKind::SensorLost);
+const LOG: Cause = Cause::System(AlertKind::ClaimsStale);
+const FLOOD: Cause = Cause::System(AlertKind::ClaimsFlooded);
+
+/// No usable frame for `sensor_lost_s`. Ends with the first usable one.
+pub fn sensor_lost(frame: &FrameContext) -> Vec<Finding> {
+    let blind_s = frame.sensor.blind_s(frame.now);
+    if blind_s >= frame.config.sensor_lost_s {
+        let content = Content::new(Severity::Critical, frame.sensor.evidence(frame.now));
+        vec![Finding::present(SENSOR, content)]
+    } else if blind_s == 0.0 {
+        vec![Finding::Absent(SENSOR)]
+    } else {
+        Vec::new()
     }
+}
 
-    /// A beam whose user's claims have stopped while the others' go on: somebody may hold them back. Lost claims are no
-    /// matter: thirty in a hundred lost at random leave a gap of twenty periods once in 10¹⁰.
-    fn watch_users_claims(&mut self, active: &[ActiveClaim], log_is_stale: bool, now: Timestamp) {
-        let period = self.period_s.unwrap_or(0.0);
-        for a in active {
-            let periods = MOST_LOST * a.period_s.unwrap_or(0.0).clamp(period, 10.0 * period.max(0.1));
-            let limit = periods.max(USER_PATIENCE * self.config.claims_stale_s);
-            if a.age_s <= limit && !a.has_alert {
-                continue;
-            }
-            let cause = Cause::User(AlertKind::ClaimsStale, a.claim.user.clone());
-            let user = self.users.get(&a.claim.user);
-            let is_lit = user.is_some_and(|u| u.last_answered.is_some_and(|t| seconds(t, now) < 1.0));
-            // The whole log's silence is one cause and not one a user.
-            if a.ended || a.age_s <= limit || !is_lit || (log_is_stale && !self.alerts.is_open(&cause)) {
-                self.alerts.absent(&cause, now);
-                continue;
-            }
-            let evidence = json!({
-                "newest_made_s_ago": a.age_s,
-                "limit_s": limit,
-                "typical_period_s": period,
-            });
-            let mut finding = Finding::new(Severity::Warning, evidence);
-            finding.claimed = claimed(a);
-            self.alerts.report(&cause, finding, now, self.frame);
-        }
+/// Claims that are refused or shed for want of room or time, or are more than a frame is compared with.
+pub fn claims_flooded(frame: &FrameContext) -> Vec<Finding> {
+    let Overload {
+        squeezed,
+        left_out,
+        users,
+        max_users,
+    } = frame.overload;
+    if squeezed.total() == 0 && left_out == 0 {
+        return vec![Finding::Absent(FLOOD)];
     }
+    let raised_at = frame.alerts.raised_at(&FLOOD);
+    let severity = if squeezed.shed_known > 0 {
+        Severity::Critical
+    } else {
+        Severity::of_duration(raised_at.map_or(0.0, |since| seconds(since, frame.now)))
+    };
+    let claims_lost = squeezed.refused + squeezed.shed_new + squeezed.shed_known;
+    let evidence = json!({
+        "window_s": WINDOW_S,
+        "claims_refused": squeezed.refused,
+        "claims_shed": squeezed.shed_new,
+        "claims_of_known_users_shed": squeezed.shed_known,
+        "claims_lost_per_s": claims_lost as f64 / WINDOW_S as f64,
+        "users_forgotten_early": squeezed.forgotten_early,
+        "log_bytes_skipped": squeezed.skipped_bytes,
+        "users": users,
+        "max_users": max_users,
+        "claims_in_view_not_considered": left_out,
+    });
+    vec![Finding::present(FLOOD, Content::new(severity, evidence))]
+}
 
-    /// Claims that are refused or shed for want of room or time, or are more than a frame is held against.
-    fn watch_flood(&mut self, claims: &Store, now: Timestamp) {
-        let cause = Cause::Whole(AlertKind::ClaimsFlooded);
-        let squeezed = claims.squeezed(now);
-        if squeezed.total() == 0 && claims.left_out() == 0 {
-            self.alerts.absent(&cause, now);
-            return;
-        }
-        let lasted_s = self.alerts.raised_at(&cause).map_or(0.0, |since| seconds(since, now));
-        let severity = if squeezed.shed_known > 0 || lasted_s >= ESCALATE_S {
-            Severity::Critical
-        } else {
-            Severity::Warning
-        };
-        let claims_lost = squeezed.refused + squeezed.shed_new + squeezed.shed_known;
-        let evidence = json!({
-            "window_s": WINDOW_S,
-            "claims_refused": squeezed.refused,
-            "claims_shed": squeezed.shed_new,
-            "claims_of_known_users_shed": squeezed.shed_known,
-            "claims_lost_per_s": claims_lost as f64 / WINDOW_S as f64,
-            "users_forgotten_early": squeezed.forgotten_early,
-            "log_bytes_skipped": squeezed.skipped_bytes,
-            "users": claims.len(),
-            "max_users": claims.max_users(),
-            "claims_in_view_not_considered": claims.left_out(),
-        });
-        self.alerts
-            .report(&cause, Finding::new(severity, evidence), now, self.frame);
-    }
-
-    fn watch_pose(&mut self, now: Timestamp) {
-        let cause = Cause::Whole(AlertKind::PoseInconsistent);
-        let limit = self
-            .config
-            .pose_limit_m
-            .unwrap_or(0.5 * self.config.tolerated_distance_m);
-        let pose = self.pose.displacement();
-        let (agreeing, of) = self.pose.support();
-        let (place, worst) = self.worst_displacement();
-        let neg_log_p = neg_log_p(worst, &self.floor(place), limit);
-        let level = self.budget.level(TestFamily::PoseConsensus, 1.0);
-        let is_open = self.alerts.is_open(&cause);
-        if neg_log_p > level || (is_open && worst.norm() > 0.9 * limit) {
-            let severity = if worst.norm() > 4.0 * limit {
+/// Nothing new in the log, or nothing new of one user whose beam goes on.
+pub fn claims_stale(frame: &FrameContext) -> Vec<Finding> {
+    let period_s = frame.timing.period_s().unwrap_or(0.0);
+    let limit_s = frame.config.claims_stale_s.max(QUIET_PERIODS * period_s);
+    let quiet = frame.claims_quiet_s.filter(|(came, made)| came.max(*made) > limit_s);
+    let is_log_stale = frame.alerts.is_open(&LOG) || quiet.is_some();
+    let mut findings = of_users(frame, period_s, is_log_stale);
+    findings.push(match quiet.filter(|_| expects_claims(frame)) {
+        Some((came, made)) => {
+            let severity = if came.max(made) > CRITICAL_RATIO * limit_s {
                 Severity::Critical
             } else {
                 Severity::Warning
             };
             let evidence = json!({
-                "shift_m": [pose.shift.x, pose.shift.y],
-                "turned_deg": pose.turn.to_degrees(),
-                "scale": 1.0 + pose.scale,
-                "largest_in_view_m": worst.norm(),
-                "limit_m": limit,
-                "users_agreeing": agreeing,
-                "users": of,
-                "surprise": neg_log_p,
-                "threshold": level,
+                "newest_came_s_ago": came,
+                "newest_made_s_ago": made,
+                "limit_s": limit_s,
+                "typical_period_s": period_s,
             });
-            self.alerts
-                .report(&cause, Finding::new(severity, evidence), now, self.frame);
-        } else {
-            self.alerts.absent(&cause, now);
+            Finding::present(LOG, Content::new(severity, evidence))
         }
+        None => Finding::Absent(LOG),
+    });
+    findings
+}
+
+/// A beam whose user's claims have stopped while the others' go on: somebody may hold them back. The whole log's silence is one cause
+/// and not one a user.
+fn of_users(frame: &FrameContext, period_s: f64, is_log_stale: bool) -> Vec<Finding> {
+    let open = frame.alerts.users_with(AlertKind::ClaimsStale);
+    let mut findings = Vec::new();
+    for claim in frame.claims {
+        let user = claim.claim.user.as_str();
+        let is_open = open.contains(user);
+        let own_period_s = claim.period_s.unwrap_or(0.0);
+        let periods_s = SILENT_PERIODS * own_period_s.clamp(period_s, 10.0 * period_s.max(0.1));
+        let limit_s = periods_s.max(USER_PATIENCE * frame.config.claims_stale_s);
+        let last_seen = frame.users.get(user).and_then(|u| u.last_seen);
+        let is_lit = last_seen.is_some_and(|t| seconds(t, frame.now) < LIT_S);
+        let cause = || Cause::User(AlertKind::ClaimsStale, user.to_owned());
+        if claim.ended || claim.age_s <= limit_s || !is_lit || (is_log_stale && !is_open) {
+            if is_open {
+                findings.push(Finding::Absent(cause()));
+            }
+            continue;
+        }
+        let evidence = json!({
+            "newest_made_s_ago": claim.age_s,
+            "limit_s": limit_s,
+            "typical_period_s": period_s,
+        });
+        let content = Content::new(Severity::Warning, evidence).with_claim(claimed(claim));
+        findings.push(Finding::present(cause(), content));
+    }
+    findings
+}
+
+/// A network without users has nothing to say.
+fn expects_claims(frame: &FrameContext) -> bool {
+    frame.claims.iter().any(|a| !a.ended) || frame.tracker.tracks.iter().any(|t| t.confirmed)
+}
+
+#[cfg(test)]
+mod tests {
+    use jiff::SignedDuration;
+
+    use super::*;
+    use crate::monitor::fixture::{Scene, absent, present};
+
+    #[test]
+    fn a_second_without_a_usable_frame_is_a_lost_sensor() {
+        let mut scene = Scene::of_users(&[[0.0, 0.0]]);
+        scene.sensor.no_frame(scene.now);
+        scene.now += SignedDuration::from_millis(900);
+        assert!(sensor_lost(&scene.context()).is_empty(), "neither lost nor there");
+        scene.now += SignedDuration::from_millis(100);
+        assert_eq!(present(&sensor_lost(&scene.context())), [&SENSOR]);
+        scene.sensor = Default::default();
+        assert_eq!(absent(&sensor_lost(&scene.context())), [&SENSOR]);
     }
 
-    /// Where in view our pose error displaces positions most, of the middle and the four edges, and by how much.
-    fn worst_displacement(&self) -> (Vector2<f64>, Vector2<f64>) {
-        let pose = self.pose.displacement();
-        let [w, h] = [&self.camera.x, &self.camera.y].map(|axis| axis.half_width() * self.camera.ground_scale());
-        [[0.0, 0.0], [w, 0.0], [-w, 0.0], [0.0, h], [0.0, -h]]
-            .map(|[x, y]| Vector2::new(x, y))
-            .map(|p| (p, pose.at(p)))
-            .into_iter()
-            .max_by(|a, b| a.1.norm().total_cmp(&b.1.norm()))
-            .expect("five places")
+    #[test]
+    fn a_quiet_log_is_stale_if_there_is_anybody_to_claim() {
+        let mut scene = Scene::of_users(&[[0.0, 0.0]]);
+        // Five seconds, by arrival or by the claims' own times.
+        for (came, made, is_stale) in [(5.0, 5.0, false), (5.1, 0.0, true), (0.0, 5.1, true)] {
+            scene.claims_quiet_s = Some((came, made));
+            let findings = claims_stale(&scene.context());
+            assert_eq!(present(&findings).len(), usize::from(is_stale), "{came} {made}");
+        }
+        scene.claims_quiet_s = Some((31.0, 31.0));
+        let findings = claims_stale(&scene.context());
+        scene.apply(findings);
+        assert_eq!(scene.alerts.open().next().unwrap().1.severity, Severity::Critical);
+        let mut empty = Scene::of_users(&[]);
+        empty.claims_quiet_s = Some((31.0, 31.0));
+        assert_eq!(absent(&claims_stale(&empty.context())), [&LOG]);
     }
 
-    /// A network without users has nothing to say.
-    fn expects_claims(&self, active: &[ActiveClaim]) -> bool {
-        active.iter().any(|a| !a.ended) || self.tracks.all.iter().any(|t| t.confirmed)
+    #[test]
+    fn refused_shed_and_unconsidered_claims_are_a_flood() {
+        let mut scene = Scene::of_users(&[[0.0, 0.0]]);
+        assert_eq!(absent(&claims_flooded(&scene.context())), [&FLOOD]);
+        scene.overload.left_out = 1;
+        let findings = claims_flooded(&scene.context());
+        assert_eq!(present(&findings), [&FLOOD]);
+        scene.apply(findings);
+        scene.overload = Overload::default();
+        scene.overload.squeezed.refused = 50;
+        let findings = claims_flooded(&scene.context());
+        scene.apply(findings);
+        let alert = |scene: &Scene| scene.alerts.open().next().unwrap().1.clone();
+        assert_eq!(alert(&scene).severity, Severity::Warning);
+        // In the newest ten seconds.
+        assert_eq!(alert(&scene).evidence["claims_lost_per_s"], 5.0);
+        scene.overload.squeezed.shed_known = 1;
+        let findings = claims_flooded(&scene.context());
+        scene.apply(findings);
+        assert_eq!(
+            alert(&scene).severity,
+            Severity::Critical,
+            "claims of known users are lost"
+        );
+    }
+
+    #[test]
+    fn one_users_claims_that_stop_while_the_beam_goes_on_are_stale() {
+        let mut scene = Scene::of_users(&[[0.0, 0.0], [50.0, 0.0]]);
+        let silent = Cause::User(AlertKind::ClaimsStale, "u-1".into());
+        // Twenty periods of a second.
+        scene.claims[1].age_s = 20.0;
+        assert!(present(&claims_stale(&scene.context())).is_empty());
+        scene.claims[1].age_s = 20.1;
+        assert_eq!(present(&claims_stale(&scene.context())), [&silent]);
+        // The whole log's silence is one cause.
+        scene.claims_quiet_s = Some((20.0, 20.0));
+        assert_eq!(present(&claims_stale(&scene.context())), [&LOG]);
+        scene.claims_quiet_s = Some((0.0, 0.0));
+        let findings = claims_stale(&scene.context());
+        scene.apply(findings);
+        // The beam has been off for a second: that user is unseen, and not silent.
+        scene.now += SignedDuration::from_secs(1);
+        assert!(absent(&claims_stale(&scene.context())).contains(&&silent));
+    }
+
+    #[test]
+    fn a_user_who_seldom_claims_may_be_silent_for_longer() {
+        let mut scene = Scene::of_users(&[[0.0, 0.0], [50.0, 0.0]]);
+        scene.claims[1].period_s = Some(3.0);
+        scene.claims[1].age_s = 59.0;
+        assert!(present(&claims_stale(&scene.context())).is_empty());
+        scene.claims[1].age_s = 61.0;
+        assert_eq!(present(&claims_stale(&scene.context())).len(), 1);
     }
 }

@@ -1,164 +1,159 @@
-use jiff::Timestamp;
+//! `position_mismatch`: a user's beam is farther from the claim than is tolerated.
+
+use std::collections::BTreeMap;
+
 use nalgebra::{Matrix2, Vector2};
-use serde_json::{Value, json};
+use serde_json::json;
 
-use crate::claims::seconds;
-use crate::monitor::alert::{AlertKind, Severity};
-use crate::monitor::alert_lifecycle::{Cause, Finding};
-use crate::monitor::input::claim_state::{ActiveClaim, User};
-use crate::monitor::monitor::{COINCIDENCE_S, ESCALATE_S, Monitor, SYSTEMATIC_M};
-use crate::monitor::stats::claim_consistency::{WINDOWS, neg_log_p};
+use crate::monitor::alert::{Alert, AlertKind, Severity};
+use crate::monitor::evidence::{claimed, power_against_reported};
+use crate::monitor::finding::{Cause, Content, Finding};
+use crate::monitor::frame_context::FrameContext;
+use crate::monitor::stats::claim_consistency::{ClaimConsistency, WINDOWS};
 use crate::monitor::stats::error_budget::TestFamily;
+use crate::monitor::stats::gaussian::neg_log_p_outside;
 
-/// Frames in a row that must show a beam outside before a single claim's evidence stands.
+/// Frames in a row that must show a beam outside before a single claim's evidence stands. More delay the alert of a jump, fewer let
+/// one odd frame raise it.
 const OUTSIDE_FRAMES: u32 = 3;
-/// Users never seen at all that have an alert each; more of them within a cool-down have one cause, which is not theirs.
-const MOST_NEVER_SEEN: usize = 10;
-/// Names of them that the common alert gives.
-const MOST_NAMES: usize = 20;
+/// Claims in a row that must agree before a mismatch ends.
+const AGREEING_CLAIMS: usize = 2;
+/// Distance in units of the tolerated one from which a mismatch is critical.
+const CRITICAL_RATIO: f64 = 2.0;
 
-/// Users who are claimed and were never seen, too many for an alert each.
+/// What is remembered of each user.
 #[derive(Debug, Default)]
-struct NeverSeen {
-    names: Vec<String>,
-    longest_s: f64,
-    /// Users with an alert of their own, lately. Counted only when somebody asks.
-    with_alert: Option<usize>,
+pub struct Memory(BTreeMap<String, User>);
+
+#[derive(Debug, Default)]
+struct User {
+    consistency: ClaimConsistency,
+    /// Frames in a row with the beam outside what is tolerated.
+    outside: u32,
+    is_mismatched: bool,
+    /// A beam elsewhere took the user's place when they vanished.
+    is_displaced: bool,
 }
 
-impl Monitor {
-    /// Adds the frame's and the new claims' evidence to what is known of each user.
-    pub fn weigh(&mut self, active: &[ActiveClaim], association: &[Option<u64>], now: Timestamp) {
-        let tolerated = self.config.tolerated_distance_m;
-        let gate = self.budget.level(TestFamily::Mismatch, active.len() as f64);
-        let displacement = self.pose.displacement();
-        let unsure_s = self.unsure_of_clock_s(now);
-        // Before everybody has claimed once our own pose and the log's clock are not known.
-        let settled = self.claims_settled(now);
-        for (a, answer) in active.iter().zip(association) {
-            let track = answer.and_then(|id| self.tracks.get(id));
-            let confusion_m = track.map_or(0.0, |t| self.confusion_m(t, association));
-            let user = match self.users.get_mut(&a.claim.user) {
-                Some(user) => user,
-                None => self.users.entry(a.claim.user.clone()).or_default(),
-            };
-            let Some(track) = track else {
-                user.outside = 0;
-                if !a.expected || a.is_unresolvable {
-                    user.unanswered_since = None;
-                    user.absence = 0.0;
-                } else {
-                    user.unanswered_since.get_or_insert(now);
-                    // A beam in view is missed by chance in one frame of ten at the worst.
-                    user.absence += (1.0f64 / 0.1).ln();
+impl Memory {
+    pub fn is_mismatched(&self, user: &str) -> bool {
+        self.0.get(user).is_some_and(|u| u.is_mismatched)
+    }
+
+    /// Takes up a mismatch from before a restart.
+    pub fn restore(&mut self, alert: &Alert) {
+        if let (AlertKind::PositionMismatch, Some(user)) = (alert.kind, &alert.user) {
+            let known = self.0.entry(user.clone()).or_default();
+            known.is_mismatched = true;
+            known.is_displaced = alert.evidence["answered_from_elsewhere"].as_bool().unwrap_or(false);
+        }
+    }
+
+    /// The user's beam has been found elsewhere.
+    pub fn displace(&mut self, user: &str) {
+        self.0.entry(user.to_owned()).or_default().is_displaced = true;
+    }
+
+    /// Residuals so far were taken by another clock.
+    pub fn forget_residuals(&mut self) {
+        for user in self.0.values_mut().filter(|u| !u.is_mismatched) {
+            user.consistency.forget();
+        }
+    }
+
+    pub fn retain(&mut self, is_kept: impl Fn(&str) -> bool) {
+        self.0.retain(|user, _| is_kept(user));
+    }
+
+    /// Adds the residuals of new claims, and counts the frames that show a beam outside.
+    pub fn update(&mut self, frame: &FrameContext) {
+        let gate = frame.budget.threshold(TestFamily::Mismatch, frame.claims.len() as f64);
+        let displacement = frame.pose.displacement();
+        let clock_uncertainty_s = frame.clock_uncertainty_s();
+        let is_settled = frame.is_settled();
+        for (i, claim) in frame.claims.iter().enumerate() {
+            let Some(track) = frame.track(i) else {
+                if let Some(user) = self.0.get_mut(&claim.claim.user) {
+                    user.outside = 0;
                 }
                 continue;
             };
-            user.track = Some(track.id);
-            user.unanswered_since = None;
-            user.absence = 0.0;
-            user.first_answered.get_or_insert(now);
-            user.last_answered = Some(now);
-            if a.ended {
+            let user = self.0.entry(claim.claim.user.clone()).or_default();
+            if claim.ended {
                 continue;
             }
-            let claimed = Vector2::new(a.claim.x_m, a.claim.y_m);
-            let claimed = claimed + displacement.at(claimed);
-            if user.residuals.newest().is_none_or(|t| t < a.claim.time) {
+            let confusion_m = frame.confusion_m(track);
+            if user.consistency.newest().is_none_or(|t| t < claim.claim.time) {
                 let is_clear = track.confirmed && track.merged_into.is_none() && confusion_m == 0.0;
-                if let Some(stamped) = track.at(a.claim.time).filter(|_| is_clear && !user.mismatched) {
-                    user.clock.push(stamped - claimed, track.motion.velocity(), a.variance);
-                }
-                match track.at(a.made) {
-                    Some(then) if is_clear && settled => {
-                        let beam = track.motion.position_cov();
-                        user.residuals.push(a.claim.time, then - claimed, beam, a.variance);
+                match track.at(claim.made) {
+                    Some(then) if is_clear && is_settled => {
+                        let claimed = Vector2::new(claim.claim.x_m, claim.claim.y_m);
+                        let claimed = claimed + displacement.at(claimed);
+                        let beam = track.filter.position_cov();
+                        user.consistency
+                            .push(claim.claim.time, then - claimed, beam, claim.variance);
                     }
-                    _ if track.confirmed => user.residuals.skip(a.claim.time),
+                    _ if track.confirmed => user.consistency.skip(claim.claim.time),
                     _ => {}
                 }
             }
-            let floor = Matrix2::identity() * (SYSTEMATIC_M.powi(2) + self.pose.variance(a.position));
-            let cov = track.motion.position_cov() + Matrix2::identity() * a.variance + floor;
-            let offset = track.motion.position() - a.position;
-            let reach = tolerated + a.slack_m + confusion_m + unsure_s * track.motion.velocity().norm();
-            let is_outside = track.hit && track.confirmed && neg_log_p(offset, &cov, reach) > gate;
+            let cov = track.filter.position_cov()
+                + Matrix2::identity() * claim.variance
+                + frame.systematic_cov(claim.position);
+            let offset = track.filter.position() - claim.position;
+            let reach = frame.config.tolerated_distance_m
+                + claim.slack_m
+                + confusion_m
+                + clock_uncertainty_s * track.filter.velocity().norm();
+            let is_outside = track.hit && track.confirmed && neg_log_p_outside(offset, &cov, reach) > gate;
             user.outside = if is_outside { user.outside + 1 } else { 0 };
         }
-        let alerts = &self.alerts;
-        self.users.retain(|name, _| {
-            is_present(active, name)
-                || [
-                    AlertKind::PositionMismatch,
-                    AlertKind::UserUnseen,
-                    AlertKind::ClaimsStale,
-                ]
-                .iter()
-                .any(|k| alerts.is_open(&Cause::User(*k, name.clone())))
-                || alerts.is_open(&Cause::Spot(name.clone()))
-        });
     }
+}
 
-    pub fn decide_users(&mut self, active: &[ActiveClaim], association: &[Option<u64>], now: Timestamp) {
-        let each = (active.len() * WINDOWS.len()) as f64;
-        let level = self
-            .budget
-            .level_every(self.period_s.unwrap_or(0.0), TestFamily::Mismatch, each);
-        let level_unseen = self.budget.level(TestFamily::Unseen, active.len() as f64);
-        let mut never_seen = NeverSeen::default();
-        for (i, a) in active.iter().enumerate() {
-            self.decide_mismatch(active, association, i, level, now);
-            self.decide_unseen(a, level_unseen, &mut never_seen, now);
-        }
-        self.decide_never_seen(never_seen, now);
-        let orphans: Vec<Cause> = self
-            .alerts
-            .open()
-            .filter(|(c, _)| matches!(c, Cause::User(_, user) if !is_present(active, user)))
-            .map(|(c, _)| c.clone())
-            .collect();
-        for cause in orphans {
-            self.alerts.absent(&cause, now);
+/// Tests every user's claims against their beam, over windows of claims and frame by frame.
+pub fn evaluate(frame: &FrameContext, memory: &mut Memory) -> Vec<Finding> {
+    let tests = (frame.claims.len() * WINDOWS.len()) as f64;
+    let period_s = frame.timing.period_s().unwrap_or(0.0);
+    let threshold = frame.budget.threshold_every(period_s, TestFamily::Mismatch, tests);
+    let open = frame.alerts.users_with(AlertKind::PositionMismatch);
+    let mut findings = Vec::new();
+    for i in 0..frame.claims.len() {
+        let user = frame.claims[i].claim.user.as_str();
+        let content = memory
+            .0
+            .get_mut(user)
+            .and_then(|known| known.mismatch(frame, i, threshold));
+        let cause = || Cause::User(AlertKind::PositionMismatch, user.to_owned());
+        match content {
+            Some(content) => findings.push(Finding::present(cause(), content)),
+            None if open.contains(user) => findings.push(Finding::Absent(cause())),
+            None => {}
         }
     }
+    findings
+}
 
-    fn decide_mismatch(
-        &mut self,
-        active: &[ActiveClaim],
-        association: &[Option<u64>],
-        i: usize,
-        level: f64,
-        now: Timestamp,
-    ) {
-        let a = &active[i];
-        if association[i].is_none() && !a.was_seen() && !a.has_alert {
-            return;
+impl User {
+    /// Decides on claim `i`, this user's.
+    fn mismatch(&mut self, frame: &FrameContext, i: usize, threshold: f64) -> Option<Content> {
+        let claim = &frame.claims[i];
+        let track = frame.track(i);
+        let tolerated = frame.config.tolerated_distance_m;
+        if self.is_mismatched && self.outside == 0 && self.consistency.agree(AGREEING_CLAIMS, tolerated) {
+            // What showed this mismatch is over and must not show another one.
+            self.consistency.forget();
+            self.is_mismatched = false;
+            self.is_displaced = false;
         }
-        let tolerated = self.config.tolerated_distance_m;
-        let floor = self.floor(a.position);
-        let cause = Cause::User(AlertKind::PositionMismatch, a.claim.user.clone());
-        let track = association[i].and_then(|id| self.tracks.get(id));
-        let unsure_s = self.unsure_of_clock_s(now);
-        let settled = self.claims_settled(now);
-        let Some(user) = self.users.get_mut(&a.claim.user) else {
-            return;
-        };
-        if user.mismatched && user.outside == 0 && user.residuals.agree(2, tolerated) {
-            // What told of the mismatch is over and must not tell of another one.
-            user.residuals.forget();
-            user.mismatched = false;
-            user.displaced = false;
-        }
-        let unsure = track.map_or(0.0, |t| unsure_s * t.motion.velocity().norm());
-        let excess = user.residuals.excess(tolerated + unsure, &floor);
-        user.mismatched |= settled && (user.outside >= OUTSIDE_FRAMES || excess.neg_log_p > level);
-        let Some(track) = track.filter(|_| !a.ended && user.mismatched) else {
-            self.alerts.absent(&cause, now);
-            return;
-        };
-        let distance = (track.motion.position() - a.position).norm();
-        let (is_displaced, outside) = (user.displaced, user.outside);
-        let severity = if is_displaced || distance > 2.0 * tolerated {
+        let unsure = track.map_or(0.0, |t| frame.clock_uncertainty_s() * t.filter.velocity().norm());
+        let excess = self
+            .consistency
+            .excess(tolerated + unsure, &frame.systematic_cov(claim.position));
+        self.is_mismatched |= frame.is_settled() && (self.outside >= OUTSIDE_FRAMES || excess.neg_log_p > threshold);
+        let track = track.filter(|_| !claim.ended && self.is_mismatched)?;
+        let distance = (track.filter.position() - claim.position).norm();
+        let severity = if self.is_displaced || distance > CRITICAL_RATIO * tolerated {
             Severity::Critical
         } else {
             Severity::Warning
@@ -168,115 +163,175 @@ impl Monitor {
             "distance_m": distance,
             "tolerated_distance_m": tolerated,
             "surprise": excess.neg_log_p,
-            "threshold": level,
+            "threshold": threshold,
             "claims_in_window": excess.window,
             "mean_distance_m": excess.distance_m,
-            "frames_outside": outside,
-            "clock_offset_s": self.ahead_s,
-            "answered_from_elsewhere": is_displaced,
-            "power_against_reported": self.against_reported(active, association, i),
+            "frames_outside": self.outside,
+            "clock_offset_s": frame.clock_offset_s,
+            "answered_from_elsewhere": self.is_displaced,
+            "power_against_reported": power_against_reported(frame, i),
         });
-        let mut finding = self.at_track(Finding::new(severity, evidence), track);
-        finding.claimed = claimed(a);
-        self.alerts.report(&cause, finding, now, self.frame);
+        let content = Content::new(severity, evidence).at(track.filter.position(), track.filter.position_cov());
+        Some(content.with_claim(claimed(claim)))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::monitor::fixture::{Scene, absent, present};
+
+    /// One user whose beam is at the origin.
+    struct Watch {
+        scene: Scene,
+        memory: Memory,
     }
 
-    fn decide_unseen(&mut self, a: &ActiveClaim, level: f64, never_seen: &mut NeverSeen, now: Timestamp) {
-        let Some(user) = self.users.get(&a.claim.user) else {
-            return;
-        };
-        let gone_s = user.unanswered_since.map_or(0.0, |t| seconds(t, now));
-        let claimed_since = user
-            .unanswered_since
-            .is_some_and(|t| a.claim.time > t || user.last_answered.is_none());
-        let is_unseen = a.expected
-            && user.absence >= level
-            && gone_s >= self.config.decision_s
-            && claimed_since
-            && self.claims_settled(now)
-            && !self.awaits_unassociated(user, gone_s);
-        if !is_unseen && !a.has_alert {
-            return;
+    impl Watch {
+        /// Their first claim has been taken, and is true.
+        fn new() -> Self {
+            let mut watch = Self {
+                scene: Scene::of_users(&[[0.0, 0.0]]),
+                memory: Memory::default(),
+            };
+            assert!(watch.show().is_empty());
+            watch
         }
-        let cause = Cause::User(AlertKind::UserUnseen, a.claim.user.clone());
-        let goes_on = self.alerts.is_open(&cause) && a.expected && user.absence > 0.0;
-        if !is_unseen && !goes_on {
-            self.alerts.absent(&cause, now);
-            return;
+
+        /// A frame.
+        fn show(&mut self) -> Vec<Finding> {
+            self.scene.show(&[[0.0, 0.0]]);
+            self.memory.update(&self.scene.context());
+            let findings = evaluate(&self.scene.context(), &mut self.memory);
+            self.scene.apply(findings.clone());
+            findings
         }
-        if user.last_answered.is_none() && !self.alerts.is_open(&cause) {
-            let with_alert = never_seen
-                .with_alert
-                .get_or_insert_with(|| self.alerts.users_lately(AlertKind::UserUnseen, now));
-            if *with_alert >= MOST_NEVER_SEEN || self.alerts.is_open(&Cause::Whole(AlertKind::UserUnseen)) {
-                never_seen.names.push(a.claim.user.clone());
-                never_seen.longest_s = never_seen.longest_s.max(gone_s);
-                return;
+
+        /// From now on the claim so far puts the user x m from the beam.
+        fn move_claim(&mut self, x: f64) {
+            self.scene.claims[0].position.x = x;
+        }
+
+        /// A frame with a new claim, x m from the beam.
+        fn claim(&mut self, x: f64) -> Vec<Finding> {
+            self.scene.claim(0, x, 0.0);
+            self.show()
+        }
+    }
+
+    #[test]
+    fn a_beam_outside_for_three_frames_is_a_mismatch() {
+        let mut watch = Watch::new();
+        watch.move_claim(9.0);
+        assert!(watch.show().is_empty());
+        assert!(watch.show().is_empty());
+        let findings = watch.show();
+        assert_eq!(
+            present(&findings),
+            [&Cause::User(AlertKind::PositionMismatch, "u-0".into())]
+        );
+        let alert = watch.scene.alerts.open().next().unwrap().1;
+        assert_eq!(alert.severity, Severity::Warning);
+        assert_eq!(alert.evidence["frames_outside"], 3);
+        assert!((alert.evidence["distance_m"].as_f64().unwrap() - 9.0).abs() < 1e-9);
+        assert!(watch.memory.is_mismatched("u-0"));
+    }
+
+    #[test]
+    fn a_beam_within_what_is_tolerated_or_outside_now_and_then_is_none() {
+        let mut watch = Watch::new();
+        watch.move_claim(4.9);
+        assert!((0..10).all(|_| watch.show().is_empty()));
+        for k in 0..10 {
+            watch.move_claim(if k % 3 == 0 { 0.0 } else { 9.0 });
+            assert!(watch.show().is_empty());
+        }
+    }
+
+    #[test]
+    fn a_claim_far_off_is_a_mismatch_at_once() {
+        let mut watch = Watch::new();
+        assert_eq!(present(&watch.claim(9.0)).len(), 1);
+        let alert = watch.scene.alerts.open().next().unwrap().1;
+        assert_eq!(
+            (&alert.evidence["claims_in_window"], &alert.evidence["frames_outside"]),
+            (&json!(1), &json!(1))
+        );
+    }
+
+    #[test]
+    fn twice_the_tolerated_distance_or_an_answer_from_elsewhere_is_critical() {
+        for (x, displaced, severity) in [
+            (9.9, false, Severity::Warning),
+            (10.1, false, Severity::Critical),
+            (9.9, true, Severity::Critical),
+        ] {
+            let mut watch = Watch::new();
+            if displaced {
+                watch.memory.displace("u-0");
             }
-            *with_alert += 1;
+            watch.claim(x);
+            let alert = watch.scene.alerts.open().next().unwrap().1;
+            assert_eq!(alert.severity, severity);
+            assert_eq!(alert.evidence["answered_from_elsewhere"], displaced);
         }
-        let severity = severity_after(gone_s);
-        let evidence = json!({
-            "unseen_s": gone_s,
-            "last_seen": user.last_answered,
-            "log_likelihood_ratio": user.absence,
-            "threshold": level,
-        });
-        let mut finding = Finding::new(severity, evidence);
-        finding.claimed = claimed(a);
-        self.alerts.report(&cause, finding, now, self.frame);
     }
 
-    /// One alert for all who were never seen, beyond the first few: who floods the log with invented users must not bury
-    /// the alerts of others. A user who was ever seen always has their own.
-    fn decide_never_seen(&mut self, never_seen: NeverSeen, now: Timestamp) {
-        let cause = Cause::Whole(AlertKind::UserUnseen);
-        self.never_seen = never_seen.names;
-        if self.never_seen.is_empty() {
-            self.alerts.absent(&cause, now);
-            return;
-        }
-        let evidence = json!({
-            "users_never_seen": self.never_seen.len(),
-            "users": &self.never_seen[..self.never_seen.len().min(MOST_NAMES)],
-            "unseen_s": never_seen.longest_s,
-        });
-        let finding = Finding::new(severity_after(never_seen.longest_s), evidence);
-        self.alerts.report(&cause, finding, now, self.frame);
+    #[test]
+    fn a_mismatch_ends_when_two_claims_agree() {
+        let mut watch = Watch::new();
+        watch.claim(9.0);
+        assert_eq!(present(&watch.claim(0.0)).len(), 1, "one claim agrees");
+        assert_eq!(present(&watch.show()).len(), 1, "the same claim again");
+        assert_eq!(absent(&watch.claim(0.0)).len(), 1);
+        assert!(!watch.memory.is_mismatched("u-0"));
     }
 
-    /// Whether a beam that came as the user went is still being judged: it may be the user answering from elsewhere, which is
-    /// one alert and not two. New beams without end put the verdict off by no more than a coincidence lasts.
-    fn awaits_unassociated(&self, user: &User, gone_s: f64) -> bool {
-        let Some(gone) = user.unanswered_since else {
-            return false;
+    #[test]
+    fn an_ended_claim_is_compared_with_nothing() {
+        let mut watch = Watch::new();
+        watch.scene.claims[0].ended = true;
+        assert!((0..10).all(|_| watch.claim(9.0).is_empty()));
+    }
+
+    #[test]
+    fn before_everybody_has_claimed_nothing_is_decided() {
+        let mut watch = Watch::new();
+        watch.scene.timing = Default::default();
+        assert!((0..10).all(|_| watch.claim(9.0).is_empty()));
+    }
+
+    #[test]
+    fn residuals_by_another_clock_are_forgotten_unless_they_are_a_mismatch() {
+        // Each alone is too little: 6.2 m with an error of 0.3 m.
+        let claims_until_found = |forget_after: usize| {
+            let mut watch = Watch::new();
+            let mut claims = 1;
+            while present(&watch.claim(6.2)).is_empty() {
+                if claims == forget_after {
+                    watch.memory.forget_residuals();
+                }
+                claims += 1;
+                assert!(claims < 50, "many together are enough");
+            }
+            watch.memory.forget_residuals();
+            assert_eq!(present(&watch.show()).len(), 1, "a mismatch is kept");
+            claims
         };
-        gone_s < self.config.decision_s + COINCIDENCE_S
-            && self.unassociated_since.iter().any(|(id, since)| {
-                let coincides = seconds(gone, *since).abs() <= COINCIDENCE_S;
-                coincides && !self.alerts.is_open(&Cause::Track(AlertKind::UnclaimedEmitter, *id))
-            })
+        let (undisturbed, disturbed) = (claims_until_found(50), claims_until_found(3));
+        assert!(undisturbed > 2 && disturbed > undisturbed, "{undisturbed} {disturbed}");
     }
-}
 
-/// Whether the user has a claim in the frame; claims come by name.
-fn is_present(active: &[ActiveClaim], user: &str) -> bool {
-    active.binary_search_by(|a| a.claim.user.as_str().cmp(user)).is_ok()
-}
-
-fn severity_after(gone_s: f64) -> Severity {
-    if gone_s >= ESCALATE_S {
-        Severity::Critical
-    } else {
-        Severity::Warning
+    #[test]
+    fn a_mismatch_outlasts_a_restart() {
+        let mut watch = Watch::new();
+        watch.claim(9.0);
+        let alert = watch.scene.alerts.open().next().unwrap().1.clone();
+        let mut restarted = Memory::default();
+        restarted.restore(&alert);
+        assert!(restarted.is_mismatched("u-0"));
+        assert_eq!(present(&evaluate(&watch.scene.context(), &mut restarted)).len(), 1);
+        restarted.retain(|user| user != "u-0");
+        assert!(!restarted.is_mismatched("u-0"));
     }
-}
-
-pub fn claimed(a: &ActiveClaim) -> Option<Value> {
-    Some(json!({
-        "x_m": a.claim.x_m,
-        "y_m": a.claim.y_m,
-        "sigma_m": a.claim.sigma_m,
-        "time": a.claim.time,
-    }))
 }

@@ -1,225 +1,369 @@
+//! `unclaimed_emitter`: a beam that no claim is associated with, for long enough to have been claimed.
+
+use std::collections::{BTreeMap, BTreeSet};
+
 use jiff::Timestamp;
 use nalgebra::Vector2;
 use serde_json::{Value, json};
 
 use crate::claims::seconds;
-use crate::monitor::alert::SAME_PLACE_M;
-use crate::monitor::alert::{AlertKind, Severity};
-use crate::monitor::alert_lifecycle::{Cause, Finding};
-use crate::monitor::evidence::likelihood_ratio;
-use crate::monitor::input::claim_state::ActiveClaim;
-use crate::monitor::input::claim_timing::median;
-use crate::monitor::monitor::{COINCIDENCE_S, ESCALATE_S, Monitor};
-use crate::monitor::track::tracker::Track;
+use crate::monitor::alert::{SAME_PLACE_M, Severity};
+use crate::monitor::alert_lifecycle::AlertLifecycle;
+use crate::monitor::evidence::stranger_likelihood_ratio;
+use crate::monitor::finding::{Cause, Content, Finding};
+use crate::monitor::frame_context::FrameContext;
+use crate::monitor::stats::error_budget::{ErrorBudget, TestFamily};
+use crate::monitor::stats::robust::median_high;
+use crate::monitor::track::association::Association;
+use crate::monitor::track::tracker::{Track, Tracker};
 
-/// ln likelihood ratio from which a user counts as vanished: three frames in a row.
-const VANISHED: f64 = 6.9;
-/// Share of the time to decide that a beam is given to be claimed; the rest is for frames that miss it, and for a beam that comes on
-/// within another's spot and is seen only as it walks out.
-const PATIENCE: f64 = 0.65;
+/// Resolutions of a spot within which the beam that an alert was about and the one that now has no claim are the same two.
+const SWAP_RESOLUTIONS: f64 = 2.0;
+/// Absences of an honest user, one an hour: what a user's absence at the same moment is by chance. Assumed; evidence only.
+const ABSENCE_PERIOD_S: f64 = 3600.0;
 
-impl Monitor {
-    /// Notes since when each beam has had no claim.
-    pub fn note_unassociated(&mut self, association: &[Option<u64>], now: Timestamp) {
-        let tracks = &self.tracks;
-        self.unassociated_since.retain(|id, _| tracks.get(*id).is_some());
-        for track in &self.tracks.all {
-            if association.contains(&Some(track.id)) {
-                self.unassociated_since.remove(&track.id);
+/// Since when each track has had no claim.
+#[derive(Debug, Default)]
+pub struct Memory(BTreeMap<u64, Timestamp>);
+
+/// Threshold on a track's score.
+pub fn threshold(budget: &ErrorBudget) -> f64 {
+    budget.threshold(TestFamily::Unclaimed, 1.0)
+}
+
+impl Memory {
+    /// Takes a frame's association. A track whose measurement merged into another's starts to be without a claim when the two
+    /// are resolved.
+    pub fn update(&mut self, tracker: &Tracker, association: &Association, now: Timestamp) {
+        self.0.retain(|id, _| tracker.get(*id).is_some());
+        for track in &tracker.tracks {
+            if association.contains(track.id) {
+                self.0.remove(&track.id);
             } else if track.hit && track.unresolved_from.is_none() {
-                self.unassociated_since.entry(track.id).or_insert(now);
+                self.0.entry(track.id).or_insert(now);
             }
         }
     }
 
-    /// How long what may be a user's waits for a claim.
-    pub fn patience_s(&self) -> f64 {
-        PATIENCE * self.config.decision_s + self.delay_s
+    /// Whether the track has had no claim in the newest frame.
+    pub fn is_unclaimed(&self, track: u64) -> bool {
+        self.0.contains_key(&track)
     }
 
-    pub fn decide_unclaimed(&mut self, active: &[ActiveClaim], association: &mut [Option<u64>], now: Timestamp) {
-        let settled = self.claims_settled(now);
-        let patience = self.patience_s();
-        let candidates: Vec<Track> = self
-            .tracks
-            .all
-            .iter()
-            .filter(|t| self.unassociated_since.contains_key(&t.id))
-            .cloned()
-            .collect();
-        for track in &candidates {
-            let cause = Cause::Track(AlertKind::UnclaimedEmitter, track.id);
-            let since = self.unassociated_since[&track.id];
-            let open = self.alerts.is_open(&cause);
-            let ripe = settled
-                && track.hit
-                && track.unresolved_from.is_none()
-                && track.confirmed
-                && track.score >= self.level_unclaimed
-                && seconds(since, now) >= patience;
-            if !open && !ripe {
+    /// The track has been associated after all.
+    pub fn remove(&mut self, track: u64) {
+        self.0.remove(&track);
+    }
+
+    /// Tracks that would be alerted now, and since when they have had no claim.
+    pub fn due(&self, frame: &FrameContext) -> Vec<(u64, Timestamp)> {
+        let tracks = frame.tracker.tracks.iter();
+        tracks
+            .filter_map(|track| Some((track, *self.0.get(&track.id)?)))
+            .filter(|(track, since)| is_due(frame, track, *since))
+            .filter(|(track, _)| !frame.alerts.is_open(&Cause::Track(track.id)))
+            .map(|(track, since)| (track.id, since))
+            .collect()
+    }
+
+    /// Since when each track without a claim and without an alert has had none.
+    pub fn undecided(&self, alerts: &AlertLifecycle) -> Vec<Timestamp> {
+        let open = |id: u64| alerts.is_open(&Cause::Track(id));
+        self.0.iter().filter(|(id, _)| !open(**id)).map(|(_, t)| *t).collect()
+    }
+}
+
+pub fn evaluate(frame: &FrameContext, memory: &mut Memory) -> Vec<Finding> {
+    let mut findings = Vec::new();
+    // Alerts as they will stand after these findings.
+    let mut alerted: BTreeSet<u64> = frame
+        .alerts
+        .open()
+        .filter_map(|(cause, _)| match cause {
+            Cause::Track(id) => Some(*id),
+            _ => None,
+        })
+        .collect();
+    let before = alerted.clone();
+    let mut moved: BTreeSet<Cause> = BTreeSet::new();
+    for track in &frame.tracker.tracks {
+        let Some(since) = memory.0.get(&track.id).copied() else {
+            continue;
+        };
+        if !alerted.contains(&track.id) {
+            if !is_due(frame, track, since) {
                 continue;
             }
-            if !open {
-                if let Some(i) = self.displaced_user(active, association, since) {
-                    association[i] = Some(track.id);
-                    let user = self.users.entry(active[i].claim.user.clone()).or_default();
-                    user.track = Some(track.id);
-                    user.unanswered_since = None;
-                    user.absence = 0.0;
-                    user.displaced = true;
-                    self.unassociated_since.remove(&track.id);
-                    continue;
+            if let Some(old) = lost_alert_near(frame, memory, track, &moved) {
+                if let Cause::Track(id) = old {
+                    alerted.remove(&id);
                 }
-                if let Some(old) = self.lost_alert_near(track) {
-                    self.alerts.rename(&old, cause.clone());
-                }
+                findings.push(Finding::Renamed {
+                    from: old.clone(),
+                    to: Cause::Track(track.id),
+                });
+                moved.insert(old);
             }
-            if track.hit {
-                let finding = self.unclaimed(active, track, since, now);
-                self.alerts.report(&cause, finding, now, self.frame);
-            }
+            alerted.insert(track.id);
         }
-        let open: Vec<(Cause, u64)> = self
-            .alerts
-            .open()
-            .filter_map(|(c, _)| match c {
-                Cause::Track(_, id) => Some((c.clone(), *id)),
-                _ => None,
-            })
-            .collect();
-        for (cause, id) in open {
-            let still = self.tracks.get(id).is_some_and(Track::is_seen) && self.unassociated_since.contains_key(&id);
-            if !still {
-                match self.swapped_with(id, association) {
-                    Some(other) => {
-                        self.unassociated_since.insert(other, now);
-                        self.alerts
-                            .rename(&cause, Cause::Track(AlertKind::UnclaimedEmitter, other));
-                    }
-                    None => self.alerts.absent(&cause, now),
-                }
-            }
+        if track.hit {
+            findings.push(Finding::present(Cause::Track(track.id), content(frame, track, since)));
         }
     }
-
-    /// The beam without a claim in the spot that track `id` is in, when `id` itself answers one: where two beams melt, which
-    /// is whose is a guess, and that one of them is nobody's is not.
-    fn swapped_with(&self, id: u64, association: &[Option<u64>]) -> Option<u64> {
-        let track = self.tracks.get(id).filter(|_| association.contains(&Some(id)))?;
-        let here = track.motion.position();
-        let reach = 2.0 * track.detection.resolution_m;
-        let others = self.tracks.all.iter().filter(|t| {
-            let cause = Cause::Track(AlertKind::UnclaimedEmitter, t.id);
-            t.id != id
-                && t.is_seen()
-                && t.confirmed
-                && !association.contains(&Some(t.id))
-                && !self.alerts.is_open(&cause)
-        });
-        let near = others.filter(|t| (t.motion.position() - here).norm() < reach);
-        near.map(|t| t.id).next()
+    for id in before {
+        let is_moved = moved.contains(&Cause::Track(id));
+        let is_there = frame.tracker.get(id).is_some_and(Track::is_seen) && memory.0.contains_key(&id);
+        if is_moved || is_there {
+            continue;
+        }
+        match swapped_with(frame, id, &alerted) {
+            Some(other) => {
+                memory.0.insert(other, frame.now);
+                alerted.remove(&id);
+                alerted.insert(other);
+                findings.push(Finding::Renamed {
+                    from: Cause::Track(id),
+                    to: Cause::Track(other),
+                });
+            }
+            None => findings.push(Finding::Absent(Cause::Track(id))),
+        }
     }
+    findings
+}
 
-    /// A user whose beam vanished as this one appeared, or who has not been seen yet. Where several have not been seen, which
-    /// of them it is would be a guess, and the beam is nobody's.
-    fn displaced_user(&self, active: &[ActiveClaim], association: &[Option<u64>], since: Timestamp) -> Option<usize> {
-        let seen = |i: usize| {
-            let user = self.users.get(&active[i].claim.user);
-            user.is_some_and(|u| u.last_answered.is_some())
+/// Whether a beam that has had no claim since then is an emitter, and claims have had time to come.
+fn is_due(frame: &FrameContext, track: &Track, since: Timestamp) -> bool {
+    frame.is_settled()
+        && track.hit
+        && track.unresolved_from.is_none()
+        && track.confirmed
+        && track.score >= threshold(frame.budget)
+        && seconds(since, frame.now) >= frame.claim_wait_s()
+}
+
+/// The beam without a claim in the spot of track `id`, when `id` itself is associated with one: where two beams merge, which is
+/// whose is a guess, and that one of them is nobody's is not.
+fn swapped_with(frame: &FrameContext, id: u64, alerted: &BTreeSet<u64>) -> Option<u64> {
+    let track = frame.tracker.get(id).filter(|_| frame.association.contains(id))?;
+    let here = track.filter.position();
+    let reach = SWAP_RESOLUTIONS * track.detection.resolution_m;
+    let mut others = frame.tracker.tracks.iter().filter(|t| {
+        t.id != id && t.is_seen() && t.confirmed && !frame.association.contains(t.id) && !alerted.contains(&t.id)
+    });
+    others
+        .find(|t| (t.filter.position() - here).norm() < reach)
+        .map(|t| t.id)
+}
+
+/// An open alert near here, not `moved` yet, whose own track was lost or is associated with a claim by now: the same cause.
+fn lost_alert_near(frame: &FrameContext, memory: &Memory, track: &Track, moved: &BTreeSet<Cause>) -> Option<Cause> {
+    let here = track.filter.position();
+    let mut open = frame.alerts.open().filter(|(cause, _)| !moved.contains(cause));
+    open.find_map(|(cause, alert)| {
+        let is_lost = match cause {
+            Cause::Track(id) => !memory.0.contains_key(id) || frame.tracker.get(*id).is_none_or(|t| !t.hit),
+            Cause::CoLocated(_) => true,
+            _ => return None,
         };
-        let candidates = (0..active.len())
-            .filter(|&i| association[i].is_none() && active[i].expected)
-            .filter_map(|i| {
-                let name = &active[i].claim.user;
-                if self.alerts.is_open(&Cause::User(AlertKind::UserUnseen, name.clone())) {
-                    return None;
-                }
-                let user = self.users.get(name)?;
-                let gap = seconds(user.unanswered_since?, since).abs();
-                (user.absence >= VANISHED && gap <= COINCIDENCE_S).then_some((i, gap))
-            });
-        let (known, new): (Vec<_>, Vec<_>) = candidates.partition(|(i, _)| seen(*i));
-        let candidates = if known.is_empty() && new.len() == 1 { new } else { known };
-        let nearest = candidates.into_iter().min_by(|a, b| a.1.total_cmp(&b.1));
-        nearest.map(|(i, _)| i)
-    }
+        let place = Vector2::new(alert.x_m?, alert.y_m?);
+        (is_lost && (here - place).norm() < SAME_PLACE_M).then(|| cause.clone())
+    })
+}
 
-    /// An open alert near here whose own track was lost, or took the place of the beam that answered a claim: the same cause.
-    fn lost_alert_near(&self, track: &Track) -> Option<Cause> {
-        let p = track.motion.position();
-        self.alerts.open().find_map(|(cause, alert)| {
-            let lost = match cause {
-                Cause::Track(AlertKind::UnclaimedEmitter, id) => {
-                    !self.unassociated_since.contains_key(id) || self.tracks.get(*id).is_none_or(|t| !t.hit)
-                }
-                Cause::Spot(_) => true,
-                _ => return None,
-            };
-            let (x, y) = (alert.x_m?, alert.y_m?);
-            (lost && (p - Vector2::new(x, y)).norm() < SAME_PLACE_M).then(|| cause.clone())
+/// What else is evidence of an eavesdropper, each with its likelihood ratio against an honest stray beam.
+fn content(frame: &FrameContext, track: &Track, since: Timestamp) -> Content {
+    let lasted_s = seconds(since, frame.now);
+    let evidence = json!({
+        "track": track.id,
+        "seen_since": track.since,
+        "unclaimed_s": lasted_s,
+        "log_likelihood_ratio": track.score,
+        "threshold": threshold(frame.budget),
+        "energy_j": track.detection.energy_j,
+        "energy_against_users": energy_against_users(frame, track),
+        "nearest_user": nearest_user(frame, track),
+        "vanished_users": vanished_users(frame, since),
+        "flags": track.detection.flags,
+    });
+    Content::new(Severity::of_duration(lasted_s), evidence).at(track.filter.position(), track.filter.position_cov())
+}
+
+/// One who wants a user's light stands within its spot; one who does not is anywhere in view.
+fn nearest_user(frame: &FrameContext, track: &Track) -> Option<Value> {
+    let here = track.filter.position();
+    let (claim, distance) = frame
+        .claims
+        .iter()
+        .filter(|a| !a.ended)
+        .map(|a| (a, (a.position - here).norm()))
+        .min_by(|a, b| a.1.total_cmp(&b.1))?;
+    let camera = frame.camera;
+    let [width, height] = [camera.x.half_width(), camera.y.half_width()].map(|h| 2.0 * h * camera.ground_scale());
+    let spot = frame.overlap_m();
+    let by_chance = (std::f64::consts::PI * spot * spot * frame.claims.len() as f64 / (width * height)).min(1.0);
+    Some(json!({
+        "user": claim.claim.user,
+        "distance_m": distance,
+        "likelihood_ratio": if distance <= spot { 1.0 / by_chance } else { 0.5 },
+        "second_beam_for_claim": distance <= frame.config.tolerated_distance_m + claim.slack_m,
+    }))
+}
+
+fn vanished_users(frame: &FrameContext, since: Timestamp) -> Vec<Value> {
+    frame
+        .claims
+        .iter()
+        .filter(|a| !frame.crowding.is_crowded() || a.before.was_seen())
+        .filter_map(|a| {
+            let gone = frame.users.get(&a.claim.user)?.unseen_since?;
+            let gap = seconds(gone, since).abs();
+            let by_chance = (2.0 * gap.max(0.1) / ABSENCE_PERIOD_S).min(1.0);
+            Some(json!({ "user": a.claim.user, "apart_s": gap, "likelihood_ratio": 0.5 / by_chance }))
         })
+        .collect()
+}
+
+fn energy_against_users(frame: &FrameContext, track: &Track) -> Option<Value> {
+    let energies = frame
+        .users
+        .tracks()
+        .filter_map(|id| Some(frame.tracker.get(id)?.detection.energy_j));
+    let usual = median_high(energies)?;
+    let off = (track.detection.energy_j.max(1e-30) / usual.max(1e-30)).ln();
+    Some(json!({ "users_median_j": usual, "likelihood_ratio": stranger_likelihood_ratio(off) }))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::monitor::fixture::{Scene, absent, present};
+
+    const USER: [f64; 2] = [0.0, 0.0];
+
+    /// One user, and the findings of each frame that shows these beams.
+    struct Watch {
+        scene: Scene,
+        memory: Memory,
     }
 
-    /// What else tells of an eavesdropper, each with its likelihood ratio against an honest stray beam.
-    fn unclaimed(&self, active: &[ActiveClaim], track: &Track, since: Timestamp, now: Timestamp) -> Finding {
-        let lasted = seconds(since, now);
-        let here = track.motion.position();
-        let nearest = active
-            .iter()
-            .filter(|a| !a.ended)
-            .map(|a| (a, (a.position - here).norm()))
-            .min_by(|a, b| a.1.total_cmp(&b.1));
-        let [width, height] =
-            [self.camera.x.half_width(), self.camera.y.half_width()].map(|h| 2.0 * h * self.camera.ground_scale());
-        let beside = nearest.map(|(a, distance)| {
-            // One who wants a user's light stands within its spot; one who does not is anywhere in view.
-            let spot = 3.0 * self.spot_m();
-            let by_chance = (std::f64::consts::PI * spot * spot * active.len() as f64 / (width * height)).min(1.0);
-            json!({
-                "user": a.claim.user,
-                "distance_m": distance,
-                "likelihood_ratio": if distance <= spot { 1.0 / by_chance } else { 0.5 },
-                "second_beam_for_claim": distance <= self.config.tolerated_distance_m + a.slack_m,
-            })
-        });
-        let vanished: Vec<Value> = active
-            .iter()
-            .filter(|a| !self.crowding.is_crowded() || a.was_seen())
-            .filter_map(|a| {
-                let gone = self.users.get(&a.claim.user)?.unanswered_since?;
-                let gap = seconds(gone, since).abs();
-                // Absences come perhaps once an hour and user: one within the gap by chance is that rare.
-                let by_chance = (2.0 * gap.max(0.1) / 3600.0).min(1.0);
-                Some(json!({ "user": a.claim.user, "apart_s": gap, "likelihood_ratio": 0.5 / by_chance }))
-            })
-            .collect();
-        let usual = median(
-            self.users
-                .values()
-                .filter_map(|u| Some(self.tracks.get(u.track?)?.detection.energy_j)),
-        );
-        let energy = usual.map(|usual| {
-            let off = (track.detection.energy_j.max(1e-30) / usual.max(1e-30)).ln();
-            json!({ "users_median_j": usual, "likelihood_ratio": likelihood_ratio(off) })
-        });
-        let severity = if lasted >= ESCALATE_S {
-            Severity::Critical
-        } else {
-            Severity::Warning
+    impl Watch {
+        fn new() -> Self {
+            Self {
+                scene: Scene::of_users(&[USER]),
+                memory: Memory::default(),
+            }
+        }
+
+        fn show(&mut self, places: &[[f64; 2]]) -> Vec<Finding> {
+            self.scene.show(places);
+            let Scene {
+                tracker,
+                association,
+                now,
+                ..
+            } = &self.scene;
+            self.memory.update(tracker, association, *now);
+            let findings = evaluate(&self.scene.context(), &mut self.memory);
+            self.scene.apply(findings.clone());
+            findings
+        }
+
+        /// A stranger at (x, 0) until the first finding; gives the frames before it.
+        fn intrude(&mut self, x: f64) -> usize {
+            (0..100)
+                .take_while(|_| present(&self.show(&[USER, [x, 0.0]])).is_empty())
+                .count()
+        }
+    }
+
+    #[test]
+    fn a_beam_without_a_claim_is_alerted_after_the_wait_for_claims() {
+        let mut watch = Watch::new();
+        assert!(watch.show(&[USER]).is_empty());
+        // 0.65 s after its first frame.
+        assert_eq!(watch.intrude(40.0), 7);
+        let alert = watch.scene.alerts.open().next().unwrap().1;
+        assert_eq!((alert.x_m.unwrap().round(), alert.severity), (40.0, Severity::Warning));
+        assert_eq!(alert.evidence["nearest_user"]["user"], "u-0");
+        (0..100).for_each(|_| drop(watch.show(&[USER, [40.0, 0.0]])));
+        assert_eq!(watch.scene.alerts.open().next().unwrap().1.severity, Severity::Critical);
+    }
+
+    #[test]
+    fn before_claims_have_settled_nobody_is_a_stranger() {
+        let mut watch = Watch::new();
+        watch.scene.timing = Default::default();
+        assert_eq!(watch.intrude(40.0), 100);
+    }
+
+    #[test]
+    fn a_beam_that_is_gone_is_absent_and_one_that_is_merged_is_not() {
+        let mut watch = Watch::new();
+        watch.intrude(2.5);
+        let stranger = Cause::Track(2);
+        // Into the user's spot: seen, and without a claim.
+        assert!(watch.show(&[USER]).is_empty());
+        assert_eq!(watch.scene.tracker.get(2).unwrap().merged_into, Some(1));
+        let mut watch = Watch::new();
+        watch.intrude(40.0);
+        assert_eq!(absent(&watch.show(&[USER])), [&stranger]);
+    }
+
+    #[test]
+    fn who_comes_on_again_nearby_is_the_same_cause() {
+        for (x, is_renamed) in [(47.0, true), (55.0, false)] {
+            let mut watch = Watch::new();
+            watch.intrude(40.0);
+            let raised = watch.scene.alerts.open().count();
+            // The alert is held open for a second; the new beam is due before.
+            let renamed = (0..9).any(|_| {
+                let findings = watch.show(&[USER, [x, 0.0]]);
+                matches!(findings[..], [Finding::Renamed { .. }, Finding::Present(..), ..])
+            });
+            assert_eq!((renamed, raised), (is_renamed, 1), "{x}");
+        }
+    }
+
+    #[test]
+    fn where_two_beams_swap_names_the_alert_follows_the_one_without_a_claim() {
+        let mut watch = Watch::new();
+        watch.intrude(3.0);
+        watch.scene.association = Association::none(1);
+        watch.scene.association.assign(0, 2);
+        let Scene {
+            tracker,
+            association,
+            now,
+            ..
+        } = &watch.scene;
+        watch.memory.update(tracker, association, *now);
+        let findings = evaluate(&watch.scene.context(), &mut watch.memory);
+        let [Finding::Renamed { from, to }] = &findings[..] else {
+            panic!("{findings:?}");
         };
-        let evidence = json!({
-            "track": track.id,
-            "seen_since": track.since,
-            "unclaimed_s": lasted,
-            "log_likelihood_ratio": track.score,
-            "threshold": self.level_unclaimed,
-            "energy_j": track.detection.energy_j,
-            "energy_against_users": energy,
-            "nearest_user": beside,
-            "vanished_users": vanished,
-            "flags": track.detection.flags,
-        });
-        self.at_track(Finding::new(severity, evidence), track)
+        assert_eq!((from, to), (&Cause::Track(2), &Cause::Track(1)));
+    }
+
+    #[test]
+    fn a_due_beam_is_offered_to_users_who_vanished_before_it_is_alerted() {
+        let mut watch = Watch::new();
+        let since = watch.scene.now + jiff::SignedDuration::from_millis(100);
+        for k in 0..8 {
+            watch.scene.show(&[USER, [40.0, 0.0]]);
+            let Scene {
+                tracker,
+                association,
+                now,
+                ..
+            } = &watch.scene;
+            watch.memory.update(tracker, association, *now);
+            let due = watch.memory.due(&watch.scene.context());
+            assert_eq!(due, if k < 7 { vec![] } else { vec![(2, since)] });
+        }
+        assert_eq!(watch.memory.undecided(&watch.scene.alerts), [since]);
+        watch.memory.remove(2);
+        assert!(evaluate(&watch.scene.context(), &mut watch.memory).is_empty());
+        assert!(watch.memory.undecided(&watch.scene.alerts).is_empty());
     }
 }

@@ -1,71 +1,76 @@
-use std::collections::VecDeque;
+//! Whether a spot is wider than one beam's: a score test (Rao, 1948) of its second moments, summed over frames.
 
 use nalgebra::{Matrix2, Matrix3, Vector3};
 
+use super::block_history::{BlockHistory, MIN_DRIFT_BLOCKS, RECENT_FRAMES, Recent};
+use super::robust::median_high;
 use crate::estimate;
-use crate::monitor::input::claim_timing::median;
 
-/// Newest frames that a test looks at.
-const WINDOWS: [usize; 5] = [3, 10, 20, 40, 80];
-const LONGEST: usize = WINDOWS[WINDOWS.len() - 1];
-/// Frames before a window that it is held against at least.
-const FEWEST: u32 = 30;
-/// Frames of a block of the past, and blocks kept: two minutes at 10 frames/s.
-const BLOCK: u32 = 30;
-const BLOCKS: usize = 40;
-/// Blocks from which a beam's slow drift is known, and what it is taken for until then and is never below, σ²: a user who walks
-/// for ten seconds sees another part of the lens.
-const DRIFT_BLOCKS: usize = 6;
+/// Windows of newest frames that are tested: the shortest for a strong second beam, the longest for one that no frame shows. They
+/// share data, and no correction is made for their number (the soaks of docs/verdicts.md hold the rate of false alerts).
+const WINDOWS: [usize; 5] = [3, 10, 20, 40, RECENT_FRAMES];
+/// Frames before a window that it is compared with at least.
+const MIN_FRAMES_BEFORE: u32 = 30;
+/// Standard deviation of a beam's drift until its blocks show it, σ²: a user who walks for ten seconds is seen through another
+/// part of the lens. Larger hides a second beam, smaller takes the lens for one. Not measured.
 const ASSUMED_DRIFT: f64 = 0.004;
-const LEAST_DRIFT: f64 = 0.002;
-/// How far honest moments may be from what all beams show, σ²: a lens is not the same everywhere.
-const UNLIKE_OTHERS: f64 = 0.1;
-/// A frame tells how frames scatter only when it is this old: what has just begun is not scatter.
+/// Smallest drift, however steady the blocks, σ². Not measured.
+const MIN_DRIFT: f64 = 0.002;
+/// Standard deviation of honest moments about what all beams show, σ²: a lens is not the same everywhere. Larger hides a second
+/// beam that was there from the start. Not measured.
+const LENS_SCATTER: f64 = 0.1;
+/// Age in frames from which a frame counts for the scatter of frames: a second beam that has just come on is no scatter.
 const SETTLED: usize = 20;
-/// Frames that the scatter is remembered over.
+/// Frames over which the scatter is averaged: as long as the blocks reach back.
 const MEMORY: f64 = 1200.0;
-/// Other beams whose median tells what befalls everybody.
-const FEWEST_OTHERS: usize = 3;
-/// One frame's squared Mahalanobis distance counts for no more: a bird is one event.
-const MOST: f64 = 25.0;
-/// Directions of a second beam that are looked in, over half a turn.
+/// Other beams from which their median is taken for what all beams share.
+const MIN_OTHERS: usize = 3;
+/// Largest squared Mahalanobis distance that one frame counts for (winsorised): a bird is one event.
+const MAX_FRAME: f64 = 25.0;
+/// Directions of a second beam that are tried, over half a turn.
 const DIRECTIONS: usize = 16;
 
-/// Whether a spot is wider than one beam's. Two beams d apart, with shares w and 1 − w of the light, have w(1 − w)·d² along the
-/// line between them, however they fade; frames add up what none of them shows.
-#[derive(Clone, Debug, Default)]
-pub struct SecondMomentTest {
-    newest: VecDeque<SecondMomentScore>,
-    filling: (SecondMomentScore, u32),
-    blocks: VecDeque<SecondMomentScore>,
-    /// Mean squared Mahalanobis distance of a frame from those before, over its expectation, and the frames it is of.
-    dispersion: f64,
-    scattered: f64,
-    seen: [Option<Seen>; WINDOWS.len()],
-}
-
-/// What a window shows, and how far that is above what came before it, each with its covariance.
-#[derive(Clone, Copy, Debug)]
-struct Seen {
-    level: (Vector3<f64>, Matrix3<f64>),
-    rise: Option<(Vector3<f64>, Matrix3<f64>)>,
-}
-
-/// What the other beams show in each window: what befalls everybody is nobody's second beam.
-#[derive(Clone, Copy, Debug, Default)]
-pub struct CommonMode([Window; WINDOWS.len()]);
-
-#[derive(Clone, Copy, Debug, Default)]
-struct Window {
-    level: (Vector3<f64>, Matrix3<f64>),
-    rise: (Vector3<f64>, Matrix3<f64>),
-}
-
-/// Second moments in information form.
+/// Second moments (xx, xy, yy) beyond one spot's, σ², in information form: scores and informations of frames add.
 #[derive(Clone, Copy, Debug)]
 pub struct SecondMomentScore {
     score: Vector3<f64>,
     information: Matrix3<f64>,
+}
+
+/// A beam's second moments. Two beams d apart, with shares w and 1 − w of the light, have w(1 − w)·d² along the line between them,
+/// however they fade; frames add up what none of them shows.
+#[derive(Clone, Debug, Default)]
+pub struct SecondMomentTest {
+    recent: Recent<SecondMomentScore>,
+    past: BlockHistory<SecondMomentScore>,
+    /// Mean squared Mahalanobis distance of a frame from those before, over its expectation, and the frames it is of.
+    dispersion: f64,
+    dispersion_frames: f64,
+    windows: [Option<WindowEstimate>; WINDOWS.len()],
+}
+
+/// Moments of a window, and their rise over what came before it, each with its covariance.
+#[derive(Clone, Copy, Debug)]
+struct WindowEstimate {
+    level: (Vector3<f64>, Matrix3<f64>),
+    rise: Option<(Vector3<f64>, Matrix3<f64>)>,
+}
+
+/// What the other beams show in each window.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct CommonMode([CommonWindow; WINDOWS.len()]);
+
+#[derive(Clone, Copy, Debug, Default)]
+struct CommonWindow {
+    level: (Vector3<f64>, Matrix3<f64>),
+    rise: (Vector3<f64>, Matrix3<f64>),
+}
+
+/// Trace of the moments beyond what is expected, σ², and −ln p of them.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Widening {
+    pub trace: f64,
+    pub neg_log_p: f64,
 }
 
 impl Default for SecondMomentScore {
@@ -78,11 +83,11 @@ impl Default for SecondMomentScore {
 }
 
 impl SecondMomentScore {
-    /// What a frame says, its covariance times `inflation`.
-    pub fn of(bend: &estimate::SecondMomentScore, inflation: f64) -> Self {
-        let s = bend.information;
+    /// A fit's score, its covariance times `inflation`.
+    pub fn of(score: &estimate::SecondMomentScore, inflation: f64) -> Self {
+        let s = score.information;
         Self {
-            score: Vector3::from(bend.score) / inflation,
+            score: Vector3::from(score.score) / inflation,
             information: Matrix3::from_fn(|r, c| 0.5 * (s[r][c] + s[c][r])) / inflation,
         }
     }
@@ -116,115 +121,106 @@ impl SecondMomentScore {
 }
 
 impl SecondMomentTest {
-    pub fn note(&mut self, frame: &SecondMomentScore, learn: bool) {
-        let expected = self.before(0).unwrap_or_default();
+    /// Takes a frame. With `learn` the frame that it pushes out of the newest is added to the past.
+    pub fn push(&mut self, frame: &SecondMomentScore, learn: bool) {
+        let expected = self.mean_before(0).unwrap_or_default();
         let Some(distance2) = frame.distance2(expected).filter(|d| d.is_finite()) else {
             return;
         };
         let mut frame = *frame;
-        if distance2 > MOST {
+        if distance2 > MAX_FRAME {
             let usual = frame.information * expected;
-            frame.score = usual + (frame.score - usual) * (MOST / distance2).sqrt();
+            frame.score = usual + (frame.score - usual) * (MAX_FRAME / distance2).sqrt();
         }
-        self.newest.push_back(frame);
+        let old = self.recent.push(frame);
         if learn {
-            self.learn(expected);
+            self.learn_dispersion(expected);
+            if let Some(old) = old {
+                self.past.push(|block| block.add(&old));
+            }
         }
-        self.newest.drain(..self.newest.len().saturating_sub(LONGEST));
-        self.look();
+        self.update_windows();
     }
 
-    fn learn(&mut self, expected: Vector3<f64>) {
-        let settled = self.newest.len().checked_sub(SETTLED + 1).map(|k| self.newest[k]);
+    fn learn_dispersion(&mut self, expected: Vector3<f64>) {
+        let settled = self.recent.iter().rev().nth(SETTLED);
         if let Some(distance2) = settled.and_then(|m| m.distance2(expected)) {
-            self.scattered = (self.scattered + 1.0).min(MEMORY);
-            self.dispersion += (distance2 / 3.0 - self.dispersion) / self.scattered;
-        }
-        if self.newest.len() > LONGEST
-            && let Some(old) = self.newest.pop_front()
-        {
-            self.filling.0.add(&old);
-            self.filling.1 += 1;
-            if self.filling.1 == BLOCK {
-                self.blocks.push_back(std::mem::take(&mut self.filling).0);
-                if self.blocks.len() > BLOCKS {
-                    self.blocks.pop_front();
-                }
-            }
+            self.dispersion_frames = (self.dispersion_frames + 1.0).min(MEMORY);
+            self.dispersion += (distance2 / 3.0 - self.dispersion) / self.dispersion_frames;
         }
     }
 
     /// Everything before the newest `n` frames, where that is enough.
     fn sum_before(&self, n: usize) -> Option<SecondMomentScore> {
-        let old = self.newest.len().checked_sub(n)?;
-        let frames = self.blocks.len() as u32 * BLOCK + self.filling.1 + old as u32;
-        (frames >= FEWEST).then(|| {
-            let mut sum = self.filling.0;
-            self.blocks
-                .iter()
-                .chain(self.newest.iter().take(old))
+        let old = self.recent.len().checked_sub(n)?;
+        (self.past.frames() + old as u32 >= MIN_FRAMES_BEFORE).then(|| {
+            let mut sum = *self.past.filling();
+            self.past
+                .blocks()
+                .chain(self.recent.iter().take(old))
                 .for_each(|m| sum.add(m));
             sum
         })
     }
 
-    fn before(&self, n: usize) -> Option<Vector3<f64>> {
+    fn mean_before(&self, n: usize) -> Option<Vector3<f64>> {
         self.sum_before(n)?.solved().map(|(mean, _)| mean)
     }
 
     fn newest(&self, n: usize) -> Option<(Vector3<f64>, Matrix3<f64>)> {
-        let first = self.newest.len().checked_sub(n)?;
+        let first = self.recent.len().checked_sub(n)?;
         let mut sum = SecondMomentScore::default();
-        self.newest.iter().skip(first).for_each(|m| sum.add(m));
+        self.recent.iter().skip(first).for_each(|m| sum.add(m));
         sum.solved()
     }
 
-    /// Standard deviation of what the blocks' means do beyond their noise.
+    /// Standard deviation of the blocks' means beyond their noise.
     fn drift(&self) -> f64 {
-        let means: Vec<_> = self.blocks.iter().filter_map(|b| b.solved()).collect();
-        if means.len() < DRIFT_BLOCKS {
+        let means: Vec<_> = self.past.blocks().filter_map(|b| b.solved()).collect();
+        if means.len() < MIN_DRIFT_BLOCKS {
             return ASSUMED_DRIFT;
         }
         let n = means.len() as f64;
         let middle = means.iter().map(|(m, _)| m).sum::<Vector3<f64>>() / n;
         let squares: f64 = means.iter().map(|(m, _)| (m - middle).norm_squared()).sum();
         let noise: f64 = means.iter().map(|(_, cov)| cov.trace()).sum::<f64>() * self.dispersion.max(1.0) / n;
-        (((squares / (n - 1.0) - noise) / 3.0).max(0.0)).sqrt().max(LEAST_DRIFT)
+        (((squares / (n - 1.0) - noise) / 3.0).max(0.0)).sqrt().max(MIN_DRIFT)
     }
 
-    fn look(&mut self) {
+    fn update_windows(&mut self) {
         let dispersion = self.dispersion.max(1.0);
         let drift = Matrix3::identity() * self.drift().powi(2);
-        self.seen = WINDOWS.map(|n| {
+        self.windows = WINDOWS.map(|n| {
             let (mean, cov) = self.newest(n)?;
             let cov = cov * dispersion;
             let before = self.sum_before(n).and_then(|m| m.solved());
             let rise = before.map(|(past, past_cov)| (mean - past, cov + past_cov * dispersion + drift));
-            Some(Seen {
+            Some(WindowEstimate {
                 level: (mean, cov),
                 rise,
             })
         });
     }
 
-    /// How much wider the spot is than expected (trace, σ²), and the surprise of the window and test that show it most: with no
-    /// correction for their number, up to ten of which share data.
-    pub fn neg_log_p(&self, common: &CommonMode) -> (f64, f64) {
-        let mut worst = (0.0, 0.0);
-        let unlike = Matrix3::identity() * UNLIKE_OTHERS.powi(2);
-        for (seen, common) in self.seen.iter().zip(&common.0) {
-            let Some(seen) = seen else { break };
-            let level = Some((seen.level.0 - common.level.0, seen.level.1 + common.level.1 + unlike));
-            let rise = seen.rise.map(|(rise, cov)| (rise - common.rise.0, cov + common.rise.1));
+    /// The most significant window, as it is against the other beams or by its rise against its own past.
+    pub fn most_significant(&self, common: &CommonMode) -> Widening {
+        let mut most = Widening::default();
+        let lens = Matrix3::identity() * LENS_SCATTER.powi(2);
+        for (window, common) in self.windows.iter().zip(&common.0) {
+            let Some(window) = window else { break };
+            let level = Some((window.level.0 - common.level.0, window.level.1 + common.level.1 + lens));
+            let rise = window
+                .rise
+                .map(|(rise, cov)| (rise - common.rise.0, cov + common.rise.1));
             for (off, cov) in level.into_iter().chain(rise) {
                 let Some(inverse) = cov.try_inverse() else { continue };
-                let wider = spread(off, inverse);
-                if wider.1 > worst.1 {
-                    worst = wider;
+                let found = widening(off, inverse);
+                if found.neg_log_p > most.neg_log_p {
+                    most = found;
                 }
             }
         }
-        worst
+        most
     }
 }
 
@@ -232,23 +228,23 @@ impl CommonMode {
     /// Medians over `others`, where there are enough, with their own uncertainty.
     pub fn of<'a>(others: impl Iterator<Item = &'a SecondMomentTest> + Clone) -> Self {
         Self(std::array::from_fn(|k| {
-            let seen = || others.clone().filter_map(|b| b.seen[k]);
-            Window {
-                level: middle(seen().map(|s| s.level.0).collect()),
-                rise: middle(seen().filter_map(|s| s.rise).map(|r| r.0).collect()),
+            let windows = || others.clone().filter_map(|b| b.windows[k]);
+            CommonWindow {
+                level: middle(windows().map(|w| w.level.0).collect()),
+                rise: middle(windows().filter_map(|w| w.rise).map(|r| r.0).collect()),
             }
         }))
     }
 }
 
-/// Component-wise median of three or more, and its variance from their scatter.
+/// Component-wise median of three or more, and its variance from their scatter (1.4826·MAD, π/2 for a median).
 fn middle(of: Vec<Vector3<f64>>) -> (Vector3<f64>, Matrix3<f64>) {
-    if of.len() < FEWEST_OTHERS {
+    if of.len() < MIN_OTHERS {
         return (Vector3::zeros(), Matrix3::zeros());
     }
     let axis = |k: usize| {
-        let middle = median(of.iter().map(|m| m[k])).unwrap_or(0.0);
-        let scatter = 1.4826 * median(of.iter().map(|m| (m[k] - middle).abs())).unwrap_or(0.0);
+        let middle = median_high(of.iter().map(|m| m[k])).unwrap_or(0.0);
+        let scatter = 1.4826 * median_high(of.iter().map(|m| (m[k] - middle).abs())).unwrap_or(0.0);
         (
             middle,
             std::f64::consts::FRAC_PI_2 * scatter * scatter / of.len() as f64,
@@ -261,18 +257,21 @@ fn middle(of: Vec<Vector3<f64>>) -> (Vector3<f64>, Matrix3<f64>) {
     )
 }
 
-/// Trace of the moments of a second beam in the direction that explains `off` best, and the surprise of it. Whitened, the
-/// directions are the edge of a convex cone: a closed convex curve on the unit sphere, at most 2π long. The largest of them exceeds
-/// u with a chance of at most Q(u) + e^(−u²/2) (Rice, 1945, for the upcrossings), below 1.5·e^(−u²/2).
-fn spread(off: Vector3<f64>, inverse: Matrix3<f64>) -> (f64, f64) {
-    let mut best = (0.0, 0.0);
+/// The moments of a second beam in the direction that explains `off` best. Whitened, the directions are the edge of a convex
+/// cone: a closed convex curve on the unit sphere, at most 2π long. The largest of them exceeds u with a probability of at
+/// most Q(u) + e^(−u²/2) (Rice, 1945, for the upcrossings), below 1.5·e^(−u²/2).
+fn widening(off: Vector3<f64>, inverse: Matrix3<f64>) -> Widening {
+    let mut best = Widening::default();
     for k in 0..DIRECTIONS {
         let (y, x) = (std::f64::consts::PI * k as f64 / DIRECTIONS as f64).sin_cos();
         let v = Vector3::new(x * x, x * y, y * y);
         let (slope, curvature) = (v.dot(&(inverse * off)), v.dot(&(inverse * v)));
         let neg_log_p = 0.5 * slope * slope / curvature - 1.5f64.ln();
-        if slope > 0.0 && neg_log_p > best.1 {
-            best = (slope / curvature, neg_log_p);
+        if slope > 0.0 && neg_log_p > best.neg_log_p {
+            best = Widening {
+                trace: slope / curvature,
+                neg_log_p,
+            };
         }
     }
     best
@@ -304,21 +303,78 @@ mod tests {
             .collect()
     }
 
-    fn told(frames: &[SecondMomentScore]) -> SecondMomentTest {
-        let mut moment_test = SecondMomentTest::default();
-        frames.iter().for_each(|m| moment_test.note(m, true));
-        moment_test
+    fn pushed(frames: &[SecondMomentScore]) -> SecondMomentTest {
+        let mut test = SecondMomentTest::default();
+        frames.iter().for_each(|m| test.push(m, true));
+        test
+    }
+
+    fn neg_log_p(test: &SecondMomentTest) -> f64 {
+        test.most_significant(&CommonMode::default()).neg_log_p
     }
 
     #[test]
-    fn one_beam_is_no_surprise_whatever_its_shape() {
+    fn two_equal_beams_a_sigma_apart_have_a_quarter_along_their_line() {
+        // At ±½ along x: w(1 − w)·d² = ¼; SNR 10.
+        let spread = Matrix2::new(0.25, 0.0, 0.0, 0.0);
+        let score = SecondMomentScore::of_spread(spread, 10.0);
+        let (moments, cov) = score.solved().unwrap();
+        assert!((moments - Vector3::new(0.25, 0.0, 0.0)).norm() < 1e-12);
+        // Information 100/8: a variance of 0.08.
+        assert!((cov[(0, 0)] - 0.08).abs() < 1e-12);
+        assert!((score.distance2(Vector3::zeros()).unwrap() - 0.0625 / 0.08).abs() < 1e-9);
+    }
+
+    #[test]
+    fn scores_of_frames_add() {
+        let one = SecondMomentScore::of_spread(Matrix2::new(0.1, 0.0, 0.0, 0.3), 4.0);
+        let mut sum = one;
+        sum.add(&one);
+        let ((a, cov_a), (b, cov_b)) = (one.solved().unwrap(), sum.solved().unwrap());
+        assert!((a - b).norm() < 1e-12 && (cov_a - cov_b * 2.0).norm() < 1e-12);
+        assert!(SecondMomentScore::default().solved().is_none());
+    }
+
+    #[test]
+    fn an_inflated_fit_has_the_same_moments_and_less_information() {
+        let fit = estimate::SecondMomentScore {
+            score: [25.0, 0.0, 0.0],
+            information: [[100.0, 0.0, 0.0], [0.0, 200.0, 0.0], [0.0, 0.0, 100.0]],
+        };
+        let (moments, cov) = SecondMomentScore::of(&fit, 4.0).solved().unwrap();
+        assert!((moments.x - 0.25).abs() < 1e-12 && (cov[(0, 0)] - 0.04).abs() < 1e-12);
+    }
+
+    #[test]
+    fn the_direction_of_a_second_beam_by_hand() {
+        // Along x, three standard deviations out: 3²/2 − ln 1.5.
+        let found = widening(Vector3::new(0.3, 0.0, 0.0), Matrix3::identity() * 100.0);
+        assert!((found.neg_log_p - (4.5 - 1.5f64.ln())).abs() < 1e-12 && (found.trace - 0.3).abs() < 1e-12);
+        // Narrower than one spot is no second beam.
+        let narrower = widening(Vector3::new(-0.3, 0.0, -0.3), Matrix3::identity() * 100.0);
+        assert_eq!(narrower, Widening::default());
+    }
+
+    #[test]
+    fn the_common_mode_needs_three_others() {
+        let of = |n: usize| middle((0..n).map(|k| Vector3::new(k as f64, 0.0, 0.0)).collect());
+        assert_eq!(of(2).0, Vector3::zeros());
+        let (middle, cov) = of(3);
+        // Median 1, MAD 1: 1.4826²·π/2/3.
+        assert_eq!(middle.x, 1.0);
+        let expected = 1.4826f64.powi(2) * std::f64::consts::FRAC_PI_2 / 3.0;
+        assert!((cov[(0, 0)] - expected).abs() < 1e-12 && cov[(1, 1)] == 0.0);
+    }
+
+    #[test]
+    fn one_beam_is_not_significant_whatever_its_shape() {
         let shape = [0.05, -0.02, 0.03];
         let mut most: f64 = 0.0;
         for seed in 0..20 {
-            let mut moment_test = SecondMomentTest::default();
+            let mut test = SecondMomentTest::default();
             for m in frames(2000, shape, seed) {
-                moment_test.note(&m, true);
-                most = most.max(moment_test.neg_log_p(&CommonMode::default()).1);
+                test.push(&m, true);
+                most = most.max(neg_log_p(&test));
             }
         }
         assert!((5.0..16.0).contains(&most), "{most}");
@@ -328,40 +384,36 @@ mod tests {
     fn a_second_beam_that_no_frame_shows_is_found_in_a_second() {
         // Equal beams a σ apart along the diagonal, after five seconds of one.
         for seed in 0..20 {
-            let mut moment_test = told(&frames(50, [0.0; 3], seed));
+            let mut test = pushed(&frames(50, [0.0; 3], seed));
             for m in frames(10, [0.125; 3], 100 + seed) {
-                moment_test.note(&m, true);
+                test.push(&m, true);
             }
-            let (wider, neg_log_p) = moment_test.neg_log_p(&CommonMode::default());
+            let found = test.most_significant(&CommonMode::default());
             assert!(
-                neg_log_p > 19.0 && (wider - 0.25).abs() < 0.1,
-                "seed {seed}: {neg_log_p}, {wider}"
+                found.neg_log_p > 19.0 && (found.trace - 0.25).abs() < 0.1,
+                "seed {seed}: {found:?}"
             );
         }
     }
 
     #[test]
     fn what_all_spots_show_and_a_single_frame_prove_nothing() {
-        let mut moment_test = told(&frames(600, [0.0; 3], 1));
-        let smear = Vector3::new(0.2, 0.0, 0.2);
-        for m in frames(10, smear.into(), 2) {
-            moment_test.note(&m, false);
+        let mut test = pushed(&frames(600, [0.0; 3], 1));
+        let smear = [0.2, 0.0, 0.2];
+        for m in frames(10, smear, 2) {
+            test.push(&m, false);
         }
-        assert!(moment_test.neg_log_p(&CommonMode::default()).1 > 20.0);
+        assert!(neg_log_p(&test) > 20.0);
         let others: Vec<SecondMomentTest> = (10..15)
             .map(|seed| {
-                let mut other = told(&frames(600, [0.0; 3], seed));
-                frames(10, smear.into(), 100 + seed)
-                    .iter()
-                    .for_each(|m| other.note(m, false));
+                let mut other = pushed(&frames(600, [0.0; 3], seed));
+                frames(10, smear, 100 + seed).iter().for_each(|m| other.push(m, false));
                 other
             })
             .collect();
-        assert!(moment_test.neg_log_p(&CommonMode::of(others.iter())).1 < 10.0);
-        let mut moment_test = told(&frames(600, [0.0; 3], 3));
-        frames(1, [5.0, 0.0, 5.0], 4)
-            .iter()
-            .for_each(|m| moment_test.note(m, false));
-        assert!(moment_test.neg_log_p(&CommonMode::default()).1 < 15.0);
+        assert!(test.most_significant(&CommonMode::of(others.iter())).neg_log_p < 10.0);
+        let mut test = pushed(&frames(600, [0.0; 3], 3));
+        frames(1, [5.0, 0.0, 5.0], 4).iter().for_each(|m| test.push(m, false));
+        assert!(neg_log_p(&test) < 15.0);
     }
 }

@@ -1,55 +1,60 @@
+//! Whether a spot's centre has stepped aside between two frames, as it does when a second beam comes on within it.
+
 use std::collections::VecDeque;
 
 use jiff::Timestamp;
 use nalgebra::Vector2;
 
+use super::jitter::ACCELERATION;
+use super::robust::ninth_decile;
 use crate::claims::seconds;
-use crate::monitor::track::detection::Detection;
-use crate::monitor::track::kalman::largest_eigenvalue;
 
-/// Frames of the way before a step, and of the ways after it that are tried.
+/// Frames of the line before a step, and of the lines after it that are tried: three are found sooner, five are more exact.
 const BEFORE: usize = 3;
 const AFTER: [usize; 2] = [3, 5];
 const KEPT: usize = BEFORE + AFTER[AFTER.len() - 1];
-/// Frames apart by more than this are no way, s.
+/// Frames farther apart than this make no line, s: a user brakes or turns in between.
 const LONGEST_GAP_S: f64 = 0.5;
-/// Accelerations of honest users, r.m.s., m/s²: half a g is a hard brake.
-const ACCELERATION: f64 = 5.0;
-/// Steps of the past that tell how steps scatter: no fewer than the first, no more than the second.
+/// Past steps that the scatter is estimated from: none is judged before the first number, none older than the second counts.
 const SCATTER: [usize; 2] = [30, 120];
-/// Frames that a step is remembered for.
+/// Frames for which a step is remembered; the energy and jitter since then add to its evidence. Longer keeps one odd frame
+/// as evidence for longer.
 const MEMORY: usize = 20;
-/// A step counts for so much at most: at one false alert a month and five frames a second something else must
-/// speak for a second beam too.
-const MOST: f64 = 22.0;
+/// Largest −ln p of a step: at one false alert a month and five frames/s or more it is below the threshold, so that something
+/// else must be evidence of a second beam too.
+const MAX_NEG_LOG_P: f64 = 22.0;
+/// Number of lines after a step that are tried.
+pub const TRIED: usize = AFTER.len();
+/// For each of `AFTER`, where there are frames enough.
+pub type CandidateSteps = [Option<Step>; TRIED];
 
-/// Whether a spot's centre has stepped aside: who comes on within a user's spot draws it towards themselves between two frames,
-/// which no user who walks, drives, brakes or turns does. A line through the positions before, another through those after;
-/// where they meet the moment between the two there was no step.
+/// A line through the positions before a moment, another through those after it: where they meet between the two there was no
+/// step. Who comes on within a user's spot draws it towards themselves between two frames, which no user who walks, drives,
+/// brakes or turns does.
 #[derive(Clone, Debug, Default)]
 pub struct StepDetector {
     /// Positions and their larger variances.
     newest: VecDeque<(Timestamp, Vector2<f64>, f64)>,
-    /// Of each newest frame, and the surprises before those.
+    /// Of each newest frame, and the −ln p of those before.
     judged: VecDeque<StepEvidence>,
     past: VecDeque<f64>,
 }
 
-/// What lies between the two lines, with its variance per axis.
+/// The gap between the two lines, with its variance per axis.
 #[derive(Clone, Copy, Debug)]
 pub struct Step {
     /// m.
     pub aside: Vector2<f64>,
-    /// Of the first frame after it.
+    /// Time of the first frame after it.
     since: Timestamp,
     variance: f64,
     /// What a turn at either end of the gap adds.
     turn: Vector2<f64>,
-    /// A gap's way, m: a frame may have been lost unnoticed.
+    /// Distance covered in a gap, m: a frame may have been lost unnoticed.
     way: f64,
 }
 
-/// How far aside, how surprising, and since when.
+/// How far aside, −ln p of it, and since when.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct StepEvidence {
     pub length_m: f64,
@@ -57,14 +62,10 @@ pub struct StepEvidence {
     pub since: Option<Timestamp>,
 }
 
-/// For each of `AFTER`, where there are frames enough.
-pub const TRIED: usize = AFTER.len();
-pub type CandidateSteps = [Option<Step>; TRIED];
-
 impl Step {
-    /// Held against what all beams have in common. What leaves the disc of the turns is no farther from it than from its own true
-    /// point, whose squared distance is χ² of two degrees.
-    fn judged(&self, common: Vector2<f64>) -> StepEvidence {
+    /// Less what all beams have in common. The distance from the disc of the turns is no more than from its own true point, whose
+    /// square is χ² of two degrees.
+    fn evidence(&self, common: Vector2<f64>) -> StepEvidence {
         let aside = self.aside - common;
         let nearest = -aside.dot(&self.turn) / self.turn.norm_squared().max(f64::MIN_POSITIVE);
         let length_m = (aside + self.turn * nearest.clamp(-1.0, 1.0)).norm();
@@ -78,8 +79,8 @@ impl Step {
 }
 
 impl StepDetector {
-    /// The frame's steps by windows, yet to be held against what all beams have in common.
-    pub fn look(&mut self, time: Timestamp, detection: &Detection) -> CandidateSteps {
+    /// Takes a position with its larger variance, m²; gives the steps that end now, before what all beams share is known.
+    pub fn candidates(&mut self, time: Timestamp, position: Vector2<f64>, variance: f64) -> CandidateSteps {
         if self
             .newest
             .back()
@@ -87,18 +88,17 @@ impl StepDetector {
         {
             self.newest.clear();
         }
-        let variance = largest_eigenvalue(&detection.cov);
-        self.newest.push_back((time, detection.position, variance));
+        self.newest.push_back((time, position, variance));
         self.newest.drain(..self.newest.len().saturating_sub(KEPT));
         AFTER.map(|after| self.step(after))
     }
 
     /// Takes the frame's steps, less what all beams have in common of each.
-    pub fn note(&mut self, tried: &CandidateSteps, common: &[Vector2<f64>; TRIED], learn: bool) {
-        let seen = tried
+    pub fn push(&mut self, candidates: &CandidateSteps, common: &[Vector2<f64>; TRIED], learn: bool) {
+        let seen = candidates
             .iter()
             .zip(common)
-            .filter_map(|(step, common)| Some(step.as_ref()?.judged(*common)));
+            .filter_map(|(step, common)| Some(step.as_ref()?.evidence(*common)));
         let Some(most) = seen.max_by(|a, b| a.neg_log_p.total_cmp(&b.neg_log_p)) else {
             return;
         };
@@ -112,19 +112,17 @@ impl StepDetector {
         }
     }
 
-    /// The most surprising step of the newest frames, where the past tells how steps scatter: air and platform move beams about
+    /// The most significant step of the newest frames, once the past shows how steps scatter: air and platform move beams about
     /// beyond what the fit's covariance says.
-    pub fn most(&self) -> Option<StepEvidence> {
+    pub fn most_significant(&self) -> Option<StepEvidence> {
         if self.past.len() < SCATTER[0] {
             return None;
         }
-        // One in ten of what is χ² of two degrees, halved, is above ln 10.
-        let mut past: Vec<f64> = self.past.iter().copied().collect();
-        past.sort_by(f64::total_cmp);
-        let usual = past.get(past.len() * 9 / 10)? / std::f64::consts::LN_10;
+        // One in ten of χ² of two degrees, halved, is above ln 10.
+        let usual = ninth_decile(self.past.iter().copied())? / std::f64::consts::LN_10;
         let most = self.judged.iter().max_by(|a, b| a.neg_log_p.total_cmp(&b.neg_log_p))?;
         Some(StepEvidence {
-            neg_log_p: (most.neg_log_p / usual.max(1.0)).min(MOST),
+            neg_log_p: (most.neg_log_p / usual.max(1.0)).min(MAX_NEG_LOG_P),
             ..*most
         })
     }
@@ -140,7 +138,7 @@ impl StepDetector {
             since: first,
             variance: before.variance + after.variance,
             turn: (after.slope - before.slope) * (0.5 * gap),
-            way: gap * before.pace(),
+            way: gap * before.speed(),
         })
     }
 
@@ -178,8 +176,8 @@ struct Line {
 }
 
 impl Line {
-    /// Of the velocity, beyond its noise.
-    fn pace(&self) -> f64 {
+    /// The velocity's size beyond its noise.
+    fn speed(&self) -> f64 {
         (self.slope.norm_squared() - self.slope_variance).max(0.0).sqrt()
     }
 }
@@ -187,39 +185,29 @@ impl Line {
 #[cfg(test)]
 mod tests {
     use jiff::SignedDuration;
-    use nalgebra::Matrix2;
     use rand::{RngExt, SeedableRng};
     use rand_chacha::ChaCha8Rng;
     use rand_distr::{Distribution, StandardNormal};
 
     use super::*;
-    use crate::estimate::Flags;
-    use crate::monitor::stats::second_moment::SecondMomentScore;
 
     const SIGMA_M: f64 = 0.05;
 
-    /// The most surprising step of a way, seen ten times a second with an error of `SIGMA_M`.
+    fn at(t: f64) -> Timestamp {
+        Timestamp::UNIX_EPOCH + SignedDuration::from_secs_f64(t)
+    }
+
+    /// The most significant step of a way, seen ten times a second with an error of `SIGMA_M`.
     fn most(way: impl Fn(f64) -> [f64; 2], seed: u64) -> StepEvidence {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        let mut steps = StepDetector::default();
+        let mut detector = StepDetector::default();
         let mut most = StepEvidence::default();
         for k in 0..100 {
             let t = 0.1 * f64::from(k);
             let noise = Vector2::from_fn(|_, _| -> f64 { StandardNormal.sample(&mut rng) }) * SIGMA_M;
-            let detection = Detection {
-                position: Vector2::from(way(t)) + noise,
-                cov: Matrix2::identity() * SIGMA_M * SIGMA_M,
-                energy_j: 1e-3,
-                flags: Flags::empty(),
-                moments: SecondMomentScore::default(),
-                snr: 200.0,
-                resolution_m: 3.0,
-                clutter_probability: 0.0,
-            };
-            let time = Timestamp::UNIX_EPOCH + SignedDuration::from_secs_f64(t);
-            let tried = steps.look(time, &detection);
-            steps.note(&tried, &[Vector2::zeros(); TRIED], true);
-            if let Some(step) = steps.most().filter(|s| s.neg_log_p > most.neg_log_p) {
+            let tried = detector.candidates(at(t), Vector2::from(way(t)) + noise, SIGMA_M * SIGMA_M);
+            detector.push(&tried, &[Vector2::zeros(); TRIED], true);
+            if let Some(step) = detector.most_significant().filter(|s| s.neg_log_p > most.neg_log_p) {
                 most = step;
             }
         }
@@ -227,7 +215,48 @@ mod tests {
     }
 
     #[test]
-    fn a_metre_aside_between_two_frames_is_a_step_and_told_since_when() {
+    fn a_step_of_exact_positions_is_its_length() {
+        let mut detector = StepDetector::default();
+        let mut tried = [None; TRIED];
+        for k in 0..6 {
+            let y = if k < 3 { 0.0 } else { 1.0 };
+            tried = detector.candidates(at(0.1 * f64::from(k)), Vector2::new(0.0, y), 1e-4);
+        }
+        let step = tried[0].expect("three frames before and three after");
+        assert!((step.aside - Vector2::new(0.0, 1.0)).norm() < 1e-9, "{step:?}");
+        assert_eq!(step.since, at(0.3));
+        assert!(tried[1].is_none(), "five after need eight frames");
+        // A step that all beams make is none.
+        assert!(step.evidence(Vector2::new(0.0, 1.0)).neg_log_p < 1e-20);
+    }
+
+    #[test]
+    fn a_straight_way_at_any_speed_is_no_step() {
+        let mut detector = StepDetector::default();
+        let mut tried = [None; TRIED];
+        for k in 0..8 {
+            tried = detector.candidates(at(0.1 * f64::from(k)), Vector2::new(1.5 * f64::from(k), 0.0), 1e-4);
+        }
+        for step in tried.into_iter().flatten() {
+            assert!(step.aside.norm() < 1e-9, "{step:?}");
+        }
+    }
+
+    #[test]
+    fn a_gap_in_time_begins_a_new_line() {
+        let mut detector = StepDetector::default();
+        for k in 0..3 {
+            detector.candidates(at(0.1 * f64::from(k)), Vector2::zeros(), 1e-4);
+        }
+        let mut tried = [None; TRIED];
+        for k in 0..3 {
+            tried = detector.candidates(at(2.0 + 0.1 * f64::from(k)), Vector2::new(0.0, 1.0), 1e-4);
+        }
+        assert!(tried.iter().all(Option::is_none));
+    }
+
+    #[test]
+    fn a_metre_aside_between_two_frames_is_a_step_and_dated() {
         for seed in 0..50 {
             let walk = |t: f64| [1.4 * t, if t > 7.95 { 1.0 } else { 0.0 }];
             let step = most(walk, seed);

@@ -1,13 +1,20 @@
+//! One frame's emitters as the tracker takes them: position, covariance and the probability that each is clutter.
+
 use nalgebra::{Matrix2, Vector2};
 
-use crate::estimate::{Estimate, Flags};
+use crate::estimate::{Emitter, Estimate, Flags};
 use crate::monitor::stats::second_moment::SecondMomentScore;
 use crate::optics::Camera;
 
-/// What a fit's covariance leaves out (calibration, pixel gains), m.
+/// Standard deviation that a fit's covariance leaves out (calibration, pixel gains), m. Larger loosens every gate, smaller makes
+/// exact fits miss theirs. Not measured.
 const POSITION_FLOOR_M: f64 = 0.02;
+/// Largest factor on covariances for a frame's misfit: beyond it the reduced χ² says only that the model is wrong.
+const MAX_INFLATION: f64 = 100.0;
+/// Distance, in σ of the spot, within which two spots overlap by a tenth.
+pub const OVERLAP: f64 = 3.0;
 
-/// One frame's emitter as the tracks take it.
+/// An emitter of one frame on the ground.
 #[derive(Clone, Debug)]
 pub struct Detection {
     pub position: Vector2<f64>,
@@ -19,44 +26,26 @@ pub struct Detection {
     pub snr: f64,
     /// Distance within which a second emitter of like energy cannot be told apart, m.
     pub resolution_m: f64,
-    /// How probable a spurious detection is here in a frame.
+    /// Probability of a spurious detection here in a frame.
     pub clutter_probability: f64,
 }
 
 impl Detection {
-    /// The emitters of an estimate on the ground, with what is known of how far each can be trusted.
+    /// The emitters of an estimate whose position and covariance are finite, each with its clutter probability.
     pub fn of(estimate: &Estimate, camera: &Camera) -> Vec<Self> {
         // A frame that the model explains badly has errors beyond its covariances.
         let inflation = if estimate.reduced_chi2.is_finite() {
-            estimate.reduced_chi2.clamp(1.0, 100.0)
+            estimate.reduced_chi2.clamp(1.0, MAX_INFLATION)
         } else {
-            100.0
+            MAX_INFLATION
         };
-        let usable = |e: &&crate::estimate::Emitter| {
-            e.x_m.is_finite() && e.y_m.is_finite() && e.cov_m2.iter().flatten().all(|c| c.is_finite())
-        };
+        let is_finite =
+            |e: &&Emitter| e.x_m.is_finite() && e.y_m.is_finite() && e.cov_m2.iter().flatten().all(|c| c.is_finite());
         let mut detections: Vec<Self> = estimate
             .emitters
             .iter()
-            .filter(usable)
-            .map(|e| {
-                let [[a, b], [_, c]] = e.cov_m2;
-                let (a, c) = (a.max(0.0), c.max(0.0));
-                // No correlation beyond ±1, whatever a learned estimator claims.
-                let most = a.sqrt() * c.sqrt();
-                let b = b.clamp(-most, most);
-                let cov = Matrix2::new(a, b, b, c) * inflation + Matrix2::identity() * POSITION_FLOOR_M.powi(2);
-                Self {
-                    position: Vector2::new(e.x_m, e.y_m),
-                    cov,
-                    energy_j: e.energy_j,
-                    flags: e.flags,
-                    moments: SecondMomentScore::of(&e.second_moment, inflation),
-                    snr: snr(camera, e.energy_j) / inflation.sqrt(),
-                    resolution_m: resolution_m(camera, snr(camera, e.energy_j)),
-                    clutter_probability: 0.0,
-                }
-            })
+            .filter(is_finite)
+            .map(|e| Self::of_emitter(e, inflation, camera))
             .collect();
         for i in 0..detections.len() {
             detections[i].clutter_probability = clutter_probability(&detections, i, camera);
@@ -64,7 +53,26 @@ impl Detection {
         detections
     }
 
-    /// What this and `others` are as one spot: all the light, its centre, and the second moments about it. A fit says it of one
+    fn of_emitter(e: &Emitter, inflation: f64, camera: &Camera) -> Self {
+        let [[a, b], [_, c]] = e.cov_m2;
+        let (a, c) = (a.max(0.0), c.max(0.0));
+        // No correlation beyond ±1, whatever a learned estimator states.
+        let most = a.sqrt() * c.sqrt();
+        let b = b.clamp(-most, most);
+        let cov = Matrix2::new(a, b, b, c) * inflation + Matrix2::identity() * POSITION_FLOOR_M.powi(2);
+        Self {
+            position: Vector2::new(e.x_m, e.y_m),
+            cov,
+            energy_j: e.energy_j,
+            flags: e.flags,
+            moments: SecondMomentScore::of(&e.second_moment, inflation),
+            snr: snr(camera, e.energy_j) / inflation.sqrt(),
+            resolution_m: resolution_m(camera, snr(camera, e.energy_j)),
+            clutter_probability: 0.0,
+        }
+    }
+
+    /// This and `others` as one spot: all the light, its centre, and the second moments about it. A fit gives this of one
     /// emitter where it found one; where it found several in a spot, their number is nearly chance.
     pub fn united<'a>(&'a self, others: impl Iterator<Item = &'a Self> + Clone, camera: &Camera) -> Self {
         let all = || std::iter::once(self).chain(others.clone());
@@ -75,7 +83,7 @@ impl Detection {
         let position = all()
             .map(|d| d.position * (d.energy_j / energy_j))
             .sum::<Vector2<f64>>();
-        let spot_m = camera.spot_sigma_m * camera.ground_scale();
+        let spot_m = spot_m(camera);
         let spread = all().map(|d| {
             let off = (d.position - position) / spot_m;
             off * off.transpose() * (d.energy_j / energy_j)
@@ -92,10 +100,15 @@ impl Detection {
         }
     }
 
-    /// Of either beam's position, when two share the spot.
-    pub fn shared_cov(&self) -> Matrix2<f64> {
+    /// Covariance of either beam's position when two share the spot.
+    pub fn merged_cov(&self) -> Matrix2<f64> {
         self.cov + Matrix2::identity() * self.resolution_m.powi(2)
     }
+}
+
+/// σ of a spot on the ground, m.
+pub fn spot_m(camera: &Camera) -> f64 {
+    camera.spot_sigma_m * camera.ground_scale()
 }
 
 /// Signal-to-noise ratio of the matched filter for a spot wider than a pixel: A·pitch/(2√π·σ·σ_n).
@@ -114,9 +127,9 @@ fn resolution_m(camera: &Camera, snr: f64) -> f64 {
     apart.max(0.5 * pitch).min(3.0 * sigma) * camera.ground_scale()
 }
 
-/// How probable it is that detection `i` is spurious: rare on its own, common where one spot may have been split in two.
-/// Even there it is no excuse for silence: nine detections in ten frames outweigh it, so that nobody gains more than a second
-/// by making the fit doubtful.
+/// Probability that detection `i` is spurious: rare on its own, common where one spot may have been split in two. Assumed, not
+/// measured; even the largest is no excuse for silence: nine detections in ten frames outweigh it, so that nobody gains
+/// more than a second by making the fit doubtful.
 fn clutter_probability(detections: &[Detection], i: usize, camera: &Camera) -> f64 {
     const ALONE: f64 = 1e-3;
     const NEIGHBOURED: f64 = 1e-2;
@@ -134,9 +147,105 @@ fn clutter_probability(detections: &[Detection], i: usize, camera: &Camera) -> f
         .intersects(Flags::NO_CONVERGENCE | Flags::POOR_FIT | Flags::ILL_CONDITIONED)
     {
         POORLY_FITTED
-    } else if nearest < 3.0 * camera.spot_sigma_m * camera.ground_scale() {
+    } else if nearest < OVERLAP * camera.spot_sigma_m * camera.ground_scale() {
         NEIGHBOURED
     } else {
         ALONE
+    }
+}
+
+#[cfg(test)]
+pub mod fixture {
+    use super::*;
+
+    /// A detection at (`x`, `y`), m, errors 0.1 m, of SNR 100 and 2 m of resolution.
+    pub fn detection(x: f64, y: f64) -> Detection {
+        Detection {
+            position: Vector2::new(x, y),
+            cov: Matrix2::identity() * 0.01,
+            energy_j: 1.0,
+            flags: Flags::empty(),
+            moments: SecondMomentScore::default(),
+            snr: 100.0,
+            resolution_m: 2.0,
+            clutter_probability: 1e-4,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::fixture::detection;
+    use super::*;
+    use crate::estimate;
+    use crate::optics;
+
+    fn emitter(x_m: f64, cov_m2: [[f64; 2]; 2]) -> Emitter {
+        Emitter {
+            x_m,
+            y_m: 0.0,
+            cov_m2,
+            energy_j: 1e-3,
+            energy_std_j: 1e-6,
+            sensor_m: [0.0, 0.0],
+            second_moment: estimate::SecondMomentScore::default(),
+            flags: Flags::empty(),
+        }
+    }
+
+    fn of(emitters: Vec<Emitter>, reduced_chi2: f64) -> Vec<Detection> {
+        let estimate = Estimate {
+            emitters,
+            reduced_chi2,
+            ..Estimate::default()
+        };
+        Detection::of(&estimate, &optics::Config::default().camera().unwrap())
+    }
+
+    #[test]
+    fn a_misfit_inflates_the_covariance() {
+        let cov = |chi2: f64| of(vec![emitter(0.0, [[1.0, 0.0], [0.0, 4.0]])], chi2)[0].cov;
+        let floor = POSITION_FLOOR_M.powi(2);
+        assert_eq!(cov(1.0), Matrix2::new(1.0 + floor, 0.0, 0.0, 4.0 + floor));
+        assert_eq!(cov(9.0)[(0, 0)], 9.0 + floor);
+        // A χ² below one is luck, and one that is no number is the worst.
+        assert_eq!(cov(0.5), cov(1.0));
+        assert_eq!(cov(f64::NAN)[(0, 0)], 100.0 + floor);
+    }
+
+    #[test]
+    fn covariances_that_are_none_are_bounded_or_left_out() {
+        let indefinite = of(vec![emitter(0.0, [[1.0, 3.0], [3.0, 1.0]])], 1.0);
+        assert!(indefinite[0].cov.determinant() > 0.0);
+        assert!(of(vec![emitter(0.0, [[f64::NAN, 0.0], [0.0, 1.0]])], 1.0).is_empty());
+        assert!(of(vec![emitter(f64::INFINITY, [[1.0, 0.0], [0.0, 1.0]])], 1.0).is_empty());
+    }
+
+    #[test]
+    fn clutter_is_rarer_the_better_a_detection_stands_alone() {
+        let camera = optics::Config::default().camera().unwrap();
+        let spot_m = spot_m(&camera);
+        let beside = |away: f64| {
+            let cov = [[1e-4, 0.0], [0.0, 1e-4]];
+            of(vec![emitter(0.0, cov), emitter(away, cov)], 1.0)[0].clutter_probability
+        };
+        assert_eq!(
+            [beside(10.0 * spot_m), beside(2.0 * spot_m), beside(0.01)],
+            [1e-3, 1e-2, 0.1]
+        );
+        let mut poor = detection(0.0, 0.0);
+        poor.flags = Flags::POOR_FIT;
+        assert_eq!(clutter_probability(&[poor], 0, &camera), 0.03);
+    }
+
+    #[test]
+    fn two_detections_of_one_spot_are_their_centre_of_light() {
+        let camera = optics::Config::default().camera().unwrap();
+        let (mut a, b) = (detection(0.0, 0.0), detection(4.0, 0.0));
+        a.energy_j = 3.0;
+        let both = a.united([&b].into_iter(), &camera);
+        assert_eq!((both.energy_j, both.snr), (4.0, 200.0));
+        assert!((both.position - Vector2::new(1.0, 0.0)).norm() < 1e-12);
+        assert_eq!(a.united(std::iter::empty(), &camera).position, a.position);
     }
 }

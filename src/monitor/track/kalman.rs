@@ -1,21 +1,28 @@
+//! A constant-velocity Kalman filter of one beam on the ground.
+
 use nalgebra::{Matrix2, Matrix2x4, Matrix4, Vector2, Vector4};
 
-/// A constant-velocity Kalman filter of one beam on the ground: state (x, y, vx, vy) in m and m/s, white-noise
-/// acceleration (Bar-Shalom, Li and Kirubarajan, 2001, eqs. 6.2.2-10 to 6.2.2-13).
+use crate::monitor::stats::gaussian::mahalanobis2;
+
+/// Spectral density of the acceleration, m²/s³. Larger follows turns and averages less; a walker may turn round within a second
+/// or two. Checked by `follows_a_walker_and_a_turn`.
+const ACCELERATION: f64 = 1.5;
+/// Standard deviation of an unknown velocity, m/s, and so of one after a manoeuvre. Larger widens the gate of a new track.
+const SPEED_STD: f64 = 8.0;
+/// Squared Mahalanobis innovation past which the beam has manoeuvred: χ² of two degrees exceeds it once in 3,000. Smaller loses
+/// the velocity to noise, larger follows a jump later.
+const MANOEUVRE: f64 = 16.0;
+
+/// State (x, y, vx, vy) in m and m/s, white-noise acceleration (Bar-Shalom, Li and Kirubarajan, 2001, eqs. 6.2.2-10 to
+/// 6.2.2-13).
 #[derive(Clone, Debug)]
 pub struct KalmanFilter {
     state: Vector4<f64>,
     cov: Matrix4<f64>,
 }
 
-/// Spectral density of the acceleration, m²/s³: a walker may turn round within a second or two.
-const ACCELERATION: f64 = 1.5;
-/// Standard deviation of an unknown velocity, m/s, and so of one after a manoeuvre.
-const SPEED_STD: f64 = 8.0;
-/// Squared Mahalanobis innovation past which the beam has manoeuvred: χ² of two degrees exceeds it once in 3,000.
-const MANOEUVRE: f64 = 16.0;
-
 impl KalmanFilter {
+    /// At a first measured position, m, of covariance `r`, m²; the velocity is unknown.
     pub fn start(z: Vector2<f64>, r: Matrix2<f64>) -> Self {
         let mut cov = Matrix4::zeros();
         cov.fixed_view_mut::<2, 2>(0, 0).copy_from(&r);
@@ -27,7 +34,7 @@ impl KalmanFilter {
         }
     }
 
-    /// Lets `dt` seconds pass.
+    /// Predicts the state `dt` seconds later.
     pub fn predict(&mut self, dt: f64) {
         let mut f = Matrix4::identity();
         f[(0, 2)] = dt;
@@ -58,7 +65,8 @@ impl KalmanFilter {
         }
     }
 
-    /// Takes a measured position. One far outside the prediction opens the filter first, so that it follows.
+    /// Takes a measured position, m, of covariance `r`, m². One far outside the prediction opens the filter first, so that it
+    /// follows.
     pub fn update(&mut self, z: Vector2<f64>, r: Matrix2<f64>) {
         let innovation = z - self.position();
         if mahalanobis2(innovation, self.position_cov() + r) > MANOEUVRE {
@@ -94,44 +102,57 @@ impl KalmanFilter {
     }
 }
 
-/// rᵀ S⁻¹ r; infinite when S is singular.
-pub fn mahalanobis2(r: Vector2<f64>, s: Matrix2<f64>) -> f64 {
-    s.try_inverse()
-        .map_or(f64::INFINITY, |inverse| (r.transpose() * inverse * r)[0])
-}
-
-/// The larger eigenvalue of a symmetric 2 × 2 matrix.
-pub fn largest_eigenvalue(s: &Matrix2<f64>) -> f64 {
-    let mean = 0.5 * (s[(0, 0)] + s[(1, 1)]);
-    mean + (0.5 * (s[(0, 0)] - s[(1, 1)])).hypot(s[(0, 1)])
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
+    fn one_prediction_and_one_update_by_hand() {
+        let mut filter = KalmanFilter::start(Vector2::zeros(), Matrix2::identity());
+        filter.predict(1.0);
+        // 1 + 8²·1² + 1.5/3, before the speed is bounded to 8 m/s again.
+        let variance = 1.0 + 64.0 + 0.5;
+        assert!((filter.position_cov()[(0, 0)] - variance).abs() < 1e-12);
+        filter.update(Vector2::new(3.0, 0.0), Matrix2::identity());
+        assert!((filter.position().x - 3.0 * variance / (variance + 1.0)).abs() < 1e-12);
+        assert!((filter.position_cov()[(0, 0)] - variance / (variance + 1.0)).abs() < 1e-9);
+    }
+
+    #[test]
     fn follows_a_walker_and_a_turn() {
         let r = Matrix2::identity() * 0.01;
-        let mut m = KalmanFilter::start(Vector2::zeros(), r);
+        let mut filter = KalmanFilter::start(Vector2::zeros(), r);
         let mut truth = Vector2::zeros();
         for k in 1..100 {
             let velocity = if k < 50 { 1.5 } else { -1.5 };
             truth.x += velocity * 0.1;
-            m.predict(0.1);
-            m.update(truth, r);
-            let error = (m.position() - truth).norm();
+            filter.predict(0.1);
+            filter.update(truth, r);
+            let error = (filter.position() - truth).norm();
             assert!(error < 0.15, "frame {k}: {error}");
         }
-        assert!((m.state[2] + 1.5).abs() < 0.1, "{}", m.state);
+        assert!((filter.velocity().x + 1.5).abs() < 0.1, "{}", filter.state);
+    }
+
+    #[test]
+    fn a_jump_is_followed_at_once() {
+        let r = Matrix2::identity() * 0.01;
+        let mut filter = KalmanFilter::start(Vector2::zeros(), r);
+        for _ in 0..50 {
+            filter.predict(0.1);
+            filter.update(Vector2::zeros(), r);
+        }
+        filter.predict(0.1);
+        filter.update(Vector2::new(40.0, 0.0), r);
+        assert!((filter.position().x - 40.0).abs() < 0.01);
     }
 
     #[test]
     fn a_long_gap_grows_no_faster_than_the_speed_bound() {
-        let mut m = KalmanFilter::start(Vector2::zeros(), Matrix2::identity());
+        let mut filter = KalmanFilter::start(Vector2::zeros(), Matrix2::identity());
         for _ in 0..100 {
-            m.predict(1.0);
+            filter.predict(1.0);
         }
-        assert!(m.position_cov()[(0, 0)].sqrt() < 100.0 * SPEED_STD);
+        assert!(filter.position_cov()[(0, 0)].sqrt() < 100.0 * SPEED_STD);
     }
 }

@@ -64,7 +64,7 @@ impl Oracle {
             let (true_score, from_truth) = search_from(&scene.positions);
             missed += usize::from(true_score < score - MORE_PROBABLE);
             let best = match true_score < score {
-                true => &from_truth.emitters,
+                true => &from_truth,
                 false => &found,
             };
             found_m2.extend(squared(&scene.positions, &found));

@@ -1,4 +1,4 @@
-//! What a hostile network does to the monitor. Takes minutes and wants a machine to itself, so none of it is run by default:
+//! What a hostile network does to the monitor: floods of requests and of claims, clients without end. Takes minutes and wants a machine to itself, so none of it is run by default:
 //! `make siege`. `OAPWATCH_SIEGE_SECONDS` is how long each storm lasts, a minute unless set.
 
 mod flood;

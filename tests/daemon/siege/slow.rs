@@ -141,7 +141,11 @@ fn siege_a_gigabyte_of_garbage_in_the_log() {
     file.write_all(b"\n").unwrap();
     lines += 1;
     file.flush().unwrap();
-    let daemon = start(dir.path(), RATE_HZ, "[claims]\nlog = \"claims.ndjson\"\n");
+    let daemon = start(
+        dir.path(),
+        RATE_HZ,
+        "[claims]\nlog = \"claims.ndjson\"\ntail_bytes = 1073741824\n",
+    );
     let began = Instant::now();
     let malformed = |daemon: &Daemon| -> u64 {
         let metrics = daemon.get("/metrics").1;

@@ -1,0 +1,49 @@
+//! The bases of both axes, with the background's profiles in them.
+
+use crate::estimate::model::svd_basis::Basis;
+
+/// What a frame is compressed into and predicted in.
+pub(crate) struct Bases {
+    pub x: Basis,
+    pub y: Basis,
+    /// Constant and sloped profiles along each axis.
+    pub backgrounds: [[Vec<f64>; 2]; 2],
+}
+
+impl Bases {
+    pub fn new([x, y]: [Basis; 2]) -> Self {
+        Self {
+            backgrounds: [background(&x), background(&y)],
+            x,
+            y,
+        }
+    }
+
+    pub fn axes(&self) -> [&Basis; 2] {
+        [&self.x, &self.y]
+    }
+
+    /// Whether coefficients are pixels, so that each may have a weight.
+    pub fn are_pixels(&self) -> bool {
+        self.x.is_pixels && self.y.is_pixels
+    }
+
+    /// The wider pixel pitch of the two axes, σ.
+    pub fn pitch(&self) -> f64 {
+        self.x.pitch().max(self.y.pitch())
+    }
+
+    /// Ranges along each axis within which a fit may place a source, σ.
+    pub fn reach(&self) -> [f64; 2] {
+        self.axes().map(|b| b.max_position() - b.min_position())
+    }
+}
+
+/// Constant and sloped profiles along one axis, of about a source's norm, so that the normal equations are well scaled.
+fn background(b: &Basis) -> [Vec<f64>; 2] {
+    let (half, norm) = (0.5 * b.n as f64, (b.n as f64).sqrt());
+    let mut pair = [vec![0.0; b.stride], vec![0.0; b.stride]];
+    b.compress((0..b.n).map(|_| 1.0 / norm), &mut pair[0]);
+    b.compress((0..b.n).map(|k| (k as f64 + 0.5 - half) / half / norm), &mut pair[1]);
+    pair
+}

@@ -1,0 +1,89 @@
+//! The claims that our own pose is estimated from: where each user's beam may be now.
+
+use nalgebra::Vector2;
+
+use crate::monitor::input::claim_state::ActiveClaim;
+use crate::monitor::track::tracker::Tracker;
+
+/// Users that have been seen, from which on only such ones count: claims that no beam ever answered say nothing of our pose.
+const MIN_KNOWN: usize = 3;
+/// Reach of a witness, m: a margin for the beam's own error, standard deviations of the claim, and a share of what the user may
+/// have gone, up to a bound. Larger lets a beam nearby count, smaller loses honest users. Not measured.
+const REACH_M: f64 = 0.5;
+const REACH_SIGMAS: f64 = 3.0;
+const REACH_SLACK: f64 = 0.3;
+const MAX_SLACK_M: f64 = 10.0;
+
+/// A claim and how far from it an honest user's beam may be found now, m.
+#[derive(Clone, Copy, Debug)]
+pub struct Witness {
+    pub claimed: Vector2<f64>,
+    /// Per axis, m².
+    pub variance: f64,
+    pub reach_m: f64,
+}
+
+impl Witness {
+    /// A claim, and how far its user's beam is known to have `moved` since it was made, m.
+    fn of(claim: &ActiveClaim, moved: Option<Vector2<f64>>) -> Self {
+        let step_m = match moved {
+            Some(_) => 0.0,
+            None => REACH_SLACK * claim.slack_m.min(MAX_SLACK_M),
+        };
+        Self {
+            claimed: Vector2::new(claim.claim.x_m, claim.claim.y_m) + moved.unwrap_or_default(),
+            variance: claim.variance,
+            reach_m: REACH_M + REACH_SIGMAS * claim.variance.sqrt() + step_m,
+        }
+    }
+}
+
+/// Witnesses of all users whose beam is expected; only of those that have been seen, where there are enough.
+pub fn witnesses(claims: &[ActiveClaim], tracker: &Tracker) -> Vec<Witness> {
+    let (known, new): (Vec<&ActiveClaim>, Vec<&ActiveClaim>) =
+        claims.iter().filter(|a| a.expected).partition(|a| a.before.was_seen());
+    let heard = if known.len() >= MIN_KNOWN {
+        known
+    } else {
+        [known, new].concat()
+    };
+    let moved = |a: &ActiveClaim| {
+        let track = tracker.get(a.before.track?)?;
+        Some(track.filter.position() - track.at(a.made)?)
+    };
+    heard.into_iter().map(|a| Witness::of(a, moved(a))).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use jiff::Timestamp;
+
+    use super::*;
+    use crate::monitor::input::claim_state::fixture::active_claim;
+
+    #[test]
+    fn a_witness_reaches_as_far_as_its_user_may_have_gone() {
+        let mut claim = active_claim("a", 3.0, 4.0);
+        claim.slack_m = 2.0;
+        let unknown = Witness::of(&claim, None);
+        assert!((unknown.reach_m - (0.5 + 0.9 + 0.6)).abs() < 1e-12);
+        let followed = Witness::of(&claim, Some(Vector2::new(1.0, 0.0)));
+        assert!((followed.reach_m - 1.4).abs() < 1e-12);
+        assert_eq!(followed.claimed, Vector2::new(4.0, 4.0));
+    }
+
+    #[test]
+    fn once_three_users_have_been_seen_invented_ones_are_no_witnesses() {
+        let mut claims: Vec<_> = ["a", "b", "c", "d", "e"]
+            .iter()
+            .map(|user| active_claim(user, 0.0, 0.0))
+            .collect();
+        claims[4].expected = false;
+        for (seen, heard) in [(2, 4), (3, 3)] {
+            for claim in &mut claims[..seen] {
+                claim.before.last_seen = Some(Timestamp::UNIX_EPOCH);
+            }
+            assert_eq!(witnesses(&claims, &Tracker::new(50.0)).len(), heard);
+        }
+    }
+}

@@ -1,0 +1,126 @@
+//! `pose_inconsistent`: all users are displaced alike, by more than is corrected in silence.
+
+use nalgebra::Vector2;
+use serde_json::json;
+
+use crate::monitor::alert::{AlertKind, Severity};
+use crate::monitor::finding::{Cause, Content, Finding};
+use crate::monitor::frame_context::FrameContext;
+use crate::monitor::stats::error_budget::TestFamily;
+use crate::monitor::stats::gaussian::neg_log_p_outside;
+
+/// Share of the tolerated distance that is corrected without an alert, where `pose_limit_m` is left out.
+const DEFAULT_LIMIT: f64 = 0.5;
+/// Share of the limit below which the displacement must fall before its alert ends.
+const ENDS_BELOW: f64 = 0.9;
+/// Displacement in units of the limit from which the alert is critical.
+const CRITICAL_RATIO: f64 = 4.0;
+
+const CAUSE: Cause = Cause::System(AlertKind::PoseInconsistent);
+
+pub fn evaluate(frame: &FrameContext) -> Vec<Finding> {
+    let limit = frame
+        .config
+        .pose_limit_m
+        .unwrap_or(DEFAULT_LIMIT * frame.config.tolerated_distance_m);
+    let (place, worst) = worst_displacement(frame);
+    let neg_log_p = neg_log_p_outside(worst, &frame.systematic_cov(place), limit);
+    let threshold = frame.budget.threshold(TestFamily::Pose, 1.0);
+    let is_open = frame.alerts.is_open(&CAUSE);
+    let is_present = neg_log_p > threshold || (is_open && worst.norm() > ENDS_BELOW * limit);
+    if !is_present {
+        return vec![Finding::Absent(CAUSE)];
+    }
+    let severity = if worst.norm() > CRITICAL_RATIO * limit {
+        Severity::Critical
+    } else {
+        Severity::Warning
+    };
+    let pose = frame.pose.displacement();
+    let (agreeing, of) = frame.pose.support();
+    let evidence = json!({
+        "shift_m": [pose.shift.x, pose.shift.y],
+        "turned_deg": pose.turn.to_degrees(),
+        "scale": 1.0 + pose.scale,
+        "largest_in_view_m": worst.norm(),
+        "limit_m": limit,
+        "users_agreeing": agreeing,
+        "users": of,
+        "surprise": neg_log_p,
+        "threshold": threshold,
+    });
+    vec![Finding::present(CAUSE, Content::new(severity, evidence))]
+}
+
+/// Where in view our pose error displaces positions most, of the middle and the four edges, and by how much, m.
+fn worst_displacement(frame: &FrameContext) -> (Vector2<f64>, Vector2<f64>) {
+    let pose = frame.pose.displacement();
+    let camera = frame.camera;
+    let [w, h] = [&camera.x, &camera.y].map(|axis| axis.half_width() * camera.ground_scale());
+    [[0.0, 0.0], [w, 0.0], [-w, 0.0], [0.0, h], [0.0, -h]]
+        .map(|[x, y]| Vector2::new(x, y))
+        .map(|p| (p, pose.at(p)))
+        .into_iter()
+        .max_by(|a, b| a.1.norm().total_cmp(&b.1.norm()))
+        .expect("five places")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::monitor::fixture::{Scene, absent, present};
+    use crate::monitor::pose::consensus::PoseConsensus;
+    use crate::monitor::pose::witness::Witness;
+
+    const USERS: [[f64; 2]; 6] = [
+        [0.0, 0.0],
+        [50.0, 0.0],
+        [0.0, 50.0],
+        [-60.0, 0.0],
+        [0.0, -70.0],
+        [80.0, 80.0],
+    ];
+
+    /// The findings where all beams are `shift` away from their claims.
+    fn findings(scene: &mut Scene, shift: f64) -> Vec<Finding> {
+        let claims = USERS.map(Vector2::from);
+        let beams = claims.map(|c| c + Vector2::new(shift, 0.0));
+        let witnesses = claims.map(|claimed| Witness {
+            claimed,
+            variance: 0.01,
+            reach_m: 1.0,
+        });
+        scene.pose = PoseConsensus::default();
+        scene.pose.update(&beams, &witnesses, 0.1, 1.0);
+        let findings = evaluate(&scene.context());
+        scene.apply(findings.clone());
+        findings
+    }
+
+    #[test]
+    fn a_common_shift_beyond_the_limit_is_our_own_error() {
+        let mut scene = Scene::of_users(&USERS);
+        // The limit is half of five metres.
+        assert_eq!(absent(&findings(&mut scene, 2.0)), [&CAUSE]);
+        assert_eq!(present(&findings(&mut scene, 4.0)), [&CAUSE]);
+        let alert = scene.alerts.open().next().unwrap().1;
+        assert_eq!(alert.severity, Severity::Warning);
+        assert_eq!(
+            (&alert.evidence["users_agreeing"], &alert.evidence["limit_m"]),
+            (&json!(6), &json!(2.5))
+        );
+        // It ends below nine tenths of the limit, and is critical beyond four of it.
+        assert_eq!(present(&findings(&mut scene, 2.3)), [&CAUSE]);
+        assert_eq!(absent(&findings(&mut scene, 2.2)), [&CAUSE]);
+        findings(&mut scene, 11.0);
+        assert_eq!(scene.alerts.open().next().unwrap().1.severity, Severity::Critical);
+    }
+
+    #[test]
+    fn the_limit_can_be_set() {
+        let mut scene = Scene::of_users(&USERS);
+        scene.config.pose_limit_m = Some(10.0);
+        assert_eq!(absent(&findings(&mut scene, 9.0)), [&CAUSE]);
+        assert_eq!(present(&findings(&mut scene, 12.0)), [&CAUSE]);
+    }
+}

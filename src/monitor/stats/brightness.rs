@@ -1,0 +1,252 @@
+//! Whether a beam is brighter than it was: Student's test of the newest ln energies against their past.
+
+use jiff::Timestamp;
+
+use super::block_history::{BLOCK_FRAMES, BlockHistory, MIN_DRIFT_BLOCKS, Recent};
+
+/// Windows of newest frames that are tested. Short ones find a strong second beam soon, long ones a weak one late; they share
+/// data, and no correction is made for their number (the soaks of docs/verdicts.md hold the rate of false alerts).
+pub const WINDOWS: [usize; 4] = [10, 20, 40, 80];
+/// Blocks of past before a beam has a history to be compared with: two leave one degree of freedom for its scatter.
+const MIN_BLOCKS: usize = 2;
+/// Variance of a beam's slow drift in units of a block mean's variance, until blocks show it. Larger delays the first verdict
+/// of a beam, smaller takes drift for a second beam. Not measured.
+const ASSUMED_DRIFT: f64 = 0.5;
+/// A beam whose blocks scatter by this factor more in variance than all beams' do is judged by its own scatter. Smaller lets
+/// chance decide with a few blocks, larger holds one user's unsteady light against them. Not measured.
+const OWN_SCATTER_RATIO: f64 = 3.0;
+/// Smallest standard deviation of an ln energy: what gains and the fit leave however steady the light. Not measured.
+const MIN_LN_STD: f64 = 0.05;
+
+/// A beam's ln energies.
+#[derive(Clone, Debug, Default)]
+pub struct Brightness {
+    recent: Recent<(Timestamp, f64)>,
+    past: BlockHistory<Variance>,
+}
+
+/// Mean and sum of squared deviations (Welford, 1962).
+#[derive(Clone, Copy, Debug, Default)]
+struct Variance {
+    n: u32,
+    mean: f64,
+    squares: f64,
+}
+
+/// Sum of squared deviations of block means and its degrees of freedom.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Scatter {
+    pub squares: f64,
+    pub freedom: f64,
+}
+
+/// Ratio of the newest mean energy to the past's, and −ln p of it.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Brightening {
+    pub ratio: f64,
+    pub neg_log_p: f64,
+}
+
+impl Variance {
+    fn add(&mut self, x: f64) {
+        self.n += 1;
+        let d = x - self.mean;
+        self.mean += d / f64::from(self.n);
+        self.squares += d * (x - self.mean);
+    }
+}
+
+impl Scatter {
+    fn variance(&self) -> f64 {
+        self.squares / self.freedom.max(1.0)
+    }
+}
+
+impl std::iter::Sum for Scatter {
+    fn sum<I: Iterator<Item = Self>>(all: I) -> Self {
+        all.fold(Self::default(), |sum, s| Self {
+            squares: sum.squares + s.squares,
+            freedom: sum.freedom + s.freedom,
+        })
+    }
+}
+
+impl Brightness {
+    /// A beam known from before a restart by the mean and standard deviation of its ln energy.
+    pub fn remembered(mean: f64, std: f64) -> Self {
+        let block = Variance {
+            n: BLOCK_FRAMES,
+            mean,
+            squares: f64::from(BLOCK_FRAMES - 1) * std * std,
+        };
+        Self {
+            past: BlockHistory::of(std::iter::repeat_n(block, MIN_DRIFT_BLOCKS)),
+            ..Self::default()
+        }
+    }
+
+    /// Takes a frame's ln energy. With `learn` the frame that it pushes out of the newest is added to the past.
+    pub fn push(&mut self, time: Timestamp, ln_energy: f64, learn: bool) {
+        if let Some((_, old)) = self.recent.push((time, ln_energy))
+            && learn
+        {
+            self.past.push(|block| block.add(old));
+        }
+    }
+
+    /// Newest frames.
+    pub fn frames(&self) -> usize {
+        self.recent.len()
+    }
+
+    /// How many of them are from `time` or later.
+    pub fn frames_since(&self, time: Timestamp) -> usize {
+        self.recent.count_since(time)
+    }
+
+    /// Mean and standard deviation of the past's ln energy.
+    pub fn past(&self) -> Option<(f64, f64)> {
+        Some((self.past_mean()?, self.within().sqrt()))
+    }
+
+    /// Rise of the mean ln energy of the shortest window over the past.
+    pub fn recent_rise(&self) -> Option<f64> {
+        (self.recent.len() >= WINDOWS[0]).then_some(self.recent.mean_of_newest(WINDOWS[0]) - self.past_mean()?)
+    }
+
+    /// How the blocks' means scatter.
+    pub fn scatter(&self) -> Scatter {
+        self.past_mean().map_or(Scatter::default(), |past| Scatter {
+            squares: self.past.blocks().map(|b| (b.mean - past).powi(2)).sum(),
+            freedom: self.past.len() as f64 - 1.0,
+        })
+    }
+
+    /// The most significant of all windows. A rise of `allowed` in ln energy is no evidence; `all_beams` is the scatter of every
+    /// beam's blocks.
+    pub fn most_significant(&self, allowed: f64, all_beams: Scatter) -> Brightening {
+        let mut most = Brightening::default();
+        for n in WINDOWS {
+            if let Some(found) = self.test(n, allowed, all_beams)
+                && found.neg_log_p >= most.neg_log_p
+            {
+                most = found;
+            }
+        }
+        most
+    }
+
+    /// Student's test of the mean ln energy of the newest `n` frames against the past. The past's blocks scatter by more than
+    /// its frames explain where light drifts slowly: a random effect of variance τ², which no window averages out. The tail
+    /// of t falls as (1 + t²/ν)^(−(ν+1)/2), with ν from Satterthwaite (1946): a few blocks of history prove little.
+    pub fn test(&self, n: usize, allowed: f64, all_beams: Scatter) -> Option<Brightening> {
+        if self.recent.len() < n {
+            return None;
+        }
+        let past = self.past_mean()?;
+        let blocks = self.past.len() as f64;
+        let frames_freedom = self.past.blocks().map(|b| f64::from(b.n - 1)).sum::<f64>();
+        let within = self.within();
+        let of_block = within / f64::from(BLOCK_FRAMES);
+        let own = self.scatter();
+        let scatter = match own.variance() > OWN_SCATTER_RATIO * all_beams.variance() {
+            true => own,
+            false => all_beams,
+        };
+        let (drift, drift_freedom) = if scatter.freedom >= MIN_DRIFT_BLOCKS as f64 {
+            ((scatter.variance() - of_block).max(0.0), scatter.freedom)
+        } else {
+            (ASSUMED_DRIFT * of_block, frames_freedom)
+        };
+        let slow = drift * (1.0 + 1.0 / blocks);
+        let fast = within / n as f64 + of_block / blocks;
+        let variance = slow + fast;
+        let freedom = variance * variance / (slow * slow / drift_freedom + fast * fast / frames_freedom);
+        let rise = self.recent.mean_of_newest(n) - past;
+        let t = (rise - allowed).max(0.0) / variance.sqrt();
+        Some(Brightening {
+            ratio: rise.exp(),
+            neg_log_p: 0.5 * (freedom + 1.0) * (t * t / freedom).ln_1p(),
+        })
+    }
+
+    fn past_mean(&self) -> Option<f64> {
+        let n = self.past.len();
+        (n >= MIN_BLOCKS).then(|| self.past.blocks().map(|b| b.mean).sum::<f64>() / n as f64)
+    }
+
+    /// Variance of ln energies within blocks.
+    fn within(&self) -> f64 {
+        let freedom = self.past.blocks().map(|b| f64::from(b.n - 1)).sum::<f64>();
+        let variance = self.past.blocks().map(|b| b.squares).sum::<f64>() / freedom.max(1.0);
+        variance.max(MIN_LN_STD * MIN_LN_STD)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn fed(brightness: &mut Brightness, frames: usize, ln_energy: impl Fn(usize) -> f64) {
+        let first = brightness.frames();
+        for k in 0..frames {
+            let time = Timestamp::from_millisecond(100 * (first + k) as i64).unwrap();
+            brightness.push(time, ln_energy(k), true);
+        }
+    }
+
+    #[test]
+    fn a_beam_without_a_past_is_not_judged() {
+        let mut young = Brightness::default();
+        // 80 newest frames and one block: one block is no past.
+        fed(&mut young, 110, |_| 0.0);
+        assert_eq!(young.past(), None);
+        assert_eq!(young.test(10, 0.0, Scatter::default()), None);
+        fed(&mut young, 30, |_| 0.0);
+        assert_eq!(young.past(), Some((0.0, MIN_LN_STD)));
+    }
+
+    #[test]
+    fn the_t_statistic_by_hand() {
+        // Six remembered blocks of equal means, σ = 0.3 within blocks; ten frames at a rise of 1.
+        let mut beam = Brightness::remembered(2.0, 0.3);
+        fed(&mut beam, 10, |_| 3.0);
+        let found = beam.test(10, 0.0, Scatter::default()).unwrap();
+        assert!((found.ratio - 1f64.exp()).abs() < 1e-12);
+        // No scatter is known: drift ½·0.09/30 = 0.0015, slow = 0.0015·7/6, fast = 0.09/10 + 0.003/6; ν = 6·29 for both.
+        let (slow, fast) = (0.0015 * 7.0 / 6.0, 0.009 + 0.0005);
+        let variance = slow + fast;
+        let freedom = 174.0 * variance * variance / (slow * slow + fast * fast);
+        let expected = 0.5 * (freedom + 1.0) * f64::ln_1p(1.0 / variance / freedom);
+        assert!((found.neg_log_p / expected - 1.0).abs() < 1e-9, "{found:?} {expected}");
+    }
+
+    #[test]
+    fn an_allowed_rise_and_a_fall_are_no_evidence() {
+        let mut beam = Brightness::remembered(2.0, 0.3);
+        fed(&mut beam, 10, |_| 2.29);
+        assert_eq!(beam.most_significant(0.3, Scatter::default()).neg_log_p, 0.0);
+        let mut beam = Brightness::remembered(2.0, 0.3);
+        fed(&mut beam, 10, |_| 0.0);
+        assert_eq!(beam.most_significant(0.0, Scatter::default()).neg_log_p, 0.0);
+    }
+
+    #[test]
+    fn drift_that_all_beams_show_takes_evidence_away() {
+        let mut beam = Brightness::remembered(2.0, 0.3);
+        fed(&mut beam, 10, |_| 3.0);
+        let steady = beam.test(10, 0.0, Scatter::default()).unwrap().neg_log_p;
+        let drifting = Scatter {
+            squares: 2.5,
+            freedom: 10.0,
+        };
+        assert!(beam.test(10, 0.0, drifting).unwrap().neg_log_p < 0.25 * steady);
+    }
+
+    #[test]
+    fn welfords_sums_are_mean_and_variance() {
+        let mut v = Variance::default();
+        [1.0, 2.0, 6.0].into_iter().for_each(|x| v.add(x));
+        assert_eq!((v.n, v.mean, v.squares), (3, 3.0, 14.0));
+    }
+}

@@ -1,0 +1,74 @@
+//! Order statistics: medians and quantiles, none of which a minority of liars can move far.
+
+use nalgebra::Vector2;
+
+use crate::stats;
+
+/// The median; of an even number of values the mean of the two in the middle. `None` of none.
+pub fn median(values: impl Iterator<Item = f64>) -> Option<f64> {
+    let values = sorted(values);
+    let n = values.len();
+    match n {
+        0 => None,
+        _ if n % 2 == 1 => Some(values[n / 2]),
+        _ => Some(0.5 * (values[n / 2 - 1] + values[n / 2])),
+    }
+}
+
+/// The median; of an even number of values the upper of the two in the middle, so that it is always one of them.
+pub fn median_high(values: impl Iterator<Item = f64>) -> Option<f64> {
+    stats::median(values.collect())
+}
+
+/// The value below which nine tenths of all values lie. `None` of none.
+pub fn ninth_decile(values: impl Iterator<Item = f64>) -> Option<f64> {
+    let values = sorted(values);
+    values.get(values.len() * 9 / 10).copied()
+}
+
+/// Component-wise median; zero of none.
+pub fn median_vector(values: impl Iterator<Item = Vector2<f64>> + Clone) -> Vector2<f64> {
+    let axis = |k: usize| median(values.clone().map(|v| v[k])).unwrap_or(0.0);
+    Vector2::new(axis(0), axis(1))
+}
+
+fn sorted(values: impl Iterator<Item = f64>) -> Vec<f64> {
+    let mut values: Vec<f64> = values.collect();
+    values.sort_by(f64::total_cmp);
+    values
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn medians_of_odd_and_even_numbers() {
+        let of = |values: &[f64]| (median(values.iter().copied()), median_high(values.iter().copied()));
+        assert_eq!(of(&[]), (None, None));
+        assert_eq!(of(&[3.0, 1.0, 2.0]), (Some(2.0), Some(2.0)));
+        assert_eq!(of(&[4.0, 1.0, 2.0, 9.0]), (Some(3.0), Some(4.0)));
+    }
+
+    #[test]
+    fn fewer_than_half_of_the_values_move_the_median_no_further_than_the_rest_spread() {
+        let honest = [1.0, 1.1, 1.2];
+        let lies = [1e9, -1e9, f64::INFINITY];
+        let median = median(honest.iter().chain(&lies[..2]).copied());
+        assert_eq!(median, Some(1.1));
+    }
+
+    #[test]
+    fn the_ninth_decile_of_ten_values_is_the_largest() {
+        assert_eq!(ninth_decile((1..=10).rev().map(f64::from)), Some(10.0));
+        assert_eq!(ninth_decile((1..=20).map(f64::from)), Some(19.0));
+        assert_eq!(ninth_decile(std::iter::empty()), None);
+    }
+
+    #[test]
+    fn a_median_vector_is_taken_by_component() {
+        let values = [[0.0, 5.0], [1.0, 3.0], [9.0, 4.0]].map(Vector2::from);
+        assert_eq!(median_vector(values.into_iter()), Vector2::new(1.0, 4.0));
+        assert_eq!(median_vector(std::iter::empty()), Vector2::zeros());
+    }
+}

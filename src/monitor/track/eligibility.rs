@@ -1,0 +1,152 @@
+//! Whether a beam may be that of a user who is not known by one yet: it is near their claim by more than chance, and has not walked
+//! onto it.
+
+use jiff::Timestamp;
+use nalgebra::Vector2;
+
+use super::tracker::Track;
+use crate::claims::{Store, seconds};
+use crate::monitor::alert_lifecycle::AlertLifecycle;
+use crate::monitor::finding::Cause;
+use crate::monitor::input::claim_state::ActiveClaim;
+use crate::monitor::input::crowding::Crowding;
+
+/// Share of the tolerated distance by which a claim that stays where it is may move: half of it is the error of an honest claim.
+const STAYS: f64 = 0.5;
+
+/// What decides on it.
+#[derive(Clone, Copy)]
+pub struct Eligibility<'a> {
+    /// The newest time so far.
+    pub now: Option<Timestamp>,
+    pub crowding: Crowding,
+    pub alerts: &'a AlertLifecycle,
+    pub store: &'a Store,
+    pub decision_s: f64,
+    pub tolerated_m: f64,
+}
+
+impl Eligibility<'_> {
+    /// `owner` is the claim that the track was associated with in the frame before.
+    pub fn allows(&self, claim: &ActiveClaim, track: &Track, owner: Option<&ActiveClaim>) -> bool {
+        if claim.before.is_established() {
+            return true;
+        }
+        let is_anothers = owner.is_some_and(|o| o.claim.user != claim.claim.user);
+        if !self.crowding.is_crowded() {
+            return claim.before.was_seen()
+                || !(self.has_walked_onto(claim, track) || (is_anothers && self.is_handed_on(claim, owner)));
+        }
+        // Where the beam was when the claim was made: a newcomer may be on the move.
+        let beam = track.at(claim.made).unwrap_or(track.filter.position());
+        let is_alerted = self.alerts.is_open(&Cause::Track(track.id));
+        !is_alerted && !is_anothers && (beam - claim.position).norm() <= self.crowding.reach_m()
+    }
+
+    /// The beam was nobody's, and alerted, while the claim stood where it is now: the beam came to the claim, not the claim to
+    /// the beam.
+    fn has_walked_onto(&self, claim: &ActiveClaim, track: &Track) -> bool {
+        let Some(raised_at) = self.alerts.raised_at(&Cause::Track(track.id)) else {
+            return false;
+        };
+        let user = &claim.claim.user;
+        let was_heard = self.store.first_heard(user).is_some_and(|t| t <= raised_at);
+        let then = self.store.position_at(user, raised_at).map(Vector2::from);
+        let here = Vector2::new(claim.claim.x_m, claim.claim.y_m);
+        was_heard && then.is_some_and(|then| (then - here).norm() <= STAYS * self.tolerated_m)
+    }
+
+    /// The beam is known by another user's claim, which goes on, and this one has been without a beam for so long that it should
+    /// have had one.
+    fn is_handed_on(&self, claim: &ActiveClaim, owner: Option<&ActiveClaim>) -> bool {
+        let waited_s = |since| self.now.map_or(0.0, |now| seconds(since, now));
+        let has_waited = claim
+            .before
+            .unseen_since
+            .is_some_and(|t| waited_s(t) >= self.decision_s);
+        has_waited && owner.is_some_and(|o| !o.ended && o.before.is_established())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use jiff::SignedDuration;
+
+    use super::*;
+    use crate::monitor::alert::Severity;
+    use crate::monitor::finding::{Content, Finding};
+    use crate::monitor::fixture::Scene;
+
+    const STRANGER: [f64; 2] = [40.0, 0.0];
+
+    /// A user at the origin who has been known for 3 s, and a stranger, track 2.
+    fn scene() -> Scene {
+        let mut scene = Scene::of_users(&[[0.0, 0.0]]);
+        (0..20).for_each(|_| scene.show(&[[0.0, 0.0], STRANGER]));
+        scene
+    }
+
+    /// Whether the stranger's beam may be that of `claim`, or the user's, where it is `theirs`.
+    fn allows(scene: &Scene, claim: &ActiveClaim, theirs: bool) -> bool {
+        let (track, owner) = match theirs {
+            true => (1, scene.claims.first()),
+            false => (2, None),
+        };
+        scene
+            .eligibility()
+            .allows(claim, scene.tracker.get(track).unwrap(), owner)
+    }
+
+    fn newcomer(scene: &mut Scene, x: f64) -> ActiveClaim {
+        scene.hear("new", x, 0.0)
+    }
+
+    #[test]
+    fn among_few_names_any_claim_may_be_a_beams() {
+        let mut scene = scene();
+        let claim = newcomer(&mut scene, 44.0);
+        assert!(allows(&scene, &claim, false));
+    }
+
+    #[test]
+    fn among_many_only_one_that_is_right_to_the_metre() {
+        let mut scene = scene();
+        scene.crowd(300.0);
+        let reach = scene.crowding.reach_m();
+        for (off, is_allowed) in [(0.9 * reach, true), (1.1 * reach, false)] {
+            let claim = newcomer(&mut scene, STRANGER[0] + off);
+            assert_eq!(allows(&scene, &claim, false), is_allowed, "{off}");
+        }
+        // A beam that has been theirs for three seconds stays theirs.
+        let mut known = newcomer(&mut scene, 60.0);
+        known.before = scene.claims[0].before;
+        assert!(known.before.is_established() && allows(&scene, &known, false));
+    }
+
+    #[test]
+    fn a_beam_that_was_alerted_before_it_came_to_the_claim_has_walked_onto_it() {
+        let mut scene = scene();
+        let stood = newcomer(&mut scene, 40.0);
+        scene.now += SignedDuration::from_secs(1);
+        let content = Content::new(Severity::Warning, serde_json::json!({}));
+        scene.apply(vec![Finding::present(Cause::Track(2), content)]);
+        scene.now += SignedDuration::from_secs(1);
+        assert!(!allows(&scene, &stood, false));
+        // One who is heard later, or was claimed elsewhere then, came to the beam.
+        let later = scene.hear("later", 40.0, 0.0);
+        assert!(allows(&scene, &later, false));
+        let moved = newcomer(&mut scene, 46.0);
+        assert!(allows(&scene, &moved, false));
+    }
+
+    #[test]
+    fn a_known_users_beam_is_not_handed_on_to_one_who_should_have_had_one() {
+        let mut scene = scene();
+        let mut claim = newcomer(&mut scene, 1.0);
+        assert!(allows(&scene, &claim, true));
+        claim.before.unseen_since = Some(scene.now - SignedDuration::from_secs(1));
+        assert!(!allows(&scene, &claim, true));
+        scene.claims[0].ended = true;
+        assert!(allows(&scene, &claim, true));
+    }
+}
