@@ -2,7 +2,7 @@
 //! directly or around a circle.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 /// Modules from the lowest up: each imports only from those before it.
 const LAYERS: &[&str] = &[

@@ -193,6 +193,14 @@ async fn an_acknowledgement_has_a_note_and_can_be_undone() {
     fake.stop().await;
 }
 
+/// Width and height of a PNG, all of whose pixels can be decoded.
+fn size_of(png: &[u8]) -> (u32, u32) {
+    let mut reader = png::Decoder::new(std::io::Cursor::new(png)).read_info().unwrap();
+    let mut pixels = vec![0; reader.output_buffer_size().unwrap()];
+    let info = reader.next_frame(&mut pixels).unwrap();
+    (info.width, info.height)
+}
+
 #[tokio::test]
 async fn evidence_is_served_as_frames_as_a_picture_and_with_claims() {
     let dir = tempfile::tempdir().unwrap();
@@ -238,8 +246,7 @@ async fn evidence_is_served_as_frames_as_a_picture_and_with_claims() {
     assert_eq!(told["frames"][position]["claims"][0]["user"], "u-1");
     let png = get(&fake, "/v1/alerts/a-1/evidence.png?scale=2").await;
     assert_eq!(png.headers()[header::CONTENT_TYPE], "image/png");
-    let picture = image::load_from_memory(&png.bytes().await.unwrap()).unwrap();
-    assert_eq!((picture.width(), picture.height()), (128, 128));
+    assert_eq!(size_of(&png.bytes().await.unwrap()), (128, 128));
 
     for ending in ["npy", "json", "png"] {
         let detail = problem(get(&fake, &format!("/v1/alerts/a-2/evidence.{ending}")).await, 404).await;
@@ -258,8 +265,7 @@ async fn without_a_recorder_an_alert_of_this_run_has_a_picture() {
     let alert = fake.journal.alert("a-1").unwrap().unwrap();
     fake.feed.illustrate(&[alert], &crate::fake::snapshot(1));
     let png = get(&fake, "/v1/alerts/a-1/evidence.png").await;
-    let picture = image::load_from_memory(&png.bytes().await.unwrap()).unwrap();
-    assert_eq!((picture.width(), picture.height()), (256, 256));
+    assert_eq!(size_of(&png.bytes().await.unwrap()), (256, 256));
     fake.stop().await;
 }
 
