@@ -1,7 +1,7 @@
 //! A frame of nine emitters, at 64×64 and 100×100, separated and melted: each stage, and the whole by every rung of the ladder.
 
-use criterion::measurement::WallTime;
-use criterion::{BenchmarkGroup, Criterion, criterion_group, criterion_main};
+mod timing;
+
 use ndarray::Array2;
 use oapwatch::assign::assign;
 use oapwatch::estimate::stages::Stages;
@@ -11,6 +11,7 @@ use oapwatch::optics::{self, psf};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, Normal};
+use timing::time;
 
 /// The frame and where its spots are, m on the sensor.
 fn frame(camera: &optics::Camera) -> (Frame, Vec<[f64; 2]>) {
@@ -39,7 +40,7 @@ fn frame(camera: &optics::Camera) -> (Frame, Vec<[f64; 2]>) {
     (frame, places)
 }
 
-fn frames(criterion: &mut Criterion) {
+fn main() {
     for (spots, sigma_m, noise_std_j) in [
         ("separated", 1e-3, 1e-6),
         ("melted", 8e-3, 1e-6 * std::f64::consts::TAU * 64e-6),
@@ -54,39 +55,34 @@ fn frames(criterion: &mut Criterion) {
             .camera()
             .expect("a valid camera");
             let (frame, places) = frame(&camera);
-            let mut group = criterion.benchmark_group(format!("{spots}/{pixels}"));
-            stages(&mut group, &camera, &frame, &places);
+            let group = format!("{spots}/{pixels}");
+            stages(&group, &camera, &frame, &places);
             for rung in ESTIMATORS {
                 let config = Config {
                     name: Some(rung.name.to_owned()),
                     ..Default::default()
                 };
                 let mut estimator = build(&config, &camera).expect("a rung of the ladder");
-                group.bench_function(rung.name, |b| b.iter(|| estimator.estimate(&frame)));
+                time(&format!("{group} {}", rung.name), || estimator.estimate(&frame));
             }
-            group.finish();
         }
     }
 }
 
-fn stages(group: &mut BenchmarkGroup<WallTime>, camera: &optics::Camera, frame: &Frame, places: &[[f64; 2]]) {
+fn stages(group: &str, camera: &optics::Camera, frame: &Frame, places: &[[f64; 2]]) {
+    let stage = |name: &str| format!("{group} stage: {name}");
     let mut stages = Stages::new(camera);
-    group.bench_function("stage: load", |b| b.iter(|| stages.load(frame)));
-    group.bench_function("stage: matched filter", |b| b.iter(|| stages.matched_filter()));
-    group.bench_function("stage: suppression, sub-pixel peaks", |b| b.iter(|| stages.peaks()));
+    time(&stage("load"), || stages.load(frame));
+    time(&stage("matched filter"), || stages.matched_filter());
+    time(&stage("suppression, sub-pixel peaks"), || stages.peaks());
     // A tenth of a pixel beside the truth, so that each step has something to do.
     let starts: Vec<_> = places.iter().map(|p| p.map(|v| v + 0.1 * camera.x.pitch_m)).collect();
-    group.bench_function("stage: joint fit, five steps", |b| b.iter(|| stages.fit(&starts)));
-    group.bench_function("stage: covariance, ground", |b| b.iter(|| stages.ground()));
+    time(&stage("joint fit, five steps"), || stages.fit(&starts));
+    time(&stage("covariance, ground"), || stages.ground());
     let found = stages.ground();
-    group.bench_function("stage: assignment to nine claims", |b| {
-        b.iter(|| {
-            assign(found.len(), found.len(), 1e4, |i, j| {
-                (found[i].x_m - found[j].x_m).powi(2) + (found[i].y_m - found[j].y_m).powi(2)
-            })
+    time(&stage("assignment to nine claims"), || {
+        assign(found.len(), found.len(), 1e4, |i, j| {
+            (found[i].x_m - found[j].x_m).powi(2) + (found[i].y_m - found[j].y_m).powi(2)
         })
     });
 }
-
-criterion_group!(benches, frames);
-criterion_main!(benches);

@@ -1,11 +1,11 @@
 //! What a frame costs: bare, with the paper's effects, with noise; that an effect which is not called for costs nothing; and
 //! what more threads bring in bulk.
 
-use std::hint::black_box;
+mod timing;
 
-use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use oapwatch::scene::{Plan, Scene};
 use rayon::ThreadPoolBuilder;
+use timing::time;
 
 /// Nine emitters that stand on a grid, 64 × 64 pixels, σ_eff 1 mm.
 fn nine(effects: &str) -> Plan {
@@ -21,8 +21,7 @@ fn nine(effects: &str) -> Plan {
 const LINK: &str =
     "attenuation = { kappa_per_m = 0.001 }\nfading = { alpha = 4, beta = 2 }\npointing = { jitter_m = 0.1 }\n";
 
-fn frames(c: &mut Criterion) {
-    let mut group = c.benchmark_group("frame, 64 × 64, N = 9");
+fn frames() {
     let noise = "thermal_noise = {}\n";
     let tolerated = "shot_noise = { wavelength_m = 1.55e-6 }\n";
     for (name, effects) in [
@@ -45,32 +44,27 @@ fn frames(c: &mut Criterion) {
         let plan = nine(&effects);
         let mut maker = plan.maker();
         let mut k = 0;
-        group.bench_function(name, |b| {
-            b.iter(|| {
-                k += 1;
-                black_box(maker.frame(k))
-            })
+        time(&format!("frame, 64 × 64, N = 9: {name}"), || {
+            k += 1;
+            maker.frame(k)
         });
     }
-    group.finish();
 }
 
 /// As many frames as `oapwatch simulate` holds at a time.
 const BULK: u64 = 256;
 
-fn bulk(c: &mut Criterion) {
-    let mut group = c.benchmark_group(format!("{BULK} frames, 64 × 64, N = 9, link and noise"));
-    group.throughput(Throughput::Elements(BULK));
+fn bulk() {
     let plan = nine(&format!("{LINK}thermal_noise = {{}}\n"));
     let all = std::thread::available_parallelism().map_or(1, usize::from);
     for threads in [1, all] {
         let pool = ThreadPoolBuilder::new().num_threads(threads).build().expect("threads");
-        group.bench_function(format!("{threads} threads"), |b| {
-            b.iter(|| pool.install(|| black_box(plan.frames(0, BULK))))
-        });
+        let name = format!("{BULK} frames, 64 × 64, N = 9, link and noise: {threads} threads");
+        time(&name, || pool.install(|| plan.frames(0, BULK)));
     }
-    group.finish();
 }
 
-criterion_group!(benches, frames, bulk);
-criterion_main!(benches);
+fn main() {
+    frames();
+    bulk();
+}

@@ -5,6 +5,10 @@
 //! ARCHITECTURE.md has the map.
 // frames/v4l2/sys alone allows it, for ioctls and mapped memory, with the reason at each place.
 #![deny(unsafe_code)]
+#![cfg_attr(not(test), warn(unused_crate_dependencies))]
+
+// The program's allocator, set in main.rs.
+use mimalloc as _;
 
 pub mod claim;
 pub mod frame;

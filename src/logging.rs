@@ -3,9 +3,10 @@
 use std::io::IsTerminal;
 
 use serde::{Deserialize, Serialize};
+use tracing_subscriber::filter::Targets;
 use tracing_subscriber::layer::SubscriberExt;
 use tracing_subscriber::util::SubscriberInitExt;
-use tracing_subscriber::{EnvFilter, Layer, Registry, reload};
+use tracing_subscriber::{Layer, Registry, reload};
 
 /// `[log]`.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -39,15 +40,15 @@ const LEVELS: [&str; 6] = ["off", "error", "warn", "info", "debug", "trace"];
 
 /// Changes the level of a running daemon.
 #[derive(Clone)]
-pub struct Handle(reload::Handle<EnvFilter, Registry>);
+pub struct Handle(reload::Handle<Targets, Registry>);
 
 impl Config {
     /// The filter that `level` describes.
     ///
     /// # Errors
     /// A directive without a known level.
-    pub fn filter(&self) -> Result<EnvFilter, Error> {
-        // `EnvFilter` takes an unknown word for a target, and then logs nothing else.
+    pub fn filter(&self) -> Result<Targets, Error> {
+        // `Targets` takes an unknown word for a target, and then logs nothing else.
         let directives = self.level.split(',').map(str::trim);
         let level_of = |directive: &str| {
             directive
@@ -62,7 +63,7 @@ impl Config {
                 found: found.to_owned(),
             });
         }
-        EnvFilter::builder().parse(&self.level).map_err(|source| Error::Filter {
+        self.level.parse().map_err(|source| Error::Filter {
             level: self.level.clone(),
             source,
         })

@@ -130,7 +130,7 @@ fn sources() -> Vec<Source> {
     found
 }
 
-fn module_of(root: &Path, path: &PathBuf) -> Module {
+fn module_of(root: &Path, path: &Path) -> Module {
     let below = path.strip_prefix(root).unwrap().with_extension("");
     let mut parts: Module = below.iter().map(|p| p.to_str().unwrap().to_owned()).collect();
     parts.pop_if(|last| last == "mod");

@@ -26,7 +26,7 @@ const LARGEST_BODY: usize = 16 << 10;
 pub struct Acknowledge {
     /// What was found or is being done, for others who read the alert; no control characters but line breaks and tabs.
     #[serde(default)]
-    #[schema(max_length = 1000)]
+    #[schema(max_length = 1000, pattern = r"^[^\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f]*$")]
     note: Option<String>,
 }
 
@@ -49,9 +49,10 @@ fn note(headers: &HeaderMap, body: &[u8]) -> Result<Option<String>, Problem> {
             return Err(Problem::new(StatusCode::UNSUPPORTED_MEDIA_TYPE, detail));
         }
     }
-    let parsed: Acknowledge = serde_json::from_slice(body).map_err(|e| unprocessable(format!("the body: {e}")))?;
+    let parsed: Option<Acknowledge> =
+        serde_json::from_slice(body).map_err(|e| unprocessable(format!("the body: {e}")))?;
     let Some(note) = parsed
-        .note
+        .and_then(|body| body.note)
         .map(|note| note.trim().to_owned())
         .filter(|note| !note.is_empty())
     else {

@@ -1,8 +1,6 @@
 //! A frame as a picture: the pixels in a perceptually even colour map, marks by shape and by colours that
 //! colour-blind readers can tell apart (Okabe and Ito, 2008).
 
-use image::{ImageEncoder, Rgb, RgbImage};
-
 use super::snapshot::Snapshot;
 use crate::frame::Frame;
 use crate::monitor::{Alert, AlertKind, PositionStatus};
@@ -17,7 +15,27 @@ const COLOURS: [[f64; 3]; 6] = [
     [247.0, 143.0, 40.0],
     [250.0, 251.0, 170.0],
 ];
-const UNUSABLE: Rgb<u8> = Rgb([0, 110, 110]);
+const UNUSABLE: Rgb = [0, 110, 110];
+
+type Rgb = [u8; 3];
+
+/// Pixels, row by row from the top.
+struct Picture {
+    width: usize,
+    height: usize,
+    pixels: Vec<Rgb>,
+}
+
+impl Picture {
+    fn encode(&self) -> Result<Vec<u8>, png::EncodingError> {
+        let mut out = Vec::new();
+        let mut encoder = png::Encoder::new(&mut out, self.width as u32, self.height as u32);
+        encoder.set_color(png::ColorType::Rgb);
+        encoder.set_compression(png::Compression::Fast);
+        encoder.write_header()?.write_image_data(self.pixels.as_flattened())?;
+        Ok(out)
+    }
+}
 
 /// A place to be marked in a picture.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -64,12 +82,13 @@ pub fn scale_for(frame: &Frame, side: usize) -> usize {
 }
 
 /// PNG of a frame, `scale` picture pixels a sensor pixel; row 0 (y_min) is at the bottom.
-pub fn png(frame: &Frame, camera: &Camera, marks: &[Mark], scale: usize) -> Result<Vec<u8>, image::ImageError> {
+pub fn png(frame: &Frame, camera: &Camera, marks: &[Mark], scale: usize) -> Result<Vec<u8>, png::EncodingError> {
     let (ny, nx) = frame.pixels.dim();
     let (low, high) = range(frame);
-    let mut picture = RgbImage::from_fn((nx * scale) as u32, (ny * scale) as u32, |px, py| {
-        let column = px as usize / scale;
-        let row = ny - 1 - py as usize / scale;
+    let (width, height) = (nx * scale, ny * scale);
+    let shade = |index: usize| {
+        let column = index % width / scale;
+        let row = ny - 1 - index / width / scale;
         let value = frame.pixels[[row, column]];
         let masked = frame.masked.as_ref().is_some_and(|m| m[[row, column]]);
         if masked || !value.is_finite() {
@@ -77,21 +96,18 @@ pub fn png(frame: &Frame, camera: &Camera, marks: &[Mark], scale: usize) -> Resu
         } else {
             colour((value - low) / (high - low))
         }
-    });
+    };
+    let mut picture = Picture {
+        width,
+        height,
+        pixels: (0..width * height).map(shade).collect(),
+    };
     for Mark { at: [x, y], status } in marks {
         let px = (x - camera.x.min_m) / camera.x.pitch_m * scale as f64;
         let py = (ny as f64 - (y - camera.y.min_m) / camera.y.pitch_m) * scale as f64;
         mark(&mut picture, [px, py], *status);
     }
-    let mut out = Vec::new();
-    let encoder = image::codecs::png::PngEncoder::new(&mut out);
-    encoder.write_image(
-        &picture,
-        picture.width(),
-        picture.height(),
-        image::ExtendedColorType::Rgb8,
-    )?;
-    Ok(out)
+    picture.encode()
 }
 
 /// Values shown darkest and lightest: the median, so that noise is dark, and the brightest pixel.
@@ -107,13 +123,11 @@ fn range(frame: &Frame) -> (f64, f64) {
 }
 
 /// Square-root stretch: weak beams beside strong ones stay visible.
-fn colour(share: f64) -> Rgb<u8> {
+fn colour(share: f64) -> Rgb {
     let place = share.clamp(0.0, 1.0).sqrt() * (COLOURS.len() - 1) as f64;
     let k = (place as usize).min(COLOURS.len() - 2);
     let t = place - k as f64;
-    Rgb(std::array::from_fn(|c| {
-        (COLOURS[k][c] * (1.0 - t) + COLOURS[k + 1][c] * t).round() as u8
-    }))
+    std::array::from_fn(|c| (COLOURS[k][c] * (1.0 - t) + COLOURS[k + 1][c] * t).round() as u8)
 }
 
 /// Distance, in picture pixels, of a point from the outline of a mark.
@@ -134,28 +148,28 @@ fn outline(status: PositionStatus, dx: f64, dy: f64) -> f64 {
     }
 }
 
-fn mark(picture: &mut RgbImage, [cx, cy]: [f64; 2], status: PositionStatus) {
-    let black = Rgb([0, 0, 0]);
+fn mark(picture: &mut Picture, [cx, cy]: [f64; 2], status: PositionStatus) {
+    let black = [0, 0, 0];
     let (ink, halo) = match status {
-        PositionStatus::Verified => (Rgb([86, 180, 233]), black),
-        PositionStatus::Pending => (Rgb([255, 255, 255]), black),
-        PositionStatus::Mismatch => (Rgb([240, 228, 66]), black),
-        PositionStatus::Unclaimed => (Rgb([255, 255, 255]), Rgb([225, 40, 20])),
+        PositionStatus::Verified => ([86, 180, 233], black),
+        PositionStatus::Pending => ([255, 255, 255], black),
+        PositionStatus::Mismatch => ([240, 228, 66], black),
+        PositionStatus::Unclaimed => ([255, 255, 255], [225, 40, 20]),
     };
     let reach = 24;
     for py in (cy as i64 - reach)..=(cy as i64 + reach) {
         for px in (cx as i64 - reach)..=(cx as i64 + reach) {
-            let (Ok(x), Ok(y)) = (u32::try_from(px), u32::try_from(py)) else {
+            let (Ok(x), Ok(y)) = (usize::try_from(px), usize::try_from(py)) else {
                 continue;
             };
-            if x >= picture.width() || y >= picture.height() {
+            if x >= picture.width || y >= picture.height {
                 continue;
             }
             let distance = outline(status, px as f64 + 0.5 - cx, py as f64 + 0.5 - cy);
             if distance < 1.5 {
-                picture.put_pixel(x, y, ink);
+                picture.pixels[y * picture.width + x] = ink;
             } else if distance < 3.0 {
-                picture.put_pixel(x, y, halo);
+                picture.pixels[y * picture.width + x] = halo;
             }
         }
     }

@@ -14,7 +14,7 @@ const CELL_M: f64 = 4.0;
 const RINGS: i32 = 4;
 /// Claims of a cell that are compared, newest users first, and claims kept for each beam.
 const MOST_IN_A_CELL: usize = 32;
-const MOST_FOR_A_BEAM: usize = 8;
+const MOST_FOR_A_BEAM: usize = 4;
 /// Beams that are served: as many spots as an estimator finds.
 const MOST_BEAMS: usize = 32;
 
@@ -209,7 +209,7 @@ mod tests {
     use super::*;
 
     /// Users on a grid 1 m apart, all in view.
-    fn index(users: u32) -> (Index, impl Fn(u32) -> Option<[f64; 2]>) {
+    fn index(users: u32) -> (Index, impl Fn(u32) -> Option<[f64; 2]> + Copy) {
         let place = |slot: u32| Some([f64::from(slot % 100), f64::from(slot / 100)]);
         let mut index = Index::default();
         for slot in 0..users {

@@ -19,6 +19,8 @@ pub(super) struct History {
     older: VecDeque<Made>,
     /// When the newest claim came in.
     pub came: Timestamp,
+    /// As in [`Standing`]: asked for in every frame, and new with a claim only.
+    pace_m_s: f64,
 }
 
 /// A claim without its name.
@@ -75,6 +77,7 @@ impl History {
             newest: claim,
             older: VecDeque::new(),
             came,
+            pace_m_s: 0.0,
         }
     }
 
@@ -83,18 +86,21 @@ impl History {
     }
 
     pub fn standing(&self) -> Standing<'_> {
-        let is_active = |made: &Made| made.state == ClaimState::Active;
-        let mut recent = self.newest_first().filter(is_active).take(PACE_CLAIMS);
-        let (last, first) = (recent.next(), recent.last());
-        let pace_m_s = match (first, last) {
-            (Some(a), Some(b)) => (b.x_m - a.x_m).hypot(b.y_m - a.y_m) / seconds(a.time, b.time).max(0.05),
-            _ => 0.0,
-        };
         Standing {
             claim: &self.newest,
             came: self.came,
-            pace_m_s,
+            pace_m_s: self.pace_m_s,
             period_s: self.older.back().map(|b| seconds(b.time, self.newest.time)),
+        }
+    }
+
+    fn pace_m_s(&self) -> f64 {
+        let is_active = |made: &Made| made.state == ClaimState::Active;
+        let mut recent = self.newest_first().filter(is_active).take(PACE_CLAIMS);
+        let (last, first) = (recent.next(), recent.last());
+        match (first, last) {
+            (Some(a), Some(b)) => (b.x_m - a.x_m).hypot(b.y_m - a.y_m) / seconds(a.time, b.time).max(0.05),
+            _ => 0.0,
         }
     }
 
@@ -119,6 +125,14 @@ impl History {
 
     /// Takes a claim of this user that came in at `now`.
     pub fn place(&mut self, claim: Claim, now: Timestamp) -> Outcome {
+        let outcome = self.take(claim, now);
+        if matches!(outcome, Outcome::Accepted | Outcome::Late) {
+            self.pace_m_s = self.pace_m_s();
+        }
+        outcome
+    }
+
+    fn take(&mut self, claim: Claim, now: Timestamp) -> Outcome {
         if claim.time > self.newest.time {
             let before = std::mem::replace(&mut self.newest, claim);
             self.came = now;
@@ -154,6 +168,7 @@ impl History {
         self.older.retain(|made| made.time <= now);
         let newest = self.older.pop_back()?;
         self.newest = newest.into_claim(self.newest.user);
+        self.pace_m_s = self.pace_m_s();
         Some(self)
     }
 }

@@ -78,6 +78,7 @@ fn write_pages(folder: &Path) -> anyhow::Result<()> {
 fn page(out: &mut dyn Write, command: Command, is_program: bool) -> io::Result<()> {
     let help = command.get_after_help().map(ToString::to_string).unwrap_or_default();
     let examples = help.strip_prefix("Examples:").unwrap_or_default().to_owned();
+    let has_version = command.get_version().is_some();
     let man = Man::new(command);
     man.render_title(out)?;
     man.render_name_section(out)?;
@@ -100,7 +101,10 @@ fn page(out: &mut dyn Write, command: Command, is_program: bool) -> io::Result<(
     if !is_program {
         writeln!(out, ".SH \"SEE ALSO\"\n.BR oapwatch (1)")?;
     }
-    man.render_version_section(out)
+    match has_version {
+        true => man.render_version_section(out),
+        false => Ok(()),
+    }
 }
 
 fn section(out: &mut dyn Write, title: &str, entries: &[(&str, &str)]) -> io::Result<()> {

@@ -1,6 +1,7 @@
 //! `[journal]`: the file and what is kept in it.
 
-use std::path::PathBuf;
+use std::io::ErrorKind;
+use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
@@ -58,15 +59,21 @@ impl Config {
             Some(folder) if !folder.as_os_str().is_empty() => folder.to_owned(),
             _ => PathBuf::from("."),
         };
-        if !folder.is_dir() {
-            return Err(ConfigError::NoFolder {
-                path: path.clone(),
-                folder,
-            });
+        let is_folder = |path: &Path| path.metadata().map(|m| m.is_dir());
+        match is_folder(&folder) {
+            // A folder that only the service may look into is no mistake.
+            Err(e) if e.kind() != ErrorKind::NotFound => return Ok(()),
+            Ok(true) => {}
+            Ok(false) | Err(_) => {
+                return Err(ConfigError::NoFolder {
+                    path: path.clone(),
+                    folder,
+                });
+            }
         }
-        match path.is_dir() {
-            true => Err(ConfigError::IsFolder { path: path.clone() }),
-            false => Ok(()),
+        match is_folder(path) {
+            Ok(true) => Err(ConfigError::IsFolder { path: path.clone() }),
+            Ok(false) | Err(_) => Ok(()),
         }
     }
 }

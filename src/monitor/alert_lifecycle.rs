@@ -84,7 +84,7 @@ impl AlertLifecycle {
             .collect()
     }
 
-    /// Until this is told once, the absence of a cause from before this run is no evidence.
+    /// Until this is true once, the absence of a cause from before this run is no evidence.
     pub fn catch_up(&mut self, has_caught_up: bool) {
         self.has_caught_up |= has_caught_up;
     }

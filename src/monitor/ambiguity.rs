@@ -10,11 +10,11 @@ use super::track::tracker::{Track, Tracker};
 use crate::estimate::Flags;
 use crate::optics::Camera;
 
-/// Gain in deviance that a beam must bring over what its neighbours can take of its light. With less it is not told apart from
+/// Gain in deviance that a beam must bring over what its neighbours can take of its light. With less it is not resolved from
 /// one neighbour nearer than 0.4 σ, nor from two a σ away on either side (signal-to-noise ratio 200). Larger excuses users
 /// who are really absent, smaller raises `user_unseen` in crowds.
 const MIN_DEVIANCE: f64 = 100.0;
-/// Neighbours that are considered, nearest first; bounds the cost in a crowd.
+/// Neighbours that are considered, nearest first; bounds the cost where many stand together.
 const MAX_NEIGHBOURS: usize = 4;
 /// Standard deviations of a claim about its place that are considered too.
 const CLAIM_REACH: f64 = 2.0;
@@ -36,7 +36,7 @@ pub(super) fn confusion_m(track: &Track, tracker: &Tracker, association: &Associ
         .fold(0.0, f64::max)
 }
 
-/// Marks the claims without a beam whose beam, of the user's usual energy (`usual_energy_j`), would not be told apart from those
+/// Marks the claims without a beam whose beam, of the user's usual energy (`usual_energy_j`), would not be resolved from those
 /// that are seen.
 pub(super) fn mark_unresolvable(
     claims: &mut [ActiveClaim],
@@ -86,6 +86,7 @@ struct Neighbours {
 impl Neighbours {
     /// `None` without any.
     fn new(places: &[Vector2<f64>]) -> Option<Self> {
+        // Keeps coincident neighbours from a singular matrix.
         const RIDGE: f64 = 1e-9;
         let columns: Vec<_> = places.iter().flat_map(|p| (0..3).map(|k| (*p, k))).collect();
         let n = columns.len();
@@ -175,7 +176,7 @@ mod tests {
         assert_eq!(confusion(20.0, Flags::empty()), 0.0);
         assert_eq!(confusion(20.0, Flags::UNRESOLVED), 20.0);
         assert_eq!(confusion(30.0, Flags::UNRESOLVED), 0.0);
-        // A beam that answers no claim is nobody to be taken for.
+        // A beam without a claim is nobody's.
         let (tracker, _) = two_beams(20.0, Flags::UNRESOLVED);
         assert_eq!(
             confusion_m(&tracker.tracks[0], &tracker, &Association::none(2), 25.0),

@@ -1,4 +1,4 @@
-//! `[monitor]`: what the operator sets; and what the monitor is told of its source.
+//! `[monitor]`: what the operator sets; and the source of the frames.
 
 use serde::{Deserialize, Serialize};
 

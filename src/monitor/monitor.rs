@@ -319,8 +319,8 @@ impl Monitor {
         }
     }
 
-    /// The rules over beams and users. Alerts of beams stand before those of users are decided: they tell whether a beam may be a
-    /// user who answers from elsewhere.
+    /// The rules over beams and users. Findings about beams are applied before the rules over users run: whether a beam is decided
+    /// matters for a user who went as it came.
     fn evaluate_beams(&mut self, at: &Associated) {
         let Self {
             state, memory, alerts, ..

@@ -1,4 +1,4 @@
-//! What the monitor takes from a frame and what it answers.
+//! The input of one step of the monitor and its output.
 
 use jiff::Timestamp;
 use serde::Serialize;

@@ -399,13 +399,14 @@ async fn claims_that_are_posted_again_and_again_share_a_row_of_the_audit_log() {
 #[tokio::test]
 async fn behind_a_trusted_proxy_its_clients_are_told_apart() {
     let limited = |trusted: &[&str]| Config {
-        requests_per_second: 5,
+        requests_per_second: 1,
         trusted_proxies: trusted.iter().map(|t| (*t).to_owned()).collect(),
         ..Config::default()
     };
-    for (trusted, expected) in [(&["127.0.0.0/8"][..], 60), (&["192.0.2.0/24"], 11)] {
+    for (trusted, is_told_apart) in [(&["127.0.0.0/8"][..], true), (&["192.0.2.0/24"], false)] {
         let fake = Fake::start(limited(trusted)).await;
         let client = Client::new();
+        let started = Instant::now();
         let mut served = 0;
         for k in 0..60 {
             let request = client
@@ -413,8 +414,12 @@ async fn behind_a_trusted_proxy_its_clients_are_told_apart() {
                 .header("x-forwarded-for", format!("203.0.113.{k}"));
             served += usize::from(request.send().await.unwrap().status() == StatusCode::OK);
         }
-        // Two of sixty addresses may share one of 1024 buckets; a slow machine earns some requests back.
-        assert!(served.abs_diff(expected) <= 5, "{trusted:?}: {served} served");
+        // One client has a burst of two and earns a request a second. Of sixty, a few may share one of 1024 buckets.
+        let of_one = 3 + started.elapsed().as_secs() as usize;
+        match is_told_apart {
+            true => assert!(served >= 55, "{served} served"),
+            false => assert!(served <= of_one, "{served} served, {of_one} of one client"),
+        }
         fake.stop().await;
     }
 }

@@ -184,6 +184,33 @@ fn what_the_daemon_records_is_reviewed_to_the_same_alert() {
     }
 }
 
+#[test]
+fn a_camera_that_was_never_there_is_seen_by_rules_and_in_the_log() {
+    let dir = tempfile::tempdir().unwrap();
+    let config =
+        "[optics]\njoules_per_count = 1e-9\n[source]\nkind = \"v4l2\"\ndevice = \"/dev/no-such-camera\"\nloop = true\n";
+    let daemon = Daemon::start(dir.path(), config);
+    daemon.wait_for("/v1/alerts", "lost sensor", |v| {
+        alerts(v).iter().any(|a| a["kind"] == "sensor_lost")
+    });
+    let (_, metrics) = daemon.get("/metrics");
+    for line in [
+        "oapwatch_last_good_frame_timestamp_seconds 0",
+        "oapwatch_source_connected 0",
+        "oapwatch_alerts_open{kind=\"sensor_lost\"} 1",
+        "oapwatch_alerts_raised_total{kind=\"unclaimed_emitter\"} 0",
+        "oapwatch_source_faults_total{fault=\"busy\"} 0",
+    ] {
+        assert!(metrics.lines().any(|l| l == line), "{line} is not in:\n{metrics}");
+    }
+    assert!(metrics.contains("process_resident_memory_bytes "), "{metrics}");
+    daemon.signal("-TERM");
+    let (code, log) = daemon.end();
+    assert_eq!(code, Some(0));
+    assert!(log.iter().any(|l| l.contains("source.loop has no effect")), "{log:?}");
+    assert!(!log.iter().any(|l| l.contains("first usable frame")), "{log:?}");
+}
+
 /// The small sister of `make siege`: seven hundred new names every .1 s in the log, and requests that add to them.
 #[test]
 fn a_flood_of_invented_names_hides_no_eavesdropper() {

@@ -36,7 +36,8 @@ fn delays(n: u64, beside_m: f64, power_w: f64, history_s: f64) -> (usize, usize,
 #[ignore = "minutes; see the file's head"]
 fn a_shadow_by_distance_and_power() {
     println!("beside m, power of the user's: found, median and longest delay s; something else first");
-    for power_w in [1.0, 0.5, 0.25] {
+    // From how far away all are found: docs/verdicts.md, "Measured".
+    for (power_w, found_from_m) in [(1.0, 0.0), (0.5, 2.0), (0.25, 3.0)] {
         for beside_m in [0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 6.0] {
             let n = 10;
             let (silent, other, delays) = delays(n, beside_m, power_w, 60.0);
@@ -44,6 +45,8 @@ fn a_shadow_by_distance_and_power() {
             let median = delays.get(delays.len() / 2).copied().unwrap_or(f64::NAN);
             let longest = delays.last().copied().unwrap_or(f64::NAN);
             println!("{beside_m:4} {power_w:5}: {found:2} of {n}, {median:.1}, {longest:.1}; {other}");
+            assert_eq!(other, 0, "nothing else is raised");
+            assert!(beside_m < found_from_m || found == n as usize, "{found} of {n}");
         }
     }
 }

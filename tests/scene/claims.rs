@@ -1,3 +1,5 @@
+//! Claims of simulated users.
+
 use oapwatch::claim::ClaimState;
 
 use super::plan;

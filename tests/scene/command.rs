@@ -1,3 +1,5 @@
+//! `simulate`, `explain` and `check` from outside.
+
 use std::process::{Command, Output, Stdio};
 
 use oapwatch::frames::npy;

@@ -1,3 +1,5 @@
+//! The detector: noise, saturation, defects and quantisation.
+
 use oapwatch::scene::{Fate, Plan};
 
 use super::{moments, plan};

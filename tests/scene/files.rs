@@ -1,3 +1,5 @@
+//! Scene files: what is read and what is refused.
+
 use std::path::{Path, PathBuf};
 
 use oapwatch::scene::{Effect, Fate, Plan, Role, Scene, Status};

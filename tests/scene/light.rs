@@ -1,3 +1,5 @@
+//! Spots, energies and motion of simulated beams.
+
 use std::f64::consts::PI;
 
 use oapwatch::optics::fading::GammaGamma;

@@ -1,3 +1,5 @@
+//! Random streams: seeds, threads and independence of effects.
+
 use oapwatch::scene::{Effect, Plan, Scene};
 
 fn nastiest() -> Scene {

@@ -39,7 +39,7 @@ pub struct ActiveClaim {
     /// The beam must be seen if the claim holds.
     pub expected: bool,
     pub ended: bool,
-    /// No beam is associated, and one at the claimed place would not be told apart from its neighbours.
+    /// No beam is associated, and one at the claimed place would not be resolved from its neighbours.
     pub is_unresolvable: bool,
     /// Seconds between the user's last two claims.
     pub period_s: Option<f64>,
@@ -48,7 +48,7 @@ pub struct ActiveClaim {
     pub before: UserTrack,
 }
 
-/// What is needed to tell which claims bear on a frame.
+/// What decides which claims bear on a frame.
 #[derive(Clone, Copy, Debug)]
 pub struct Scope<'a> {
     pub config: &'a Config,

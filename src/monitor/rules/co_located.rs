@@ -147,7 +147,7 @@ impl Memory {
     }
 }
 
-/// Tests every user's beam that stands alone. A spot that cannot be judged in this frame keeps its alert; one whose beam is gone
+/// Tests every user's beam that stands alone. A spot that cannot be tested in this frame keeps its alert; one whose beam is gone
 /// does not.
 pub fn evaluate(frame: &FrameContext, memory: &mut Memory) -> Vec<Finding> {
     let threshold = frame.budget.threshold(TestFamily::CoLocated, frame.claims.len() as f64);
@@ -186,13 +186,13 @@ pub fn evaluate(frame: &FrameContext, memory: &mut Memory) -> Vec<Finding> {
         findings.push(Finding::present(cause, content));
     }
     let is_watched: BTreeSet<&str> = watched.iter().map(|w| w.user(frame)).collect();
-    let cannot_be_judged = |user: &str| {
+    let is_undecided = |user: &str| {
         let claim = frame.claims.iter().position(|a| a.claim.user == user);
         let is_associated = claim.is_some_and(|i| frame.association.track_id(i).is_some());
         is_associated && !(is_watched.contains(user) && memory.has_verdict(user))
     };
     let over = frame.alerts.open().filter_map(|(cause, _)| match cause {
-        Cause::CoLocated(user) if !present.contains(user.as_str()) && !cannot_be_judged(user) => Some(cause),
+        Cause::CoLocated(user) if !present.contains(user.as_str()) && !is_undecided(user) => Some(cause),
         _ => None,
     });
     findings.extend(over.cloned().map(Finding::Absent));
@@ -292,7 +292,7 @@ fn is_beside_unclaimed(frame: &FrameContext, track: &Track, moved: &BTreeSet<Cau
     })
 }
 
-/// The alert (not `moved`) of an emitter that can no longer be told apart from this beam: the same cause.
+/// The alert (not `moved`) of an emitter that can no longer be resolved from this beam: the same cause.
 fn alert_merged_into(frame: &FrameContext, track: &Track, moved: &BTreeSet<Cause>) -> Option<Cause> {
     let here = track.filter.position();
     let reach = BESIDE_RESOLUTIONS * track.detection.resolution_m;
@@ -434,7 +434,7 @@ mod tests {
         let mut watch = Watch::new();
         watch.until_found([3.0, 1.0, 1.0, 1.0]).expect("found");
         let beams = Watch::beams([3.0, 1.0, 1.0, 1.0]);
-        // The association of a beam that was just missed is held, but it cannot be judged: neither present nor absent.
+        // The association of a beam that was just missed is held, but it cannot be tested: neither present nor absent.
         watch.scene.detect(&beams[1..]);
         watch.scene.association.assign(0, 1);
         assert!(evaluate(&watch.scene.context(), &mut watch.memory).is_empty());
@@ -479,7 +479,7 @@ mod tests {
     }
 
     #[test]
-    fn a_spot_that_may_be_shared_is_not_judged() {
+    fn a_spot_that_may_be_shared_is_not_tested() {
         let mut watch = Watch::new();
         // A second user claims to be 4 m away, and has no beam.
         watch.scene.claim(1, 4.0, 0.0);

@@ -12,7 +12,7 @@ const MIN_BLOCKS: usize = 2;
 /// Variance of a beam's slow drift in units of a block mean's variance, until blocks show it. Larger delays the first verdict
 /// of a beam, smaller takes drift for a second beam. Not measured.
 const ASSUMED_DRIFT: f64 = 0.5;
-/// A beam whose blocks scatter by this factor more in variance than all beams' do is judged by its own scatter. Smaller lets
+/// A beam whose blocks scatter by this factor more in variance than all beams' do is tested against its own scatter. Smaller lets
 /// chance decide with a few blocks, larger holds one user's unsteady light against them. Not measured.
 const OWN_SCATTER_RATIO: f64 = 3.0;
 /// Smallest standard deviation of an ln energy: what gains and the fit leave however steady the light. Not measured.
@@ -196,7 +196,7 @@ mod tests {
     }
 
     #[test]
-    fn a_beam_without_a_past_is_not_judged() {
+    fn a_beam_without_a_past_is_not_tested() {
         let mut young = Brightness::default();
         // 80 newest frames and one block: one block is no past.
         fed(&mut young, 110, |_| 0.0);

@@ -11,7 +11,7 @@ use super::step_change::{StepDetector, StepEvidence};
 /// Frames since a step from which brightness and jitter since then are tested.
 const MIN_FRAMES_AFTER: usize = 3;
 
-/// What is remembered of one spot. Two beams too near to be told apart show one spot at their centre of light; they fade
+/// What is remembered of one spot. Two beams too near to be resolved show one spot at their centre of light; they fade
 /// independently, so that the spot is brighter than before and wanders between the two from frame to frame; and it is
 /// spread along the line between them.
 #[derive(Clone, Debug, Default)]
@@ -103,14 +103,14 @@ impl CoLocationTest {
     pub fn evaluate(&self, brightening: f64, others: &OtherBeams) -> CoLocationEvidence {
         let allowed = brightening.ln() + others.rise.unwrap_or(0.0).max(0.0);
         let brighter = self.brightness.most_significant(allowed, others.scatter);
-        let restless = self.jitter.most_significant(others.jitter);
+        let jitter = self.jitter.most_significant(others.jitter);
         let step = self.steps.most_significant().unwrap_or_default();
         let wider = self.second_moment.most_significant(&others.second_moment);
         let mut evidence = CoLocationEvidence {
             energy_ratio: brighter.ratio,
             energy_neg_log_p: brighter.neg_log_p,
-            jitter_ratio: restless.ratio,
-            jitter_neg_log_p: restless.neg_log_p,
+            jitter_ratio: jitter.ratio,
+            jitter_neg_log_p: jitter.neg_log_p,
             step,
             widening: wider.trace,
             width_neg_log_p: wider.neg_log_p,

@@ -52,7 +52,7 @@ pub struct Jitter {
 
 /// Mean jitter over what is expected, and −ln p of it.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Restlessness {
+pub struct JitterExcess {
     pub ratio: f64,
     pub neg_log_p: f64,
 }
@@ -118,8 +118,8 @@ impl Jitter {
     }
 
     /// The most significant of all windows; `others` is the median jitter of the other beams.
-    pub fn most_significant(&self, others: Option<f64>) -> Restlessness {
-        let mut most = Restlessness::default();
+    pub fn most_significant(&self, others: Option<f64>) -> JitterExcess {
+        let mut most = JitterExcess::default();
         for n in WINDOWS {
             if let Some(found) = self.test(n, others)
                 && found.neg_log_p >= most.neg_log_p
@@ -131,7 +131,7 @@ impl Jitter {
     }
 
     /// Chernoff's bound on the mean of k independent χ² of two degrees, halved: P(mean ≥ r) ≤ exp(−k(r − 1 − ln r)).
-    pub fn test(&self, n: usize, others: Option<f64>) -> Option<Restlessness> {
+    pub fn test(&self, n: usize, others: Option<f64>) -> Option<JitterExcess> {
         if self.recent.len() < n {
             return None;
         }
@@ -150,7 +150,7 @@ impl Jitter {
         } else {
             0.0
         };
-        Some(Restlessness { ratio, neg_log_p })
+        Some(JitterExcess { ratio, neg_log_p })
     }
 }
 
@@ -203,7 +203,7 @@ mod tests {
     }
 
     #[test]
-    fn a_walk_is_calm_and_a_spot_between_two_places_is_restless() {
+    fn a_walk_has_no_jitter_and_a_spot_between_two_places_has() {
         let walk = watched(40, |k| 0.15 * k as f64);
         assert!(walk.recent_mean().unwrap() < 1e-9);
         assert_eq!(walk.most_significant(Some(1.0)).neg_log_p, 0.0);

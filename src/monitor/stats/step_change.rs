@@ -15,7 +15,7 @@ const AFTER: [usize; 2] = [3, 5];
 const KEPT: usize = BEFORE + AFTER[AFTER.len() - 1];
 /// Frames farther apart than this make no line, s: a user brakes or turns in between.
 const LONGEST_GAP_S: f64 = 0.5;
-/// Past steps that the scatter is estimated from: none is judged before the first number, none older than the second counts.
+/// Past steps that the scatter is estimated from: none is evidence before the first number, none older than the second counts.
 const SCATTER: [usize; 2] = [30, 120];
 /// Frames for which a step is remembered; the energy and jitter since then add to its evidence. Longer keeps one odd frame
 /// as evidence for longer.
@@ -36,7 +36,7 @@ pub struct StepDetector {
     /// Positions and their larger variances.
     newest: VecDeque<(Timestamp, Vector2<f64>, f64)>,
     /// Of each newest frame, and the −ln p of those before.
-    judged: VecDeque<StepEvidence>,
+    found: VecDeque<StepEvidence>,
     past: VecDeque<f64>,
 }
 
@@ -102,9 +102,9 @@ impl StepDetector {
         let Some(most) = seen.max_by(|a, b| a.neg_log_p.total_cmp(&b.neg_log_p)) else {
             return;
         };
-        self.judged.push_back(most);
-        if self.judged.len() > MEMORY
-            && let Some(old) = self.judged.pop_front()
+        self.found.push_back(most);
+        if self.found.len() > MEMORY
+            && let Some(old) = self.found.pop_front()
             && learn
         {
             self.past.push_back(old.neg_log_p);
@@ -120,7 +120,7 @@ impl StepDetector {
         }
         // One in ten of χ² of two degrees, halved, is above ln 10.
         let usual = ninth_decile(self.past.iter().copied())? / std::f64::consts::LN_10;
-        let most = self.judged.iter().max_by(|a, b| a.neg_log_p.total_cmp(&b.neg_log_p))?;
+        let most = self.found.iter().max_by(|a, b| a.neg_log_p.total_cmp(&b.neg_log_p))?;
         Some(StepEvidence {
             neg_log_p: (most.neg_log_p / usual.max(1.0)).min(MAX_NEG_LOG_P),
             ..*most

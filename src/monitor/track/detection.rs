@@ -24,7 +24,7 @@ pub struct Detection {
     pub moments: SecondMomentScore,
     /// Signal-to-noise ratio, less what the frame's misfit takes from it.
     pub snr: f64,
-    /// Distance within which a second emitter of like energy cannot be told apart, m.
+    /// Distance within which a second emitter of like energy cannot be resolved, m.
     pub resolution_m: f64,
     /// Probability of a spurious detection here in a frame.
     pub clutter_probability: f64,
@@ -118,7 +118,7 @@ pub fn snr(camera: &Camera, energy_j: f64) -> f64 {
     energy_j.max(0.0) * pitch / (spread * camera.noise_std_j)
 }
 
-/// An equal pair can be told apart at d ≥ 5 σ/√SNR (measured on the fit); never taken beyond 3 σ, where any two spots show two
+/// An equal pair is resolved at d ≥ 5 σ/√SNR (measured on the fit); never taken beyond 3 σ, where any two spots show two
 /// maxima.
 fn resolution_m(camera: &Camera, snr: f64) -> f64 {
     let sigma = camera.spot_sigma_m;

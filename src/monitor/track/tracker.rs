@@ -161,7 +161,7 @@ impl Track {
         self.count(false);
     }
 
-    /// Without a detection of its own: it is known to be in `spot`, as well as the two can be told apart.
+    /// Without a detection of its own: it is known to be in `spot`, to within the resolution.
     fn merge(&mut self, into: u64, spot: &Detection, dt_s: f64) {
         self.filter.update(spot.position, spot.merged_cov());
         self.merged_into = Some(into);

@@ -1,8 +1,8 @@
-//! The monitor is killed and started again: what stood goes on, what is over clears, nothing is raised twice.
+//! Alerts over a restart, and of causes that come and go: what is open goes on, what is over clears, nothing is raised twice.
 
 use oapwatch::monitor::AlertKind::*;
 
-use super::stories::{Actor, Story, crowd, tell};
+use crate::stories::{Actor, Story, crowd, tell};
 
 #[test]
 fn an_intruder_that_stays_is_still_the_same_alert() {
@@ -65,4 +65,22 @@ fn what_ended_while_nobody_watched_clears() {
     told.expect(&[(UnclaimedEmitter, None, 10.0, 11.0)]);
     // A new run looks for two seconds first.
     assert!((17.5..20.0).contains(&told.cleared()[0].2));
+}
+
+/// A beam that blinks is not an alert a blink: what goes out dies down, and the alert counts how often it came back.
+#[test]
+fn a_beam_that_blinks_does_not_flood() {
+    let mut actors = crowd();
+    actors.push(Actor::intruder(|t| {
+        (t >= 10.0 && (t - 10.0) % 5.0 < 2.0).then_some([20.0, 10.0])
+    }));
+    let mut story = Story::new(13, actors);
+    story.seconds = 310.0;
+    let told = tell(&story);
+    let raised = told.raised();
+    assert!(raised.iter().all(|(kind, ..)| *kind == UnclaimedEmitter), "{raised:?}");
+    // Held for 1, 2, 4 s: the third time it outlasts the three seconds of dark.
+    assert_eq!(raised.len(), 3, "{raised:?}");
+    let last = &told.events.last().expect("events").alert;
+    assert!(last.evidence["recurrences"].as_u64() >= Some(2), "{last:?}");
 }

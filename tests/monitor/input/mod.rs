@@ -1,0 +1,3 @@
+mod claim_timing;
+mod clock_offset;
+mod crowding;

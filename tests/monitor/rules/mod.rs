@@ -1,0 +1,6 @@
+mod co_located;
+mod inputs;
+mod mismatch;
+mod pose;
+mod unclaimed;
+mod unseen;

@@ -1,0 +1,2 @@
+mod association;
+mod eligibility;
