@@ -79,7 +79,7 @@ fn stages(group: &str, camera: &optics::Camera, frame: &Frame, places: &[[f64; 2
     let starts: Vec<_> = places.iter().map(|p| p.map(|v| v + 0.1 * camera.x.pitch_m)).collect();
     time(&stage("joint fit, five steps"), || stages.fit(&starts));
     time(&stage("covariance, ground"), || stages.ground());
-    let found = stages.ground().emitters;
+    let found = stages.ground();
     time(&stage("assignment to nine claims"), || {
         assign(found.len(), found.len(), 1e4, |i, j| {
             (found[i].x_m - found[j].x_m).powi(2) + (found[i].y_m - found[j].y_m).powi(2)
