@@ -228,14 +228,14 @@ fn a_flood_of_invented_names_hides_no_eavesdropper() {
                 std::thread::sleep(Duration::from_millis(100));
             }
         });
-        let posted = siege::names::lines(1_000_000..1_001_000, jiff::Timestamp::now(), siege::names::anywhere);
-        let (code, body) = daemon.post("/v1/claims", &posted);
-        let answer: Value = serde_json::from_str(&body).unwrap();
-        let counted = [&answer["accepted"], &answer["refused"]].map(|n| n.as_u64().unwrap_or(0));
-        assert!(matches!(code, 200 | 503), "{code}: {body}");
-        assert_eq!(counted[0] + counted[1], 1000, "{body}");
         // A stop of the flood must come whatever the daemon does.
         let seen = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| {
+            let posted = siege::names::lines(1_000_000..1_001_000, jiff::Timestamp::now(), siege::names::anywhere);
+            let (code, body) = daemon.post("/v1/claims", &posted);
+            let answer: Value = serde_json::from_str(&body).unwrap();
+            let counted = [&answer["accepted"], &answer["refused"]].map(|n| n.as_u64().unwrap_or(0));
+            assert!(matches!(code, 200 | 503), "{code}: {body}");
+            assert_eq!(counted[0] + counted[1], 1000, "{body}");
             daemon.wait_for("/v1/positions", "the eavesdropper's first visit", |v| {
                 v["frame"].as_u64() > Some(80)
             })
