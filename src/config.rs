@@ -325,7 +325,7 @@ mod tests {
                 "monitor.tolerated_distance_m"
             ]
         );
-        let plain = loaded("[source]\nseed = 3\nrate_hz = 10").unwrap();
+        let plain = loaded("[source]\nseed = 3").unwrap();
         assert_eq!(plain.warnings(&plain.camera().unwrap()), [""; 0]);
     }
 }

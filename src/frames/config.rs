@@ -93,34 +93,24 @@ impl Config {
         self.v4l2.validate()
     }
 
-    /// Frames per second that the source gives: the scene's, or those of `rate_hz`.
+    /// Frames per second that the source gives: of a simulator the scene's, otherwise those of `rate_hz`.
     ///
     /// # Errors
-    /// The scene cannot be read, or has a rate other than `rate_hz`.
+    /// The scene cannot be read.
     pub fn frame_rate_hz(&self) -> Result<f64, Error> {
         match self.kind {
             SourceKind::Simulator => match &self.scene {
-                Some(path) => self.rate_of(&Scene::load(path)?),
-                None => self.rate_of(&Scene::builtin()),
+                Some(path) => Ok(Scene::load(path)?.rate_hz),
+                None => Ok(Scene::builtin().rate_hz),
             },
             SourceKind::V4l2 | SourceKind::Replay => Ok(self.rate_hz.unwrap_or(Self::DEFAULT_RATE_HZ)),
-        }
-    }
-
-    pub(super) fn rate_of(&self, scene: &Scene) -> Result<f64, Error> {
-        match self.rate_hz {
-            Some(given) if given != scene.rate_hz => Err(Error::SceneRate {
-                given,
-                scene: scene.rate_hz,
-            }),
-            _ => Ok(scene.rate_hz),
         }
     }
 
     /// Keys of `[source]` among `given` that the chosen kind of source does not use.
     pub fn unused<'a>(&self, given: impl Iterator<Item = &'a str>) -> Vec<&'a str> {
         let used: &[&str] = match self.kind {
-            SourceKind::Simulator => &["scene", "seed", "start", "rate_hz"],
+            SourceKind::Simulator => &["scene", "seed", "start"],
             SourceKind::V4l2 => &["device", "v4l2", "rate_hz"],
             SourceKind::Replay => &["frames", "start", "rate_hz", "speed", "loop"],
         };

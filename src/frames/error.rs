@@ -22,10 +22,6 @@ pub enum Error {
         found_x: usize,
         found_y: usize,
     },
-    #[error(
-        "source.rate_hz: expected {scene}, the rate of the scene, or nothing, since a simulator runs at its scene's rate; found {given}"
-    )]
-    SceneRate { given: f64, scene: f64 },
     #[error(transparent)]
     Scene(#[from] scene::Error),
     #[error("optics.joules_per_count: needed for source.kind = \"v4l2\", whose frames are counts; found nothing")]

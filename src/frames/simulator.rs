@@ -34,7 +34,6 @@ impl Simulator {
             Some(path) => Scene::load(path)?,
             None => Scene::builtin(),
         };
-        config.rate_of(&scene)?;
         let plan = Plan::compile(&scene, config.seed)?;
         let (found, expected) = (plan.camera().shape(), camera.shape());
         if found != expected {

@@ -138,7 +138,7 @@ fn ask_scene(questions: &Questions, path: &Path) -> Result<Vec<Answer>, Error> {
     let scene = Scene::load(path)?;
     let plan = scene::Plan::compile(&scene, questions.seed)?;
     let mut config = Config::default();
-    config.source.rate_hz = Some(plan.rate_hz());
+    config.source.scene = Some(path.to_owned());
     let mut pipeline = pipeline::Pipeline::new(&config, plan.camera())?;
     let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
     let mut maker = plan.maker();

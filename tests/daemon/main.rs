@@ -88,7 +88,6 @@ fn a_bad_config_ends_the_program_before_a_port_is_bound() {
             "[monitor]\ndecision_s = 1e9\n",
             "monitor.decision_s: expected 0.001 to 3600",
         ),
-        ("[source]\nrate_hz = 25.0\n", "expected 10, the rate of the scene"),
         ("[log]\nlevel = \"loud\"\n", "log.level: expected off, error"),
         ("[record]\n", "record.folder: expected a folder"),
         ("[journal]\npath = \"absent/oapwatch.db\"\n", "found no folder"),
