@@ -124,7 +124,7 @@ mod tests {
             "WARN",
             "off",
             "info,oapwatch::frames=debug",
-            "oapwatch::frames[span{frame=3}]=trace",
+            "warn,oapwatch::api=trace,oapwatch::frames=off",
         ] {
             filter(good).unwrap_or_else(|e| panic!("{good}: {e}"));
         }

@@ -18,7 +18,7 @@ static API: LazyLock<(Runtime, Fake)> = LazyLock::new(|| {
         .build()
         .expect("a runtime");
     let config = Config {
-        requests_per_second: u32::MAX,
+        requests_per_second: 1_000_000,
         ..Config::default()
     };
     let fake = runtime.block_on(async {
