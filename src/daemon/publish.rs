@@ -75,6 +75,8 @@ impl Outlet {
 
     /// Publishes until the outlet is closed and empty.
     pub async fn publish(self, journal: Journal, feed: Arc<Feed>) {
+        // The snapshot of the frame that raised them may come later than the events.
+        let mut raised: Vec<Alert> = Vec::new();
         loop {
             let (pending, closed) = {
                 let mut pending = self.lock();
@@ -92,12 +94,7 @@ impl Outlet {
                 continue;
             }
             let is_raised = |event: &&AlertEvent| event.event == AlertEventKind::Raised;
-            let raised: Vec<Alert> = pending
-                .events
-                .iter()
-                .filter(is_raised)
-                .map(|e| e.alert.clone())
-                .collect();
+            raised.extend(pending.events.iter().filter(is_raised).map(|e| e.alert.clone()));
             if !pending.events.is_empty() {
                 let numbered = feed.number(pending.events, pending.at);
                 if let Err(error) = journal.record_numbered(&numbered, Timestamp::now()) {
@@ -114,7 +111,7 @@ impl Outlet {
             }
             if let Some(snapshot) = pending.snapshot {
                 if !raised.is_empty() {
-                    let (feed, snapshot) = (feed.clone(), snapshot.clone());
+                    let (feed, snapshot, raised) = (feed.clone(), snapshot.clone(), std::mem::take(&mut raised));
                     tokio::task::spawn_blocking(move || feed.illustrate(&raised, &snapshot));
                 }
                 feed.publish(snapshot);
