@@ -1,3 +1,5 @@
+//! The program: sets the allocator and hands over to the command line.
+
 #![forbid(unsafe_code)]
 
 #[global_allocator]

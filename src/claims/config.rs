@@ -1,3 +1,5 @@
+//! `[claims]`: where claims come from, what their fields are called and how many are kept.
+
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};

@@ -1,3 +1,5 @@
+//! Follows the claims log as it grows, is rotated or replaced.
+
 use std::fs::{File, Metadata};
 use std::io::{self, Read, Seek, SeekFrom};
 use std::os::unix::fs::MetadataExt;

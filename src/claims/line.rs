@@ -1,3 +1,5 @@
+//! One line of the claims log or of a POST as a claim.
+
 use jiff::{SignedDuration, Timestamp};
 use serde_json::Value;
 
