@@ -158,7 +158,10 @@ fn agreement() -> Outcome {
         })
         .collect();
     // The default estimator takes a second a frame where floating point is emulated.
-    configure(joules_per_count, &format!("[estimator]\nname = \"greedy-fit\"\n{RECORD}"))?;
+    configure(
+        joules_per_count,
+        &format!("[estimator]\nname = \"greedy-fit\"\n{RECORD}"),
+    )?;
     let mut claims = fs::File::create(format!("{FOLDER}/claims.ndjson"))?;
 
     let mut output = Output::open(OUTPUT)?;
