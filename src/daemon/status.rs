@@ -9,7 +9,6 @@ use jiff::Timestamp;
 use metrics::{counter, gauge};
 
 use crate::api::{FrameCounts, Latency, Snapshot, SourceState};
-use crate::claim::escape_undisplayable;
 use crate::metric;
 use crate::monitor::{Alert, AlertEvent, AlertEventKind, AlertKind, AlertState, PositionStatus, Report};
 
@@ -78,7 +77,7 @@ impl State {
         }
     }
 
-    /// Keeps count of what is open, and logs it.
+    /// Keeps count of what is open.
     pub fn note(&mut self, event: &AlertEvent) {
         let alert = &event.alert;
         if alert.state == AlertState::Cleared {
@@ -90,16 +89,6 @@ impl State {
         if event.event == AlertEventKind::Raised {
             counter!(metric::ALERTS_RAISED, "kind" => word(alert.kind)).increment(1);
         }
-        tracing::info!(
-            event = word(event.event),
-            kind = word(alert.kind),
-            severity = word(alert.severity),
-            id = alert.id,
-            user = alert.user.as_deref().map(escape_undisplayable).as_deref(),
-            x_m = alert.x_m,
-            y_m = alert.y_m,
-            "alert"
-        );
     }
 
     /// Alerts that are not cleared, by kind.
@@ -155,7 +144,7 @@ fn push<T>(window: &mut VecDeque<T>, value: T) {
 }
 
 /// The JSON string of a unit variant, used as a label.
-fn word(value: impl serde::Serialize) -> String {
+pub(super) fn word(value: impl serde::Serialize) -> String {
     match serde_json::to_value(value) {
         Ok(serde_json::Value::String(word)) => word,
         other => unreachable!("labels are made of unit variants, found {other:?}"),

@@ -6,9 +6,9 @@ cd "$(dirname "$0")/../.."
 work=$PWD/target/deploy-vm
 deb=$PWD/target/oapwatch.deb
 mkdir -p "$work"
-for tool in qemu-system-x86_64 mmdebstrap mksquashfs busybox depmod cpio apt-get dpkg-deb; do
+for tool in qemu-system-x86_64 mmdebstrap mksquashfs busybox depmod cpio xz apt-get dpkg-deb; do
     if ! command -v "$tool" > /dev/null; then
-        echo "tests/deploy: $tool is missing: apt-get install qemu-system-x86 mmdebstrap squashfs-tools busybox-static kmod cpio"
+        echo "tests/deploy: $tool is missing: apt-get install qemu-system-x86 mmdebstrap squashfs-tools busybox-static kmod cpio xz-utils"
         exit 1
     fi
 done
@@ -24,36 +24,14 @@ if [ ! -f "$base" ]; then
         "$suite" "$work/root.tar.part"
     mv "$work/root.tar.part" "$base"
 fi
-if [ ! -d "$work/kernel" ]; then
-    echo "Fetching Debian's kernel"
-    package=$(apt-cache depends linux-image-amd64 | sed -n 's/.*Depends: //p' | head -n 1)
-    (cd "$work" && apt-get download -q "$package" 2>/dev/null)
-    mkdir -p "$work/kernel.part"
-    dpkg-deb --extract "$work"/linux-image-*.deb "$work/kernel.part"
-    rm "$work"/linux-image-*.deb
-    depmod -b "$work/kernel.part" "$(ls "$work/kernel.part/lib/modules")"
-    mv "$work/kernel.part" "$work/kernel"
-fi
-version=$(ls "$work/kernel/lib/modules")
-vmlinuz=$work/kernel/boot/vmlinuz-$version
-
-# Paths of MODULE and all it needs, in loading order.
-needs() {
-    modprobe -d "$work/kernel" -S "$version" --show-depends "$@" | sed -n 's/^insmod \([^ ]*\).*/\1/p'
-}
+. tests/machine/kernel.sh
 
 initramfs() {
     local dir=$work/initramfs
     rm -rf "$dir"
-    mkdir -p "$dir"/{bin,dev,proc,sys,lower,upper,root,modules}
+    mkdir -p "$dir"/{bin,dev,proc,sys,lower,upper,root}
     cp /bin/busybox "$dir/bin/"
-    local n=10
-    for module in virtio_pci virtio_blk squashfs overlay; do
-        for path in $(needs "$module"); do
-            cp -n "$path" "$dir/modules/$n-$(basename "$path")"
-            n=$((n + 1))
-        done
-    done
+    install_modules "$dir" virtio_pci virtio_blk squashfs overlay
     cat > "$dir/init" <<'INIT'
 #!/bin/busybox sh
 /bin/busybox --install -s /bin
@@ -67,7 +45,7 @@ umount /proc /sys
 exec switch_root /root /lib/systemd/systemd
 INIT
     chmod +x "$dir/init"
-    (cd "$dir" && find . | cpio --quiet -o -H newc | gzip -1) > "$work/initramfs.gz"
+    pack "$dir" "$work/initramfs.gz"
 }
 
 root_image() {
@@ -78,7 +56,7 @@ root_image() {
     for path in $(needs vivid); do
         install -D "$path" "$dir/lib/modules/$version/${path##*/lib/modules/$version/}"
     done
-    cp "$work/kernel/lib/modules/$version"/modules.{builtin,order}* "$dir/lib/modules/$version/"
+    cp "$kernel/lib/modules/$version"/modules.{builtin,order}* "$dir/lib/modules/$version/"
     depmod -b "$dir" "$version"
     cp "$deb" "$dir/oapwatch.deb"
     cp "$work/upgrade.deb" "$dir/upgrade.deb"
@@ -128,7 +106,7 @@ root_image
 echo "Booting (software emulation; a few minutes at most)"
 status=0
 timeout 900 qemu-system-x86_64 -accel tcg -cpu max -smp 1 -m 1024 -nodefaults -display none -no-reboot \
-    -kernel "$vmlinuz" -initrd "$work/initramfs.gz" \
+    -kernel "$vmlinux" -initrd "$work/initramfs.gz" \
     -append "console=ttyS0 quiet loglevel=2 panic=-1 nokaslr mitigations=off tsc=reliable no_timer_check random.trust_cpu=on cryptomgr.notests systemd.show_status=false rd.systemd.show_status=false" \
     -drive "file=$work/root.squashfs,format=raw,if=virtio,readonly=on" \
     -device isa-debug-exit,iobase=0xf4,iosize=0x04 -serial stdio </dev/null | tee "$work/log" || status=${PIPESTATUS[0]}

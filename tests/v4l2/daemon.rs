@@ -52,6 +52,8 @@ name = "shadow"
 motion.still = [-10, 60]
 "#;
 
+const RECORD: &str = "[record]\nfolder = \"recordings\"\nsegment_s = 3.0\nbefore_s = 1.0\nafter_s = 1.0\n";
+
 type Found<T> = Result<T, Box<dyn std::error::Error>>;
 
 /// A running `oapwatch run`; killed when dropped.
@@ -156,8 +158,10 @@ fn agreement() -> Outcome {
         })
         .collect();
     // The default estimator takes a second a frame where floating point is emulated.
-    let record = "[estimator]\nname = \"greedy-fit\"\n[record]\nfolder = \"recordings\"\nsegment_s = 3.0\nbefore_s = 1.0\nafter_s = 1.0\n";
-    configure(joules_per_count, record)?;
+    configure(
+        joules_per_count,
+        &format!("[estimator]\nname = \"greedy-fit\"\n{RECORD}"),
+    )?;
     let mut claims = fs::File::create(format!("{FOLDER}/claims.ndjson"))?;
 
     let mut output = Output::open(OUTPUT)?;
@@ -298,7 +302,7 @@ fn same_as_reviewed(alerts: &Value) -> Found<usize> {
     let text = fs::read_to_string(config())?
         .replace("kind = \"v4l2\"", "kind = \"replay\"\nframes = \"recordings\"")
         .replace("log = \"claims.ndjson\"", "")
-        .replace("folder = \"recordings\"", "");
+        .replace(RECORD, "");
     fs::write(&review, text)?;
     let events = lines(&stdout_of(&["review", "--config", &review])?)?;
     let mut again: Vec<String> = events
