@@ -5,7 +5,7 @@ use std::io;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime};
 
 use jiff::Timestamp;
 
@@ -39,7 +39,8 @@ impl ClaimsLog {
             return Ok(Self::Inline { follower, looked: None });
         }
         let (polls, log) = sync_channel(0);
-        let follower = follower.live();
+        let since = SystemTime::now() - Duration::from_secs_f64(OLD_AT_START_S);
+        let follower = follower.live(since);
         std::thread::Builder::new()
             .name("claims".into())
             .spawn(move || read(follower, &inbox, &polls, &stop))?;
