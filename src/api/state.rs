@@ -4,12 +4,14 @@ use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
+use axum::http::StatusCode;
 use metrics_exporter_prometheus::PrometheusHandle;
 use tokio::sync::{mpsc, oneshot, watch};
 
 use super::audit::Audit;
 use super::feed::Feed;
 use super::picture_cache::PictureCache;
+use super::problem::Problem;
 use crate::claim::Claim;
 use crate::frames::record;
 use crate::journal::Journal;
@@ -64,10 +66,27 @@ impl State {
         self
     }
 
+    /// Asks the compute thread and waits for its answer; a full queue is overload.
+    pub(super) async fn ask<T>(&self, command: impl FnOnce(oneshot::Sender<T>) -> Command) -> Result<T, Problem> {
+        let (reply, answer) = oneshot::channel();
+        self.commands.try_send(command(reply)).map_err(|e| match e {
+            mpsc::error::TrySendError::Full(_) => busy(),
+            mpsc::error::TrySendError::Closed(_) => {
+                Problem::later(StatusCode::SERVICE_UNAVAILABLE, 5, "the monitor is stopping")
+            }
+        })?;
+        answer.await.map_err(|_| busy())
+    }
+
     pub fn with_webhooks(mut self, notifier: Notifier) -> Self {
         self.notifier = Some(notifier);
         self
     }
+}
+
+pub(super) fn busy() -> Problem {
+    let detail = "the monitor is too busy to take this now";
+    Problem::later(StatusCode::SERVICE_UNAVAILABLE, 1, detail)
 }
 
 /// What a client may ask of the compute thread.

@@ -5,19 +5,25 @@ use std::net::{SocketAddr, TcpListener};
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
+use std::time::Duration;
 
 use jiff::Timestamp;
 use ndarray::Array2;
 use oapwatch::api::{self, Acknowledged, Command, Config, Feed, Listen, Listener, Server, State};
 use oapwatch::claim::Claim;
 use oapwatch::frame::Frame;
-use oapwatch::journal::{self, Journal};
+use oapwatch::journal::{self, AuditRecord, Journal};
 use oapwatch::monitor::{
     Acknowledgement, Alert, AlertEvent, AlertEventKind, AlertKind, AlertSource, AlertState, PositionStatus, Report,
     Severity, TrackedPosition, Withdrawal,
 };
 use oapwatch::optics;
+use tokio::io::AsyncReadExt;
+use tokio::net::TcpStream;
 use tokio::sync::{mpsc, oneshot};
+use tokio::time::timeout;
+
+pub const PATIENCE: Duration = Duration::from_secs(20);
 
 /// A running API and the strings that move it.
 pub struct Fake {
@@ -131,6 +137,22 @@ impl Fake {
     pub async fn alert(&self, id: &str, second: i64) {
         publish(&self.feed, &self.journal, AlertEventKind::Raised, alert(id, second)).await;
     }
+}
+
+pub async fn audited(fake: &Fake, action: &str) -> Vec<AuditRecord> {
+    fake.journal.settled().await;
+    let rows = fake.journal.audit_log(None, 100).unwrap();
+    let of = |r: &AuditRecord| serde_json::to_value(r.entry.action).unwrap() == action;
+    rows.into_iter().filter(of).collect()
+}
+
+pub async fn until_closed(mut stream: TcpStream) -> String {
+    let mut said = Vec::new();
+    // A reset is a close too.
+    let _ = timeout(PATIENCE, stream.read_to_end(&mut said))
+        .await
+        .expect("the server closes");
+    String::from_utf8_lossy(&said).into_owned()
 }
 
 async fn publish(feed: &Feed, journal: &Journal, event: AlertEventKind, alert: Alert) {
