@@ -9,10 +9,12 @@ use metrics_exporter_prometheus::PrometheusHandle;
 use tokio::sync::{mpsc, oneshot, watch};
 
 use super::audit::Audit;
+use super::evidence_fit::Fitter;
 use super::feed::Feed;
 use super::picture_cache::PictureCache;
 use super::problem::Problem;
 use crate::claim::Claim;
+use crate::estimate;
 use crate::frames::record;
 use crate::journal::Journal;
 use crate::monitor::Alert;
@@ -34,6 +36,7 @@ pub struct State {
     pub(super) audit: Audit,
     /// The recorder's folder for evidence, where frames are recorded.
     pub(super) evidence: Option<Arc<Path>>,
+    pub(super) fitter: Arc<Fitter>,
     /// Turns true when the server stops: streams then close.
     pub(super) stopping: watch::Sender<bool>,
 }
@@ -51,6 +54,7 @@ impl State {
             commands,
             audit: Audit::new(journal.clone()),
             evidence: None,
+            fitter: Arc::new(Fitter::new(estimate::Config::default())),
             journal,
             metrics,
             ready,
@@ -60,8 +64,9 @@ impl State {
         }
     }
 
-    /// `folder` is the recorder's.
-    pub fn with_evidence(mut self, folder: &Path) -> Self {
+    /// `folder` is the recorder's; `estimator` explains what it recorded.
+    pub fn with_evidence(mut self, folder: &Path, estimator: &estimate::Config) -> Self {
+        self.fitter = Arc::new(Fitter::new(estimator.clone()));
         self.evidence = Some(folder.join(record::EVIDENCE).into());
         self
     }

@@ -171,6 +171,17 @@ impl Follower {
         }
     }
 
+    /// Reads lines by other rules from now on, and another log from its start where `path` is another.
+    pub fn change(&mut self, path: &Path, config: &Config) {
+        if path != self.path {
+            self.path = path.to_owned();
+            self.open = None;
+            self.rotated = None;
+        }
+        self.config = config.clone();
+        self.most_behind = self.most_behind.map(|_| config.tail_bytes);
+    }
+
     /// Reads what has been written since the last poll. A log that does not exist (yet) gives nothing. An error says
     /// that there is nothing else to tell: what has been read comes first.
     pub fn poll(&mut self) -> io::Result<Poll> {

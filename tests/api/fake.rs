@@ -91,7 +91,7 @@ impl Fake {
         let metrics = oapwatch::metric::recorder().unwrap().handle();
         let mut state = State::new(feed.clone(), commands, journal.clone(), metrics, ready.clone());
         if let Some(folder) = recordings {
-            state = state.with_evidence(folder);
+            state = state.with_evidence(folder, &oapwatch::estimate::Config::default());
         }
         tokio::spawn(answer(received, feed.clone(), journal.clone()));
         let (stop, stopped) = oneshot::channel::<()>();
@@ -139,6 +139,7 @@ impl Fake {
     }
 }
 
+/// Rows of the audit log about one action, newest first.
 pub async fn audited(fake: &Fake, action: &str) -> Vec<AuditRecord> {
     fake.journal.settled().await;
     let rows = fake.journal.audit_log(None, 100).unwrap();
@@ -146,6 +147,7 @@ pub async fn audited(fake: &Fake, action: &str) -> Vec<AuditRecord> {
     rows.into_iter().filter(of).collect()
 }
 
+/// Reads until the server closes; gives what it said.
 pub async fn until_closed(mut stream: TcpStream) -> String {
     let mut said = Vec::new();
     // A reset is a close too.

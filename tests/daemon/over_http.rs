@@ -8,7 +8,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use super::process::{Daemon, alerts};
 
 /// One user who stands still and somebody nobody knows.
-const SCENE: &str = r#"
+pub const SCENE: &str = r#"
 rate_hz = 10.0
 
 [optics]
