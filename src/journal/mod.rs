@@ -7,6 +7,7 @@
 
 mod audit;
 mod config;
+#[allow(clippy::disallowed_methods, reason = "a hanging disk is known by the time it takes")]
 mod disk;
 mod error;
 mod follow;

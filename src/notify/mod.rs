@@ -4,6 +4,7 @@
 //! what waits there until the receiver has confirmed it. docs/webhooks.md is the receiver's side of it.
 
 mod client;
+#[allow(clippy::disallowed_methods, reason = "the clock of deliveries, which tests speed up")]
 mod clock;
 mod config;
 mod cooling;
