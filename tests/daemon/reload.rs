@@ -2,38 +2,11 @@
 
 use std::io::{Read, Write};
 use std::net::TcpListener;
+use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
-use std::sync::{Arc, Mutex};
 
 use super::over_http::SCENE;
-use super::process::{Daemon, alerts};
-
-/// A receiver that takes everything; gives its port and the bodies.
-fn receiver() -> (u16, Arc<Mutex<Vec<String>>>) {
-    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
-    let port = listener.local_addr().unwrap().port();
-    let bodies: Arc<Mutex<Vec<String>>> = Arc::default();
-    let seen = bodies.clone();
-    std::thread::spawn(move || {
-        for stream in listener.incoming() {
-            let Ok(mut stream) = stream else { return };
-            let mut request = Vec::new();
-            let mut buffer = [0; 4096];
-            // The body's end is the last brace: it is JSON.
-            while !request.ends_with(b"}") {
-                match stream.read(&mut buffer) {
-                    Ok(n) if n > 0 => request.extend_from_slice(&buffer[..n]),
-                    _ => break,
-                }
-            }
-            seen.lock()
-                .unwrap()
-                .push(String::from_utf8_lossy(&request).into_owned());
-            let _ = stream.write_all(b"HTTP/1.1 204 No Content\r\nconnection: close\r\n\r\n");
-        }
-    });
-    (port, bodies)
-}
+use super::process::{Daemon, alerts, receiver};
 
 /// u-1 claims a place eight metres from where they are.
 fn scene() -> String {
@@ -62,7 +35,7 @@ fn a_reload_changes_claims_monitor_and_webhooks_and_keeps_the_rest() {
     std::fs::write(dir.path().join("scene.toml"), scene()).unwrap();
     let secret = "whsec_MDEyMzQ1Njc4OWFiY2RlZjAxMjM0NTY3ODlhYmNkZWY=\n";
     std::fs::write(dir.path().join("secret"), secret).unwrap();
-    let (port, bodies) = receiver();
+    let (port, bodies) = receiver("204 No Content");
     let of_stranger = |v: &serde_json::Value| {
         let kinds: Vec<_> = alerts(v)
             .iter()
