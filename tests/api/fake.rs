@@ -18,6 +18,8 @@ use oapwatch::monitor::{
     Severity, TrackedPosition, Withdrawal,
 };
 use oapwatch::optics;
+use reqwest::{Client, Response, header};
+use serde_json::Value;
 use tokio::io::AsyncReadExt;
 use tokio::net::TcpStream;
 use tokio::sync::{mpsc, oneshot};
@@ -137,6 +139,24 @@ impl Fake {
     pub async fn alert(&self, id: &str, second: i64) {
         publish(&self.feed, &self.journal, AlertEventKind::Raised, alert(id, second)).await;
     }
+}
+
+pub async fn get(fake: &Fake, path: &str) -> Response {
+    Client::new().get(fake.url(path)).send().await.unwrap()
+}
+
+pub async fn json_of(response: Response) -> Value {
+    serde_json::from_slice(&response.bytes().await.unwrap()).unwrap()
+}
+
+/// Asserts problem details of this status and gives their detail.
+pub async fn problem(response: Response, status: u16) -> String {
+    assert_eq!(response.status().as_u16(), status);
+    assert_eq!(response.headers()[header::CONTENT_TYPE], "application/problem+json");
+    let body = json_of(response).await;
+    assert_eq!(body["status"], status);
+    assert_eq!(body["type"], "about:blank");
+    body["detail"].as_str().unwrap().to_owned()
 }
 
 /// Rows of the audit log about one action, newest first.

@@ -2,8 +2,10 @@
 
 mod bodies;
 mod connections;
+mod evidence;
 mod fake;
 mod guards;
 mod rest;
 mod stream;
+mod tables;
 mod tokens;
