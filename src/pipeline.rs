@@ -70,6 +70,12 @@ impl Pipeline {
         self.estimator.name()
     }
 
+    /// Goes on with other settings for claims and monitor; users, tracks and alerts stay.
+    pub fn reconfigure(&mut self, monitor: &monitor::Config, claims: &claims::Config) {
+        self.monitor.reconfigure(monitor, claims);
+        self.claims.reconfigure(claims);
+    }
+
     /// Takes claims that came in at `now`, the frames' clock.
     pub fn claim(&mut self, claims: impl IntoIterator<Item = Claim>, now: Timestamp) {
         for claim in claims {

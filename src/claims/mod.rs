@@ -11,6 +11,7 @@ mod line;
 mod outcome;
 mod pressure;
 mod roster;
+mod rotated;
 mod store;
 
 pub use candidates::MOST_UNANSWERED;

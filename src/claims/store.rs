@@ -138,6 +138,11 @@ impl Store {
         }
     }
 
+    /// Goes on with other settings; what is known stays.
+    pub fn reconfigure(&mut self, config: &Config) {
+        self.max_users = config.max_users;
+    }
+
     /// The log is not read ahead of its frames: few claims are made for later.
     pub fn expect_live_claims(&mut self) {
         self.ahead.iter_mut().for_each(|ahead| ahead.set_most(MOST_LIVE));

@@ -14,6 +14,7 @@ pub struct Args {
     /// Frames of each kind
     #[arg(long, value_name = "N", default_value_t = 20, value_parser = clap::value_parser!(u32).range(1..))]
     frames: u32,
+    /// The same seed gives the same frames
     #[arg(long, value_name = "S", default_value_t = 1)]
     seed: u64,
     /// Estimator to test; the default one when left out

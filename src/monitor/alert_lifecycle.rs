@@ -74,6 +74,10 @@ impl AlertLifecycle {
         }
     }
 
+    pub fn set_cool_down(&mut self, cool_down_s: f64) {
+        self.cool_down_s = cool_down_s;
+    }
+
     /// Forgets all causes; gives the alerts that are open.
     pub fn start_again(&mut self) -> Vec<Alert> {
         self.cleared.clear();

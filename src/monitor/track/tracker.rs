@@ -213,6 +213,10 @@ impl Tracker {
         }
     }
 
+    pub fn set_max_score(&mut self, max_score: f64) {
+        self.max_score = max_score;
+    }
+
     /// Links one frame's detections to the tracks; `dt_s` is the time since the last frame, s.
     pub fn step(&mut self, time: Timestamp, detections: &[Detection], dt_s: f64) {
         let elapsed = self.time.map_or(0.0, |t| seconds(t, time)).max(0.0);

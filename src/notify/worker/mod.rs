@@ -15,8 +15,8 @@ use tokio::task::{Id, JoinError, JoinSet};
 
 use super::client::{self, Failure, Verdict};
 use super::queue::Next;
-use super::status::{EndpointState, EndpointStatus};
-use super::{Clock, Endpoint};
+use super::status::{EndpointState, EndpointStatus, TestOutcome};
+use super::{AskError, Clock, Endpoint, payload};
 use crate::journal::{self, Attempt, Journal, Outcome};
 use crate::metric;
 use lane::{Found, Lane};
@@ -27,16 +27,30 @@ const GRACE: Duration = Duration::from_secs(3);
 /// How often the age of the oldest delivery is brought up to date.
 const TICK: Duration = Duration::from_secs(10);
 
+/// Test events to one endpoint: often enough while somebody sets a receiver up, and no means to flood it.
+const TEST_EVERY: Duration = Duration::from_secs(5);
+/// Longest wait for the answer to a test event, while the operator's own request waits for it.
+const TEST_TIMEOUT: Duration = Duration::from_secs(5);
+
 /// What an operator asks of the worker.
 pub(super) enum Command {
     Enable {
-        endpoint: usize,
+        endpoint: String,
         done: oneshot::Sender<()>,
     },
     Replay {
-        endpoint: usize,
+        endpoint: String,
         seq: Option<u64>,
         done: oneshot::Sender<u64>,
+    },
+    Test {
+        endpoint: String,
+        done: oneshot::Sender<Result<TestOutcome, AskError>>,
+    },
+    /// Other endpoints from now on. Those that stay, by name, keep what waits.
+    Replace {
+        endpoints: Vec<Endpoint>,
+        done: oneshot::Sender<()>,
     },
 }
 
@@ -49,25 +63,26 @@ pub(super) struct Worker {
     commands: mpsc::Receiver<Command>,
     shown: Arc<Mutex<Vec<EndpointStatus>>>,
     /// Looks at the disk.
-    reads: JoinSet<(usize, Found)>,
+    reads: JoinSet<(u64, Found)>,
     requests: JoinSet<Verdict>,
     /// Lane and event of each request.
-    under_way: HashMap<Id, (usize, u64)>,
+    under_way: HashMap<Id, (u64, u64)>,
+    /// Lanes so far.
+    begun: u64,
 }
 
 impl Worker {
     pub(super) fn new(
-        endpoints: Vec<Arc<Endpoint>>,
+        endpoints: Vec<Endpoint>,
         journal: Journal,
         clock: Clock,
         rng: ChaCha8Rng,
         commands: mpsc::Receiver<Command>,
         shown: Arc<Mutex<Vec<EndpointStatus>>>,
     ) -> Self {
-        let begun_at = journal.last_seq();
-        let lane = |endpoint| Lane::new(endpoint, journal.clone(), clock, begun_at);
-        Self {
-            lanes: endpoints.into_iter().map(lane).collect(),
+        let mut worker = Self {
+            lanes: Vec::new(),
+            begun: 0,
             journal,
             clock,
             rng,
@@ -76,7 +91,48 @@ impl Worker {
             reads: JoinSet::new(),
             requests: JoinSet::new(),
             under_way: HashMap::new(),
+        };
+        worker.replace(endpoints);
+        worker
+    }
+
+    /// Takes these endpoints in place of those before. What waits for one that is gone stays in the journal.
+    fn replace(&mut self, endpoints: Vec<Endpoint>) {
+        let begun_at = self.journal.last_seq();
+        let mut before = std::mem::take(&mut self.lanes);
+        for endpoint in endpoints.into_iter().map(Arc::new) {
+            let kept = before.iter().position(|lane| lane.endpoint.name() == endpoint.name());
+            let lane = match kept {
+                Some(k) => {
+                    let mut lane = before.swap_remove(k);
+                    lane.change(endpoint);
+                    lane
+                }
+                None => {
+                    self.begun += 1;
+                    Lane::new(self.begun, endpoint, self.journal.clone(), self.clock, begun_at)
+                }
+            };
+            self.lanes.push(lane);
         }
+        for lane in before {
+            let name = lane.endpoint.name().to_owned();
+            for metric in [
+                metric::WEBHOOK_QUEUED,
+                metric::WEBHOOK_OLDEST,
+                metric::WEBHOOK_DEAD_LETTERS,
+            ] {
+                gauge!(metric, "endpoint" => name.clone()).set(0.0);
+            }
+        }
+    }
+
+    fn lane(&mut self, id: u64) -> Option<&mut Lane> {
+        self.lanes.iter_mut().find(|lane| lane.id == id)
+    }
+
+    fn named(&self, name: &str) -> Option<usize> {
+        self.lanes.iter().position(|lane| lane.endpoint.name() == name)
     }
 
     pub(super) async fn run(mut self, shutdown: impl Future<Output = ()>) {
@@ -105,7 +161,11 @@ impl Worker {
             tokio::select! {
                 () = &mut shutdown => break,
                 Some(ended) = self.requests.join_next_with_id(), if !self.requests.is_empty() => self.settle(ended),
-                Some(Ok(found)) = self.reads.join_next(), if !self.reads.is_empty() => self.lanes[found.0].found(found.1),
+                Some(Ok((id, found))) = self.reads.join_next(), if !self.reads.is_empty() => {
+                    if let Some(lane) = self.lane(id) {
+                        lane.found(found);
+                    }
+                }
                 Ok(()) = heard.changed() => {}
                 Some(command) = self.commands.recv() => self.handle_command(command).await,
                 () = self.clock.sleep_until(wake) => {}
@@ -125,9 +185,10 @@ impl Worker {
 
     /// Takes new events into the queues; reads of the disk run beside.
     fn look(&mut self) {
-        for (k, lane) in self.lanes.iter_mut().enumerate() {
+        for lane in &mut self.lanes {
+            let id = lane.id;
             if let Some(read) = lane.look() {
-                self.reads.spawn(async move { (k, read.await) });
+                self.reads.spawn(async move { (id, read.await) });
             }
         }
     }
@@ -144,11 +205,11 @@ impl Worker {
     }
 
     fn start(&mut self, now: Duration) {
-        for (k, lane) in self.lanes.iter_mut().enumerate() {
+        for lane in &mut self.lanes {
             while let Some(job) = lane.queue.take(now) {
                 let request = attempt(self.journal.clone(), lane.endpoint.clone(), job.seq, self.clock);
                 let id = self.requests.spawn(request).id();
-                self.under_way.insert(id, (k, job.seq));
+                self.under_way.insert(id, (lane.id, job.seq));
             }
         }
     }
@@ -161,11 +222,14 @@ impl Worker {
             };
             (error.id(), verdict)
         });
-        let Some((k, seq)) = self.under_way.remove(&id) else {
+        let Some((of, seq)) = self.under_way.remove(&id) else {
             return;
         };
         let (at, now) = (self.clock.now(), self.clock.uptime());
-        let lane = &mut self.lanes[k];
+        // Where the endpoint is gone the delivery waits in the journal.
+        let Some(lane) = self.lanes.iter_mut().find(|lane| lane.id == of) else {
+            return;
+        };
         let name = lane.endpoint.name();
         let count = |outcome: &'static str| {
             counter!(metric::WEBHOOK_ATTEMPTS, "endpoint" => name.to_owned(), "outcome" => outcome).increment(1);
@@ -245,15 +309,20 @@ impl Worker {
     async fn handle_command(&mut self, command: Command) {
         match command {
             Command::Enable { endpoint, done } => {
-                self.journal.enable(self.lanes[endpoint].endpoint.name()).await;
+                let Some(k) = self.named(&endpoint) else { return };
+                self.journal.enable(&endpoint).await;
                 let now = self.clock.uptime();
-                self.lanes[endpoint].queue.enable(now);
+                self.lanes[k].queue.enable(now);
                 self.show(now);
                 // Whoever asked may have gone away meanwhile.
                 let _ = done.send(());
             }
-            Command::Replay { endpoint, seq, done } => {
-                let name = self.lanes[endpoint].endpoint.name().to_owned();
+            Command::Replay {
+                endpoint: name,
+                seq,
+                done,
+            } => {
+                let Some(endpoint) = self.named(&name) else { return };
                 self.journal.replay(&name, seq, self.clock.now()).await;
                 let before = self.lanes[endpoint].queue.len();
                 match self.ask(move |journal| journal.waiting(&name, 0)).await {
@@ -273,6 +342,26 @@ impl Worker {
                 lane.status.failed = lane.status.failed.saturating_sub(revived);
                 self.show(self.clock.uptime());
                 let _ = done.send(revived);
+            }
+            Command::Test { endpoint, done } => {
+                let now = self.clock.uptime();
+                let Some(k) = self.named(&endpoint) else { return };
+                let lane = &mut self.lanes[k];
+                let next = lane.tested_at.map_or(Duration::ZERO, |at| at + TEST_EVERY);
+                if now < next {
+                    let _ = done.send(Err(AskError::TooSoon((next - now).as_secs() + 1)));
+                    return;
+                }
+                lane.tested_at = Some(now);
+                let request = test(lane.endpoint.clone(), self.journal.id().to_owned(), self.clock);
+                tokio::spawn(async move { done.send(Ok(request.await)) });
+            }
+            Command::Replace { endpoints, done } => {
+                self.journal
+                    .subscribe(endpoints.iter().map(Endpoint::subscription).collect());
+                self.replace(endpoints);
+                self.show(self.clock.uptime());
+                let _ = done.send(());
             }
         }
     }
@@ -318,5 +407,24 @@ async fn attempt(journal: Journal, endpoint: Arc<Endpoint>, seq: u64, clock: Clo
     Verdict::Failed {
         failure,
         retry_after: None,
+    }
+}
+
+/// Sends a test event like any other, but once and beside the queue.
+async fn test(endpoint: Arc<Endpoint>, journal: String, clock: Clock) -> TestOutcome {
+    let now = clock.now();
+    let id = format!("msg_{journal}_test_{}", now.as_millisecond());
+    let began = clock.uptime();
+    let request = client::post(&endpoint, &id, payload::test_body(now), now);
+    let answer = tokio::time::timeout(TEST_TIMEOUT, request).await;
+    let (status, failure) = match answer.unwrap_or(Err(Failure::Timeout)) {
+        Ok(answer) => (Some(answer.status.as_u16()), answer.failure()),
+        Err(failure) => (None, Some(failure)),
+    };
+    TestOutcome {
+        delivered: failure.is_none(),
+        status,
+        took_ms: (clock.uptime() - began).as_millis() as u64,
+        error: failure.map(|failure| failure.to_string()),
     }
 }
