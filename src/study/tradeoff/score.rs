@@ -26,7 +26,8 @@ pub struct Study {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Row {
     pub cell: Cell,
-    pub rung: String,
+    #[serde(alias = "rung")]
+    pub estimator: String,
     pub frames: usize,
     pub seed: u64,
     /// Of the network, where the study was given one.
@@ -66,7 +67,7 @@ const TRIMMED_EXPONENTIAL: f64 = 0.842_329_8;
 pub(super) fn measure(cell: &Cell, candidate: &Candidate, scenes: &[Scene], seed: u64) -> Result<Row, Error> {
     let camera = cell.camera()?;
     let config = estimate::Config {
-        name: Some(candidate.rung.to_owned()),
+        name: Some(candidate.estimator.to_owned()),
         network: candidate.network.as_ref().map(|n| n.path.clone()),
         known_power: Some(cell.known_power(&camera)),
         ..Default::default()
@@ -116,7 +117,7 @@ pub(super) fn measure(cell: &Cell, candidate: &Candidate, scenes: &[Scene], seed
     let emitters = bounds.len().max(1);
     Ok(Row {
         cell: *cell,
-        rung: candidate.label(),
+        estimator: candidate.label(),
         training: candidate.training(),
         frames,
         seed,
