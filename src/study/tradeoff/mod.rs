@@ -14,7 +14,7 @@ use std::path::Path;
 use crate::estimate::{ESTIMATORS, Learned};
 pub(in crate::study) use networks::Candidate;
 pub(in crate::study) use scene::Scene;
-pub(in crate::study) use score::CUTOFF_M;
+pub(in crate::study) use score::{Answer, CUTOFF_M, bound_ratio};
 
 pub use condition::Condition;
 pub use error::{Error, PictureError};
