@@ -60,7 +60,7 @@ impl Pipeline {
         Ok(Self {
             estimator: estimate::build(&config.estimator, camera)?,
             budget: config.estimator.budget(),
-            saturation_j: camera.saturation_j.unwrap_or(f64::INFINITY),
+            saturation_j: camera.saturation_limit_j(),
             claims: Store::new(&config.claims),
             monitor: Monitor::new(&config.monitor, &config.claims, camera, source),
         })

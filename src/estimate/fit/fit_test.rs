@@ -300,3 +300,28 @@ fn a_poor_fit_ends_when_it_stalls_and_rounding_ends_one_by_small_decreases() {
     let (end, ..) = end_of(&huge, &[[0.2, -0.2], [0.6, 0.0]], 200, f64::INFINITY, 0.0, patient);
     assert_eq!(end, Termination::SmallDecreases);
 }
+
+#[test]
+fn steps_that_fail_at_any_damping_end_at_its_ceiling() {
+    // A source that starts on darkness walks along a curved valley to a noise peak beyond the edge: the damping is high when it gets
+    // there, and near a minimum no step decreases the deviance by more than rounding.
+    let ends = [3.5, 5.5].map(|v| {
+        end_of(
+            &[([v, 0.3], -1e3)],
+            &[[6.0, 0.0]],
+            300,
+            f64::INFINITY,
+            0.0,
+            Rules::default(),
+        )
+    });
+    let at_ceiling = ends.iter().filter(|(end, ..)| *end == Termination::DampingCeiling);
+    let places: Vec<_> = at_ceiling
+        .map(|(_, at, steps)| (at.converged, at.sources[0].u, *steps))
+        .collect();
+    assert!(!places.is_empty(), "{ends:?}");
+    assert!(
+        places.iter().all(|(converged, _, steps)| *converged && *steps < 300),
+        "{places:?}"
+    );
+}

@@ -20,27 +20,34 @@ use crate::estimate::fit::workspace::Workspace;
 use crate::estimate::model::hypothesis::{Hypothesis, PointSource};
 use crate::estimate::rules::Rules;
 
-/// Damping λ: first value, and range.
+/// Damping λ: first value, and range. The first trusts the start (undamped steps may leap out of its basin), the floor is rounding's, and
+/// at the ceiling a step is below the last digit of a position.
 const LAMBDA_START: f64 = 1e-3;
 const LAMBDA_FLOOR: f64 = 1e-14;
 const LAMBDA_CEILING: f64 = 1e10;
-/// Converged after two successive decreases of the deviance below this.
+/// Converged after two successive decreases of the deviance below this, which moves a position by 3 % of its standard deviation.
 const CONVERGED_DECREASE: f64 = 1e-3;
-/// Converged when the predicted decrease of the next step is below this.
+/// Converged when the predicted decrease of the next step is below this: 1 % of a standard deviation.
 const NEGLIGIBLE_DECREASE: f64 = 1e-4;
-/// Sources farther apart than this, σ, along either axis need no geodesic acceleration.
+/// Sources farther apart than this, σ, along either axis need no geodesic acceleration: their profiles overlap by exp(−9/4) and the
+/// deviance is no curved valley.
 const ACCELERATION_DISTANCE: f64 = 3.0;
-/// Aborts when this many times the predicted decrease misses the acceptance threshold.
+/// Aborts when this many times the predicted decrease misses the acceptance threshold: larger loses time on hopeless fits, smaller gives up
+/// those that a first step underestimates.
 const ABORT_FACTOR: f64 = 5.0;
-/// From this many times the expected deviance on, sources are missing and the others need no more digits: stalled steps end the fit.
+/// From this many times the expected deviance on, sources are missing and the others need no more digits: stalled steps end the fit. Well
+/// above what a wrong width or a background leave.
 const POOR_FIT_FACTOR: f64 = 100.0;
-/// A poor fit ends after `STALLED_STEPS` successive steps that each decrease the deviance by less than this share.
+/// A poor fit ends after `STALLED_STEPS` successive steps that each decrease the deviance by less than this share; one such step may be the
+/// bend of a valley.
 const STALLED_SHARE: f64 = 1e-2;
 const STALLED_STEPS: usize = 3;
-/// A fit exceeds its number of steps, up to `MAX_STEP_FACTOR` times, while each decreases the deviance by more than this share.
+/// A fit exceeds its number of steps, up to `MAX_STEP_FACTOR` times, while each decreases the deviance by more than this share: a start far
+/// off would otherwise be compared before it has arrived.
 const FAST_SHARE: f64 = 0.2;
 pub(crate) const MAX_STEP_FACTOR: usize = 8;
-/// Steps of all sources together before only the groups that still move are fitted, and how often that is tried.
+/// Steps of all sources together before only the groups that still move are fitted, and how often that is tried: after the first step every
+/// group moves, after many there is nothing left to save.
 pub(crate) const JOINT_STEPS: usize = 2;
 const MAX_REGROUPINGS: usize = 2;
 

@@ -7,11 +7,12 @@ use crate::estimate::model::compressed_frame::CompressedFrame;
 use crate::estimate::model::hypothesis::{Hypothesis, Nuisances};
 use crate::estimate::model::separable_model::SeparableModel;
 
-/// A source is at rest when its squared step over the step's variance is below this.
+/// A source is at rest when its squared step over the step's variance is below this: a tenth of a standard deviation, which the joint fit
+/// that follows takes up.
 const AT_REST: f64 = 1e-2;
-/// Fewest sources for which grouping pays.
+/// Fewest sources for which grouping pays: below, restricting the frame costs as much as a step.
 const MIN_SOURCES: usize = 4;
-/// Sources within this distance, σ, belong to one group.
+/// Sources within this distance, σ, belong to one group: beyond it two spots overlap by less than exp(−4), 2 %.
 const GROUP_DISTANCE: f64 = 4.0;
 
 /// The sources in groups that can be fitted separately (single linkage); `None` where there is one group, or parameters are shared.

@@ -68,7 +68,7 @@ pub(crate) fn maximum_posterior(search: &mut Search, prior: &PowerPrior, hypothe
 
 /// Searches for a more probable optimum: with tight energy priors where sources overlap, and from positions displaced along the
 /// ill-determined directions.
-fn explore_ill_determined(search: &mut Search, prior: &PowerPrior, candidate: &mut Candidate) {
+pub(crate) fn explore_ill_determined(search: &mut Search, prior: &PowerPrior, candidate: &mut Candidate) {
     if !close_pairs(candidate, OVERLAP_DISTANCE).is_empty() {
         fit_with_tight_prior(search, prior, candidate);
     }

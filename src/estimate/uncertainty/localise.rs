@@ -12,17 +12,18 @@ use crate::estimate::uncertainty::profile_nonlinearity::is_likelihood_quadratic;
 use crate::estimate::uncertainty::split_score_test::{second_moment_scores, split_proposal};
 use crate::optics::Camera;
 
-/// A masked pixel within this distance, σ, sets a flag.
+/// A masked pixel within this distance, σ, sets a flag: 99 % of a spot's light lies within.
 const MASKED_DISTANCE: f64 = 3.0;
-/// A source within this distance of the edge, σ, is flagged.
+/// A source within this distance of the edge, σ, is flagged: nearer, the edge cuts more than 2 % of its light.
 const EDGE_DISTANCE: f64 = 2.0;
 /// Condition number beyond which the ridge under the information matrix is no longer small against its least eigenvalue.
 const MAX_CONDITION: f64 = 0.01 / RIDGE;
 /// Sources this many standard deviations of their difference apart are resolved.
 const RESOLVED: f64 = 3.0;
-/// A source may be two where a split is predicted to decrease the deviance by this much, which is less than a source's penalty.
+/// A source may be two where a split is predicted to decrease the deviance by this much: less than a source's penalty, so that a pair which
+/// the search leaves as one is flagged. Less would flag lone sources by chance.
 const DOUBTFUL: f64 = 10.0;
-/// Sources within this distance, σ, of an unresolved one may be displaced by it.
+/// Sources within this distance, σ, of an unresolved one may be displaced by it: farther off they share less than exp(−2.5²/4), a fifth, of their square.
 const INFLUENCE_DISTANCE: f64 = 2.5;
 
 /// The emitters of a hypothesis, and how well it explains the frame.

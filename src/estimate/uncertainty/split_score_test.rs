@@ -12,9 +12,9 @@ use crate::estimate::uncertainty::covariance::Covariance;
 /// Orders and factors of the derivatives for the second moments xx, xy, yy: a source spread by M changes by
 /// ½A(M_xx f_xx + 2 M_xy f_xy + M_yy f_yy).
 const SECOND: [([usize; 2], f64); 3] = [([2, 0], 0.5), ([1, 1], 1.0), ([0, 2], 0.5)];
-/// Directions tested, over half a turn.
+/// Directions tested, over half a turn: the best is missed by at most 6°.
 const DIRECTIONS: usize = 16;
-/// Smallest share of a moment's information that must remain after projection off the fitted parameters.
+/// Smallest share of a moment's information that must remain after projection off the fitted parameters: less is rounding.
 const LEAST: f64 = 1e-6;
 
 /// A split suggested by a second-moment score.
