@@ -13,7 +13,7 @@ mod pressure;
 mod roster;
 mod store;
 
-pub use candidates::MOST_UNANSWERED;
+pub use candidates::{Bearing, MOST_UNANSWERED};
 pub use config::{Config, ConfigError, Fields, Origin};
 pub use follower::{Follower, LONGEST_LINE, Poll, Refused, read_log};
 pub use history::Standing;

@@ -8,7 +8,7 @@ use jiff::Timestamp;
 use serde::Serialize;
 
 use super::ahead::{Ahead, MOST_IN_A_REPLAY, MOST_LIVE};
-use super::candidates::Index;
+use super::candidates::{Bearing, Index};
 use super::history::{History, Standing};
 use super::outcome::Outcome;
 use super::pressure::{Dropped, Pressure, Squeeze};
@@ -260,11 +260,11 @@ impl Store {
 
     /// Chooses the claims that the coming frame is held against: of users that were ever answered, and of the others those that bear on the view
     /// (`bears`), the nearest to `beams` and those known longest where they are too many.
-    pub fn choose(&mut self, beams: &[Beam], bears: impl Fn(&Standing<'_>) -> bool) {
+    pub fn choose(&mut self, beams: &[Beam], bears: impl Fn(&Standing<'_>) -> Option<Bearing>) {
         let slots = &self.slots;
         let place = |slot: u32| {
             let standing = slots[slot as usize].as_ref()?.history.standing();
-            bears(&standing).then_some([standing.claim.x_m, standing.claim.y_m])
+            Some((bears(&standing)?, [standing.claim.x_m, standing.claim.y_m]))
         };
         self.unanswered.look(place);
         // Those of beams without a user come first: the claims beside them decide most.
@@ -292,7 +292,7 @@ impl Store {
         self.dropped.lately(now)
     }
 
-    /// Claims that bear on the view and were not among those chosen.
+    /// Claims in view that were not among those chosen.
     pub fn left_out(&self) -> usize {
         self.left_out
     }
