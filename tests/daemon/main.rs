@@ -3,7 +3,6 @@
 mod over_http;
 mod process;
 mod siege;
-mod viewers;
 
 use std::path::Path;
 use std::process::Command;

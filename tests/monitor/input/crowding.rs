@@ -4,7 +4,7 @@ use oapwatch::monitor::AlertKind::*;
 use oapwatch::monitor::{PositionStatus, TrackedPosition};
 
 use crate::hostile::forged;
-use crate::stories::{Actor, Story, crowd, tell};
+use crate::stories::{Actor, Expect, Story, crowd, tell};
 
 /// A grid of names over the whole view, each claimed once a second, in steps of 10 m: an eavesdropper who walks through it is near one
 /// of them at any time.
