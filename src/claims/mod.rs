@@ -10,6 +10,7 @@ mod inbox;
 mod line;
 mod outcome;
 mod pressure;
+mod registry;
 mod roster;
 mod store;
 
