@@ -7,8 +7,8 @@ use std::time::{Duration, SystemTime};
 
 use jiff::{SignedDuration, Timestamp};
 use oapwatch::claims::{
-    Beam, Claim, ClaimState, Config, Follower, LONGEST_LINE, MOST_UNANSWERED, Outcome, Poll, Store, parse_line,
-    read_log,
+    Beam, Bearing, Claim, ClaimState, Config, Follower, LONGEST_LINE, MOST_UNANSWERED, Outcome, Poll, Store,
+    parse_line, read_log,
 };
 
 fn at(s: f64) -> Timestamp {
@@ -393,7 +393,7 @@ fn who_is_claimed_beside_a_beam_that_is_nobodys_is_let_in_first() {
         position: [40.0, 3.0],
         is_answered: false,
     };
-    store.choose(&[beam], |_| true);
+    store.choose(&[beam], |_| Some(Bearing::InView));
     assert_eq!(store.insert(claim("far", 1.0, 70.0), at(1.0)), Outcome::Full);
     assert_eq!(store.insert(claim("beside", 1.0, 38.0), at(1.0)), Outcome::Accepted);
 }
@@ -413,7 +413,7 @@ fn a_frame_is_held_against_a_bounded_number_of_claims() {
         position: [77.0, 55.2],
         is_answered: false,
     };
-    store.choose(&[beam], |_| true);
+    store.choose(&[beam], |_| Some(Bearing::InView));
     let chosen: Vec<String> = store.chosen().map(|s| s.claim.user.clone()).collect();
     assert_eq!(chosen.len(), MOST_UNANSWERED + 1);
     assert_eq!(store.left_out(), 15_000 - chosen.len());
@@ -425,7 +425,7 @@ fn a_frame_is_held_against_a_bounded_number_of_claims() {
     assert!(chosen.is_sorted(), "by name");
     // Those that bear no more leave.
     for _ in 0..100 {
-        store.choose(&[], |s| s.claim.x_m < 1.0);
+        store.choose(&[], |s| (s.claim.x_m < 1.0).then_some(Bearing::InView));
     }
     assert_eq!((store.chosen().count(), store.left_out()), (101, 0));
 }

@@ -4,7 +4,6 @@ mod over_http;
 mod process;
 mod reload;
 mod siege;
-mod viewers;
 
 use std::path::Path;
 use std::process::Command;
