@@ -59,6 +59,7 @@ pub struct EvidenceQuery {
     scale: Option<usize>,
     /// All when left out
     #[serde(default)]
+    #[param(inline)]
     panels: Panels,
 }
 
@@ -241,7 +242,12 @@ pub async fn png(
         Err(problem) => Err(problem),
     };
     let png = match (recorded, state.feed.picture(&alert.id)) {
-        (Ok(frame), _) => draw(&state, frame, alert, scale, query.panels).await?,
+        (Ok(frame), _) => {
+            // What moves has left the place that the alert has now.
+            let events = alerts::read(&state, move |journal| journal.events(&id)).await?;
+            let raised = events.into_iter().next().map_or(alert, |first| first.event.alert);
+            draw(&state, frame, raised, scale, query.panels).await?
+        }
         (Err(_), Some(png)) => png,
         (Err(problem), None) => return Err(problem),
     };

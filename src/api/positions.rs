@@ -141,6 +141,10 @@ pub async fn history_csv(Shared(state): Shared<State>, Query(query): Query<Histo
             let mut row = serde_json::to_value(beam).expect("beams are JSON");
             row["time"] = json!(moment.time);
             row["frame"] = json!(moment.frame);
+            // As JSON has them: a centimetre, and not the digits by which a single-precision number misses it.
+            for (key, metres) in [("x_m", beam.x_m), ("y_m", beam.y_m)] {
+                row[key] = json!((f64::from(metres) * 100.0).round() / 100.0);
+            }
             row
         };
         let beams = moments

@@ -26,33 +26,18 @@ use rand_chacha::ChaCha8Rng;
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::JoinHandle;
 
-use crate::journal::{self, DeadLetter, Journal};
+use crate::journal::{DeadLetter, Journal};
 use worker::{Command, Worker};
 
 pub use clock::Clock;
 pub use config::Config;
 pub use endpoint::{Endpoint, load};
-pub use error::Error;
+pub use error::{AskError, Error};
 pub use status::{EndpointState, EndpointStatus, TestOutcome};
 
 /// How long a replay waits for a busy disk, and how often it looks.
 const REPLAY_TIMEOUT: Duration = Duration::from_secs(3);
 const REPLAY_POLL: Duration = Duration::from_millis(100);
-
-/// Why a request of the operator cannot be met.
-#[derive(Debug, thiserror::Error)]
-pub enum AskError {
-    #[error("there is no webhook `{0}`")]
-    Unknown(String),
-    #[error("the journal cannot be written now; dead letters stay where they are")]
-    ReadOnly,
-    #[error("a test event was sent a moment ago; come back in {0} s")]
-    TooSoon(u64),
-    #[error("the daemon is stopping")]
-    Stopping,
-    #[error(transparent)]
-    Journal(#[from] journal::Error),
-}
 
 /// A handle on the webhook worker, for the API.
 #[derive(Clone)]

@@ -1,5 +1,6 @@
 //! The delivery loop: takes due deliveries from every endpoint's queue, sends them and notes the outcome.
 
+mod command;
 mod lane;
 
 use std::collections::HashMap;
@@ -10,15 +11,16 @@ use std::time::Duration;
 use jiff::{SignedDuration, Timestamp};
 use metrics::{counter, gauge};
 use rand_chacha::ChaCha8Rng;
-use tokio::sync::{mpsc, oneshot};
+use tokio::sync::mpsc;
 use tokio::task::{Id, JoinError, JoinSet};
 
 use super::client::{self, Failure, Verdict};
 use super::queue::Next;
-use super::status::{EndpointState, EndpointStatus, TestOutcome};
-use super::{AskError, Clock, Endpoint, payload};
-use crate::journal::{self, Attempt, Journal, Outcome};
+use super::status::{EndpointState, EndpointStatus};
+use super::{Clock, Endpoint};
+use crate::journal::{Attempt, Journal, Outcome};
 use crate::metric;
+pub(super) use command::Command;
 use lane::{Found, Lane};
 
 /// How long requests that are under way may still take when the daemon stops.
@@ -26,33 +28,6 @@ const GRACE: Duration = Duration::from_secs(3);
 
 /// How often the age of the oldest delivery is brought up to date.
 const TICK: Duration = Duration::from_secs(10);
-
-/// Test events to one endpoint: often enough while somebody sets a receiver up, and no means to flood it.
-const TEST_EVERY: Duration = Duration::from_secs(5);
-/// Longest wait for the answer to a test event, while the operator's own request waits for it.
-const TEST_TIMEOUT: Duration = Duration::from_secs(5);
-
-/// What an operator asks of the worker.
-pub(super) enum Command {
-    Enable {
-        endpoint: String,
-        done: oneshot::Sender<()>,
-    },
-    Replay {
-        endpoint: String,
-        seq: Option<u64>,
-        done: oneshot::Sender<u64>,
-    },
-    Test {
-        endpoint: String,
-        done: oneshot::Sender<Result<TestOutcome, AskError>>,
-    },
-    /// Other endpoints from now on. Those that stay, by name, keep what waits.
-    Replace {
-        endpoints: Vec<Endpoint>,
-        done: oneshot::Sender<()>,
-    },
-}
 
 /// All endpoints, their requests and their reads of the journal.
 pub(super) struct Worker {
@@ -193,17 +168,6 @@ impl Worker {
         }
     }
 
-    async fn ask<T: Send + 'static>(
-        &self,
-        question: impl FnOnce(&Journal) -> Result<T, journal::Error> + Send + 'static,
-    ) -> Result<T, journal::Error> {
-        let journal = self.journal.clone();
-        match tokio::task::spawn_blocking(move || question(&journal)).await {
-            Ok(answer) => answer,
-            Err(error) => std::panic::resume_unwind(error.into_panic()),
-        }
-    }
-
     fn start(&mut self, now: Duration) {
         for lane in &mut self.lanes {
             while let Some(job) = lane.queue.take(now) {
@@ -306,66 +270,6 @@ impl Worker {
         });
     }
 
-    async fn handle_command(&mut self, command: Command) {
-        match command {
-            Command::Enable { endpoint, done } => {
-                let Some(k) = self.named(&endpoint) else { return };
-                self.journal.enable(&endpoint).await;
-                let now = self.clock.uptime();
-                self.lanes[k].queue.enable(now);
-                self.show(now);
-                // Whoever asked may have gone away meanwhile.
-                let _ = done.send(());
-            }
-            Command::Replay {
-                endpoint: name,
-                seq,
-                done,
-            } => {
-                let Some(endpoint) = self.named(&name) else { return };
-                self.journal.replay(&name, seq, self.clock.now()).await;
-                let before = self.lanes[endpoint].queue.len();
-                match self.ask(move |journal| journal.waiting(&name, 0)).await {
-                    Ok(rows) => {
-                        // Later events come in by `read_new`, once.
-                        let read_to = self.lanes[endpoint].read_to;
-                        for row in rows.iter().filter(|row| row.seq <= read_to) {
-                            if !self.lanes[endpoint].cool_down.holds(row.seq) {
-                                self.lanes[endpoint].push(row);
-                            }
-                        }
-                    }
-                    Err(error) => tracing::warn!(%error, "the webhook outbox cannot be read"),
-                }
-                let lane = &mut self.lanes[endpoint];
-                let revived = (lane.queue.len() - before) as u64;
-                lane.status.failed = lane.status.failed.saturating_sub(revived);
-                self.show(self.clock.uptime());
-                let _ = done.send(revived);
-            }
-            Command::Test { endpoint, done } => {
-                let now = self.clock.uptime();
-                let Some(k) = self.named(&endpoint) else { return };
-                let lane = &mut self.lanes[k];
-                let next = lane.tested_at.map_or(Duration::ZERO, |at| at + TEST_EVERY);
-                if now < next {
-                    let _ = done.send(Err(AskError::TooSoon((next - now).as_secs() + 1)));
-                    return;
-                }
-                lane.tested_at = Some(now);
-                let request = test(lane.endpoint.clone(), self.journal.id().to_owned(), self.clock);
-                tokio::spawn(async move { done.send(Ok(request.await)) });
-            }
-            Command::Replace { endpoints, done } => {
-                self.journal
-                    .subscribe(endpoints.iter().map(Endpoint::subscription).collect());
-                self.replace(endpoints);
-                self.show(self.clock.uptime());
-                let _ = done.send(());
-            }
-        }
-    }
-
     /// Brings status and metrics up to date.
     fn show(&mut self, now: Duration) {
         let wall = self.clock.now();
@@ -407,24 +311,5 @@ async fn attempt(journal: Journal, endpoint: Arc<Endpoint>, seq: u64, clock: Clo
     Verdict::Failed {
         failure,
         retry_after: None,
-    }
-}
-
-/// Sends a test event like any other, but once and beside the queue.
-async fn test(endpoint: Arc<Endpoint>, journal: String, clock: Clock) -> TestOutcome {
-    let now = clock.now();
-    let id = format!("msg_{journal}_test_{}", now.as_millisecond());
-    let began = clock.uptime();
-    let request = client::post(&endpoint, &id, payload::test_body(now), now);
-    let answer = tokio::time::timeout(TEST_TIMEOUT, request).await;
-    let (status, failure) = match answer.unwrap_or(Err(Failure::Timeout)) {
-        Ok(answer) => (Some(answer.status.as_u16()), answer.failure()),
-        Err(failure) => (None, Some(failure)),
-    };
-    TestOutcome {
-        delivered: failure.is_none(),
-        status,
-        took_ms: (clock.uptime() - began).as_millis() as u64,
-        error: failure.map(|failure| failure.to_string()),
     }
 }
