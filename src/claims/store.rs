@@ -85,7 +85,7 @@ impl Store {
 
     /// Goes on with other settings; what is known stays.
     pub fn reconfigure(&mut self, config: &Config) {
-        self.max_users = config.max_users;
+        self.users.max_users = config.max_users;
     }
 
     /// The log is not read ahead of its frames: few claims are made for later.

@@ -51,7 +51,7 @@ impl AlertLifecycle {
     }
 
     pub fn set_cool_down(&mut self, cool_down_s: f64) {
-        self.cool_down_s = cool_down_s;
+        self.cleared.cool_down_s = cool_down_s;
     }
 
     /// Forgets all causes; gives the alerts that are open.

@@ -19,7 +19,8 @@ const MAX_CLEARED: usize = 10_000;
 #[derive(Debug)]
 pub(super) struct ClearedCauses {
     causes: BTreeMap<Cause, Cleared>,
-    cool_down_s: f64,
+    /// Absence for which a cause that comes back is the same, s.
+    pub cool_down_s: f64,
 }
 
 #[derive(Clone, Copy, Debug)]

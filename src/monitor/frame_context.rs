@@ -40,6 +40,11 @@ pub(super) struct Overload {
     pub max_users: usize,
 }
 
+/// Largest score of a track.
+fn max_score(budget: &ErrorBudget) -> f64 {
+    MAX_SCORE * budget.threshold(TestFamily::Unclaimed, 1.0)
+}
+
 /// What all rules read: the settings, what frames and claims so far have shown, and the newest frame. The monitor alone changes it.
 pub(super) struct FrameContext {
     pub config: Config,
@@ -82,7 +87,7 @@ impl FrameContext {
             time: None,
             sensor: SensorHealth::default(),
             timing: ClaimTiming::default(),
-            tracker: Tracker::new(MAX_SCORE * budget.threshold(TestFamily::Unclaimed, 1.0)),
+            tracker: Tracker::new(max_score(&budget)),
             pose: PoseConsensus::default(),
             users: UserTracks::default(),
             alerts: AlertLifecycle::new(source.kind, source.file, config.cool_down_s),
@@ -94,6 +99,15 @@ impl FrameContext {
             crowding: Crowding::default(),
             clock_offset_s: 0.0,
         }
+    }
+
+    /// Goes on with other settings.
+    pub fn reconfigure(&mut self, config: &Config, claims: &crate::claims::Config) {
+        self.config = config.clone();
+        self.budget = self.budget.reconfigured(config);
+        self.default_sigma_m = claims.default_sigma_m;
+        self.tracker.set_max_score(max_score(&self.budget));
+        self.alerts.set_cool_down(config.cool_down_s);
     }
 
     /// Forgets what frames have shown: all but the settings and the alerts.

@@ -59,14 +59,7 @@ impl Monitor {
 
     /// Goes on with other settings; tracks, alerts and what has been learned stay.
     pub fn reconfigure(&mut self, config: &Config, claims: &crate::claims::Config) {
-        let state = &mut self.state;
-        state.budget = state.budget.reconfigured(config);
-        state.config = config.clone();
-        state.default_sigma_m = claims.default_sigma_m;
-        state
-            .tracker
-            .set_max_score(MAX_SCORE * unclaimed::threshold(&state.budget));
-        self.alerts.set_cool_down(config.cool_down_s);
+        self.frame.reconfigure(config, claims);
     }
 
     /// Names the recording that holds the frames from now on, for the alerts that they raise.
