@@ -57,20 +57,18 @@ pub struct EvidenceQuery {
     /// when left out
     #[param(minimum = 1, maximum = 64)]
     scale: Option<usize>,
-    /// All when left out
-    #[serde(default)]
+    /// All of a recorded frame when left out; asked for all, what is not recorded has no picture
     #[param(inline)]
-    panels: Panels,
+    panels: Option<Panels>,
 }
 
 /// What the picture shows, from left to right.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Deserialize, utoipa::ToSchema)]
+#[derive(Clone, Copy, Debug, PartialEq, Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "lowercase")]
 enum Panels {
     /// The frame.
     Data,
     /// The frame, the model that the estimator explains it by, and the residual in σ.
-    #[default]
     All,
 }
 
@@ -241,12 +239,16 @@ pub async fn png(
         Ok(None) => Err(nothing_recorded(&state, &alert)),
         Err(problem) => Err(problem),
     };
-    let png = match (recorded, state.feed.picture(&alert.id)) {
+    let kept = state
+        .feed
+        .picture(&alert.id)
+        .filter(|_| query.panels != Some(Panels::All));
+    let png = match (recorded, kept) {
         (Ok(frame), _) => {
             // What moves has left the place that the alert has now.
             let events = alerts::read(&state, move |journal| journal.events(&id)).await?;
             let raised = events.into_iter().next().map_or(alert, |first| first.event.alert);
-            draw(&state, frame, raised, scale, query.panels).await?
+            draw(&state, frame, raised, scale, query.panels.unwrap_or(Panels::All)).await?
         }
         (Err(_), Some(png)) => png,
         (Err(problem), None) => return Err(problem),

@@ -90,5 +90,6 @@ async fn without_a_recorder_an_alert_of_this_run_has_a_picture() {
     fake.feed.illustrate(&[alert], &crate::fake::snapshot(1));
     let png = get(&fake, "/v1/alerts/a-1/evidence.png").await;
     assert_eq!(size_of(&png.bytes().await.unwrap()), (256, 256));
+    problem(get(&fake, "/v1/alerts/a-1/evidence.png?panels=all").await, 404).await;
     fake.stop().await;
 }

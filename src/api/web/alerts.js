@@ -313,15 +313,17 @@ export class Alerts {
   fit(alert, details) {
     const image = el("img", { alt: "The frame, the model that explains it, and the residual" });
     const box = el("figure", { className: "fit", hidden: true }, image, el("figcaption", {}, "Frame, model, residual (blue −5 σ, black 0, orange +5 σ)"));
+    let tries = 3;
     const load = async () => {
       if (!details.open || image.src) return;
       try {
-        const answer = await this.link.request(`/v1/alerts/${encodeURIComponent(alert.id)}/evidence.png`);
+        const answer = await this.link.request(`/v1/alerts/${encodeURIComponent(alert.id)}/evidence.png?panels=all`);
         image.src = URL.createObjectURL(await answer.blob());
         image.onload = () => URL.revokeObjectURL(image.src);
         box.hidden = false;
       } catch {
-        // Its recording has made way for newer ones.
+        // A new alert's recording takes a moment; an old one's may have made way for newer ones.
+        if (--tries > 0) setTimeout(load, 1500);
       }
     };
     details.addEventListener("toggle", load);
