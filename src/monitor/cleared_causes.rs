@@ -111,7 +111,7 @@ mod tests {
     #[test]
     fn a_cause_is_the_same_within_the_cool_down_and_once() {
         let cause = Cause::System(AlertKind::SensorLost);
-        for (s, recurrences) in [(60, Some(3)), (61, None)] {
+        for (s, recurrences) in [(59, Some(3)), (61, None)] {
             let mut cleared = ClearedCauses::new(60.0);
             cleared.push(cause.clone(), 3, None, at(0));
             assert_eq!(cleared.take(&cause, None, at(s)), recurrences);
