@@ -31,8 +31,9 @@ pub struct Effect {
     pub right_only_without: usize,
     pub missed_more: i64,
     pub invented_more: i64,
-    /// Trimmed ratio of squared error to the bound, with the rule and without it.
+    /// Trimmed ratio of squared error to the bound, and mean squared error over matched pairs, m²: with the rule and without it.
     pub bound_ratio: [Option<f64>; 2],
+    pub mean_m2: [Option<f64>; 2],
     /// OSPA without the rule minus OSPA with it, m: mean over all frames and its standard error.
     pub ospa_more_m: f64,
     pub ospa_error_m: f64,
@@ -169,6 +170,7 @@ impl Effect {
             missed_more: more(&|a| a.missed),
             invented_more: more(&|a| a.invented),
             bound_ratio: [0, 1].map(|which| bound_ratio(frames.iter().flat_map(|f| f[which].answer.ratios.clone()))),
+            mean_m2: [0, 1].map(|which| mean_m2(frames.iter().flat_map(|f| &f[which].answer.squared_m2))),
             ospa_more_m: mean,
             ospa_error_m: (variance / n).sqrt(),
             needed_most,
@@ -177,6 +179,11 @@ impl Effect {
             p99_ratio: p99(without) / p99(with),
         }
     }
+}
+
+fn mean_m2<'a>(squared: impl Iterator<Item = &'a f64>) -> Option<f64> {
+    let (sum, count) = squared.fold((0.0, 0.0), |(sum, count), s| (sum + s, count + 1.0));
+    (count > 0.0).then_some(sum / count)
 }
 
 fn p99(mut values: Vec<f64>) -> f64 {
@@ -188,11 +195,11 @@ fn p99(mut values: Vec<f64>) -> f64 {
 /// The effects as a Markdown table, each of a rule's absence.
 pub fn markdown(effects: &[Effect], plan: &Plan) -> String {
     let mut text = format!(
-        "{} frames of each of {} cells, seed {}, each with every rule and without each one. r is the trimmed ratio to the bound, with the \
-         rule and without it. OSPA (order 2, {CUTOFF_M} m) is without the rule minus with it, ± one standard error: positive means that \
+        "{} frames of each of {} cells, seed {}, each with every rule and without each one. r is the trimmed ratio to the bound and m² the \
+         mean squared error, with the rule and without it. OSPA (order 2, {CUTOFF_M} m) is without the rule minus with it, ± one standard error: positive means that \
          the rule helps. Steps of fits, time and its 99th percentile are without over with: above 1 the rule saves them.\n\n\
-         | without | estimator | answers changed | number right only with | only without | missed | invented | r | OSPA m | needed most in | steps | time | 99th |\n\
-         |---|---|---|---|---|---|---|---|---|---|---|---|---|\n",
+         | without | estimator | answers changed | number right only with | only without | missed | invented | r | m² | OSPA m | needed most in | steps | time | 99th |\n\
+         |---|---|---|---|---|---|---|---|---|---|---|---|---|---|\n",
         plan.frames,
         plan.cells.len(),
         plan.seed
@@ -202,7 +209,7 @@ pub fn markdown(effects: &[Effect], plan: &Plan) -> String {
         let needed = e.needed_most.as_ref();
         let _ = writeln!(
             text,
-            "| {} | {} | {:.1} % | {} | {} | {:+} | {:+} | {}, {} | {:+.4} ± {:.4} | {} | {:.3} | {:.2} | {:.2} |",
+            "| {} | {} | {:.1} % | {} | {} | {:+} | {:+} | {}, {} | {}, {} | {:+.4} ± {:.4} | {} | {:.3} | {:.2} | {:.2} |",
             e.rule,
             e.estimator,
             100.0 * e.changed as f64 / e.frames.max(1) as f64,
@@ -212,6 +219,8 @@ pub fn markdown(effects: &[Effect], plan: &Plan) -> String {
             e.invented_more,
             r(e.bound_ratio[0]),
             r(e.bound_ratio[1]),
+            r(e.mean_m2[0]),
+            r(e.mean_m2[1]),
             e.ospa_more_m,
             e.ospa_error_m,
             needed.map_or("–".to_owned(), |(cell, rise)| format!("{cell} ({rise:+.3})")),

@@ -1,6 +1,6 @@
 //! The matched filter on a fine grid and its maxima: non-maximum suppression, sub-grid peaks.
 
-use crate::estimate::dense_linalg::{axpy, dot};
+use crate::estimate::dense_linalg::{axpy, dispatch, dot};
 use crate::estimate::model::svd_basis::Basis;
 
 /// Grid spacing, σ: a spot half-way between grid points loses 3 % of its response. Half the spacing has four times the points.
@@ -83,12 +83,12 @@ impl MatchedFilter {
 
     /// Fills the map with the response to `residual`.
     pub fn respond(&mut self, residual: &[f64], mx: usize, my: usize) {
-        pulp::Arch::new().dispatch(Filter {
-            matched_filter: self,
-            residual,
-            mx,
-            my,
-        });
+        dispatch!(<'a>
+            matched_filter: &'a mut MatchedFilter = self,
+            residual: &'a [f64] = residual,
+            mx: usize = mx,
+            my: usize = my
+            => (): matched_filter.filter(residual, mx, my));
     }
 
     #[inline(always)]
@@ -164,21 +164,5 @@ impl MatchedFilter {
         }
         self.peaks.truncate(kept);
         &self.peaks
-    }
-}
-
-struct Filter<'a> {
-    matched_filter: &'a mut MatchedFilter,
-    residual: &'a [f64],
-    mx: usize,
-    my: usize,
-}
-
-impl pulp::NullaryFnOnce for Filter<'_> {
-    type Output = ();
-
-    #[inline(always)]
-    fn call(self) {
-        self.matched_filter.filter(self.residual, self.mx, self.my);
     }
 }

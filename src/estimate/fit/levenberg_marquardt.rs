@@ -7,7 +7,7 @@
 //!
 //! In the pixel bases every component is evaluated only within its reach, and pixels may have weights of their own.
 
-use crate::estimate::dense_linalg::dot;
+use crate::estimate::dense_linalg::{dispatch, dot};
 use crate::estimate::fit::context::FitContext;
 use crate::estimate::fit::damped_step::{predicted_decrease, step};
 use crate::estimate::fit::evaluation::Evaluation;
@@ -191,12 +191,12 @@ pub(crate) fn linearise<'w>(
     budget: &mut WorkBudget,
     workspace: &'w mut Workspace,
 ) -> Linearisation<'w> {
-    pulp::Arch::new().dispatch(Linearise {
-        problem,
-        hypothesis,
-        budget,
-        workspace,
-    });
+    dispatch!(<'w, 'a, 'b>
+        problem: Problem<'a> = problem,
+        hypothesis: &'w mut Hypothesis = hypothesis,
+        budget: &'w mut WorkBudget<'b> = budget,
+        workspace: &'w mut Workspace = workspace
+        => (): evaluate_with_equations(problem, hypothesis, budget, workspace));
     let Workspace {
         current,
         equations,
@@ -211,14 +211,14 @@ pub(crate) fn linearise<'w>(
 }
 
 fn run(context: &mut FitContext, problem: Problem, hypothesis: &mut Hypothesis, limits: Limits) -> Run {
-    pulp::Arch::new().dispatch(Iterate {
-        problem,
-        hypothesis,
-        limits,
-        rules: context.rules,
-        budget: context.budget,
-        workspace: context.workspace,
-    })
+    dispatch!(<'w, 'a, 'b>
+        problem: Problem<'a> = problem,
+        hypothesis: &'w mut Hypothesis = hypothesis,
+        limits: Limits = limits,
+        rules: Rules = context.rules,
+        budget: &'w mut WorkBudget<'b> = context.budget,
+        workspace: &'w mut Workspace = context.workspace
+        => Run: iterate(problem, hypothesis, limits, rules, budget, workspace))
 }
 
 /// How a run of steps ended, and whether the workspace holds its last step.
@@ -227,127 +227,108 @@ struct Run {
     has_step: bool,
 }
 
-struct Iterate<'w, 'a, 'b> {
-    problem: Problem<'a>,
-    hypothesis: &'w mut Hypothesis,
+/// Levenberg–Marquardt steps within the limits.
+#[inline(always)]
+fn iterate(
+    problem: Problem,
+    hypothesis: &mut Hypothesis,
     limits: Limits,
     rules: Rules,
-    budget: &'w mut WorkBudget<'b>,
-    workspace: &'w mut Workspace,
-}
-
-impl pulp::NullaryFnOnce for Iterate<'_, '_, '_> {
-    type Output = Run;
-
-    #[inline(always)]
-    fn call(self) -> Run {
-        let Self {
-            problem,
-            hypothesis,
-            limits: Limits {
-                steps,
-                acceptance_threshold,
-            },
-            rules,
-            budget,
-            workspace,
-        } = self;
-        let Workspace {
-            current,
-            trial,
-            equations,
-            step: last_step,
-            scratch,
-        } = workspace;
-        let nuisances = hypothesis.nuisances;
-        current.load(problem, hypothesis);
-        let mut deviance = current.evaluate(problem, nuisances, scratch);
-        let has_overlap = has_overlap(&current.model.sources);
-        let mut lambda = LAMBDA_START;
-        let mut small_decreases = 0;
-        let mut is_linearised = false;
-        let mut is_fast = false;
-        let mut stalled = 0;
-        let mut has_step = false;
-        let mut steps_taken = 0;
-        let mut end = (hypothesis.parameters() == nuisances.background_terms()).then_some(Termination::NoParameter);
-        let termination = loop {
-            if let Some(reason) = end {
-                break reason;
+    budget: &mut WorkBudget,
+    workspace: &mut Workspace,
+) -> Run {
+    let Workspace {
+        current,
+        trial,
+        equations,
+        step: last_step,
+        scratch,
+    } = workspace;
+    let nuisances = hypothesis.nuisances;
+    current.load(problem, hypothesis);
+    let mut deviance = current.evaluate(problem, nuisances, scratch);
+    let has_overlap = has_overlap(&current.model.sources);
+    let mut lambda = LAMBDA_START;
+    let mut small_decreases = 0;
+    let mut is_linearised = false;
+    let mut is_fast = false;
+    let mut stalled = 0;
+    let mut has_step = false;
+    let mut steps_taken = 0;
+    let mut end = (hypothesis.parameters() == nuisances.background_terms()).then_some(Termination::NoParameter);
+    let termination = loop {
+        if let Some(reason) = end {
+            break reason;
+        }
+        if steps_taken >= limits.steps && (!is_fast || steps_taken >= MAX_STEP_FACTOR * limits.steps) {
+            break Termination::StepLimit;
+        }
+        if stalled >= STALLED_STEPS {
+            break Termination::Stalled;
+        }
+        if budget.is_overrun() {
+            break Termination::OutOfWork;
+        }
+        steps_taken += 1;
+        budget.charge_step(
+            current.model.components(),
+            step_cost(problem.bases, problem.compressed, &current.model),
+        );
+        if !is_linearised {
+            equations.compute(problem, nuisances, current, scratch);
+            is_linearised = true;
+        }
+        has_step = step(equations, lambda, &mut scratch.factor, last_step);
+        if has_step && has_overlap {
+            last_step.accelerate(problem, current, equations, scratch);
+        }
+        if has_step && lambda <= LAMBDA_START {
+            let expected = dot(&last_step.velocity, &equations.gradient);
+            if expected < NEGLIGIBLE_DECREASE {
+                break Termination::NegligibleDecrease;
             }
-            if steps_taken >= steps && (!is_fast || steps_taken >= MAX_STEP_FACTOR * steps) {
-                break Termination::StepLimit;
+            let is_unreachable = |decrease: f64| deviance - ABORT_FACTOR * decrease > limits.acceptance_threshold;
+            // Damping hides the decrease along ill-determined directions.
+            if rules.abort_fits && is_unreachable(expected) && is_unreachable(predicted_decrease(equations, scratch)) {
+                break Termination::OutOfReach;
             }
-            if stalled >= STALLED_STEPS {
-                break Termination::Stalled;
-            }
-            if budget.is_overrun() {
-                break Termination::OutOfWork;
-            }
-            steps_taken += 1;
-            budget.charge_step(
-                current.model.components(),
-                step_cost(problem.bases, problem.compressed, &current.model),
-            );
-            if !is_linearised {
-                equations.compute(problem, nuisances, current, scratch);
-                is_linearised = true;
-            }
-            has_step = step(equations, lambda, &mut scratch.factor, last_step);
-            if has_step && has_overlap {
-                last_step.accelerate(problem, current, equations, scratch);
-            }
-            if has_step && lambda <= LAMBDA_START {
-                let expected = dot(&last_step.velocity, &equations.gradient);
-                if expected < NEGLIGIBLE_DECREASE {
-                    break Termination::NegligibleDecrease;
-                }
-                let is_unreachable = |decrease: f64| deviance - ABORT_FACTOR * decrease > acceptance_threshold;
-                // Damping hides the decrease along ill-determined directions.
-                if rules.abort_fits
-                    && is_unreachable(expected)
-                    && is_unreachable(predicted_decrease(equations, scratch))
-                {
-                    break Termination::OutOfReach;
-                }
-            }
-            let mut is_accepted = false;
-            if has_step {
-                last_step.take(problem, nuisances.widths(), &current.model, &mut trial.model);
-                let next = trial.evaluate(problem, nuisances, scratch);
-                let decrease = deviance - next;
-                is_accepted = decrease >= 0.0;
-                if is_accepted {
-                    small_decreases = if decrease < CONVERGED_DECREASE && lambda < 1e-3 {
-                        small_decreases + 1
-                    } else {
-                        0
-                    };
-                    let is_poor_fit = rules.stop_stalled_fits && next > POOR_FIT_FACTOR * problem.compressed.data_count;
-                    is_fast = rules.extend_fast_fits && decrease > FAST_SHARE * deviance;
-                    stalled = if is_poor_fit && decrease < STALLED_SHARE * deviance {
-                        stalled + 1
-                    } else {
-                        0
-                    };
-                    deviance = next;
-                }
-            }
+        }
+        let mut is_accepted = false;
+        if has_step {
+            last_step.take(problem, nuisances.widths(), &current.model, &mut trial.model);
+            let next = trial.evaluate(problem, nuisances, scratch);
+            let decrease = deviance - next;
+            is_accepted = decrease >= 0.0;
             if is_accepted {
-                std::mem::swap(current, trial);
-                lambda = (lambda * 0.15).max(LAMBDA_FLOOR);
-                is_linearised = false;
-                end = (small_decreases >= 2).then_some(Termination::SmallDecreases);
-            } else {
-                lambda *= 4.0;
-                end = (lambda > LAMBDA_CEILING).then_some(Termination::DampingCeiling);
+                small_decreases = if decrease < CONVERGED_DECREASE && lambda < 1e-3 {
+                    small_decreases + 1
+                } else {
+                    0
+                };
+                let is_poor_fit = rules.stop_stalled_fits && next > POOR_FIT_FACTOR * problem.compressed.data_count;
+                is_fast = rules.extend_fast_fits && decrease > FAST_SHARE * deviance;
+                stalled = if is_poor_fit && decrease < STALLED_SHARE * deviance {
+                    stalled + 1
+                } else {
+                    0
+                };
+                deviance = next;
             }
-        };
-        current.store(problem, deviance, hypothesis);
-        // A fit of no steps only evaluates the deviance.
-        hypothesis.converged = termination.is_converged() || steps == 0 && hypothesis.converged;
-        Run { termination, has_step }
-    }
+        }
+        if is_accepted {
+            std::mem::swap(current, trial);
+            lambda = (lambda * 0.15).max(LAMBDA_FLOOR);
+            is_linearised = false;
+            end = (small_decreases >= 2).then_some(Termination::SmallDecreases);
+        } else {
+            lambda *= 4.0;
+            end = (lambda > LAMBDA_CEILING).then_some(Termination::DampingCeiling);
+        }
+    };
+    current.store(problem, deviance, hypothesis);
+    // A fit of no steps only evaluates the deviance.
+    hypothesis.converged = termination.is_converged() || limits.steps == 0 && hypothesis.converged;
+    Run { termination, has_step }
 }
 
 /// Whether two sources are so near that a step needs acceleration.
@@ -359,36 +340,24 @@ fn has_overlap(sources: &[PointSource]) -> bool {
     })
 }
 
-struct Linearise<'w, 'a, 'b> {
-    problem: Problem<'a>,
-    hypothesis: &'w mut Hypothesis,
-    budget: &'w mut WorkBudget<'b>,
-    workspace: &'w mut Workspace,
-}
-
-impl pulp::NullaryFnOnce for Linearise<'_, '_, '_> {
-    type Output = ();
-
-    #[inline(always)]
-    fn call(self) {
-        let Self {
-            problem,
-            hypothesis,
-            budget,
-            workspace,
-        } = self;
-        let Workspace {
-            current,
-            equations,
-            scratch,
-            ..
-        } = workspace;
-        let nuisances = hypothesis.nuisances;
-        current.load(problem, hypothesis);
-        let deviance = current.evaluate(problem, nuisances, scratch);
-        current.store(problem, deviance, hypothesis);
-        hypothesis.converged |= hypothesis.parameters() == nuisances.background_terms();
-        budget.charge(step_cost(problem.bases, problem.compressed, &current.model));
-        equations.compute(problem, nuisances, current, scratch);
-    }
+#[inline(always)]
+fn evaluate_with_equations(
+    problem: Problem,
+    hypothesis: &mut Hypothesis,
+    budget: &mut WorkBudget,
+    workspace: &mut Workspace,
+) {
+    let Workspace {
+        current,
+        equations,
+        scratch,
+        ..
+    } = workspace;
+    let nuisances = hypothesis.nuisances;
+    current.load(problem, hypothesis);
+    let deviance = current.evaluate(problem, nuisances, scratch);
+    current.store(problem, deviance, hypothesis);
+    hypothesis.converged |= hypothesis.parameters() == nuisances.background_terms();
+    budget.charge(step_cost(problem.bases, problem.compressed, &current.model));
+    equations.compute(problem, nuisances, current, scratch);
 }

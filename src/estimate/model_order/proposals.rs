@@ -2,7 +2,7 @@
 //! whether one was accepted.
 
 use crate::estimate::detect::matched_filter::Peak;
-use crate::estimate::model::hypothesis::{Hypothesis, PointSource};
+use crate::estimate::model::hypothesis::{Hypothesis, OVERLAPPING, PointSource};
 use crate::estimate::model_order::candidate::Candidate;
 use crate::estimate::model_order::search::Search;
 use crate::estimate::uncertainty::pixel_posterior::WIDE_PIXEL;
@@ -12,9 +12,7 @@ use crate::estimate::uncertainty::split_score_test::SplitProposal;
 const MAX_BIRTHS: usize = 2;
 const MAX_SPLITS: usize = 3;
 const MAX_RELOCATIONS: usize = 3;
-/// Sources within this distance, σ, are proposed to be merged.
-const MERGE_DISTANCE: f64 = 2.5;
-/// The same in pixels, where pixels are wide; the quadratic prediction of the merge is then ignored.
+/// Sources within this distance in pixels are proposed to be merged, where pixels are wide; the quadratic prediction of the merge is then ignored.
 const MERGE_PIXELS: f64 = 1.6;
 /// Merges proposed in a round: with narrow pixels, with wide ones.
 const MAX_MERGES: [usize; 2] = [3, 8];
@@ -81,9 +79,9 @@ pub(crate) fn merge(search: &mut Search, candidate: &mut Candidate) -> bool {
     let pitch = search.context.bases.pitch();
     let is_wide = search.rules().merge_wide_pixels && pitch > WIDE_PIXEL;
     let limit = if is_wide {
-        MERGE_DISTANCE.max(MERGE_PIXELS * pitch)
+        OVERLAPPING.max(MERGE_PIXELS * pitch)
     } else {
-        MERGE_DISTANCE
+        OVERLAPPING
     };
     let most = MAX_MERGES[usize::from(is_wide)];
     close_pairs(candidate, limit).into_iter().take(most).any(|(d, i, j)| {
@@ -104,7 +102,7 @@ pub(crate) fn merge_all(search: &mut Search, candidate: &mut Candidate) -> bool 
         return false;
     }
     let mut chosen: Vec<(usize, usize)> = Vec::new();
-    for (_, i, j) in close_pairs(candidate, MERGE_DISTANCE) {
+    for (_, i, j) in close_pairs(candidate, OVERLAPPING) {
         if is_disjoint(&chosen, i, j)
             && candidate.merge_deviance_rise(&mut search.context, i, j) < search.criterion.threshold()
         {

@@ -3,7 +3,7 @@
 use crate::estimate::emitter::{Emitter, Flags, SecondMomentScore};
 use crate::estimate::fit::context::FitContext;
 use crate::estimate::fit::levenberg_marquardt::linearise;
-use crate::estimate::model::hypothesis::Hypothesis;
+use crate::estimate::model::hypothesis::{Hypothesis, OVERLAPPING};
 use crate::estimate::preprocess::screening::PreprocessedFrame;
 use crate::estimate::uncertainty::covariance::{Covariance, RIDGE, condition_number};
 use crate::estimate::uncertainty::pixel_posterior;
@@ -23,8 +23,6 @@ const RESOLVED: f64 = 3.0;
 /// A source may be two where a split is predicted to decrease the deviance by this much: less than a source's penalty, so that a pair which
 /// the search leaves as one is flagged. Less would flag lone sources by chance.
 const DOUBTFUL: f64 = 10.0;
-/// Sources within this distance, σ, of an unresolved one may be displaced by it: farther off they share less than exp(−2.5²/4), a fifth, of their square.
-const INFLUENCE_DISTANCE: f64 = 2.5;
 
 /// The emitters of a hypothesis, and how well it explains the frame.
 pub(crate) struct Localised {
@@ -95,7 +93,7 @@ pub(crate) fn localise(
     let is_doubtful: Vec<bool> = (0..n).map(|i| !is_regular || is_merged(i) || may_be_two(i)).collect();
     let is_near = |i: usize, j: usize| {
         let d = [0, 1].map(|k| hypothesis.sources[i].u[k] - hypothesis.sources[j].u[k]);
-        d[0].hypot(d[1]) < INFLUENCE_DISTANCE
+        d[0].hypot(d[1]) < OVERLAPPING
     };
     let is_crowded = |i: usize| (0..n).any(|j| j != i && is_near(i, j));
     let is_quadratic: Vec<bool> = (0..n)

@@ -140,7 +140,7 @@ pub(in crate::study) struct Answer {
     /// Whether the number of emitters is right.
     pub is_right: bool,
     /// Squared error over matched pairs, both axes summed, m².
-    squared_m2: Vec<f64>,
+    pub squared_m2: Vec<f64>,
     /// The same over the bound, among resolvable emitters.
     pub ratios: Vec<f64>,
 }
