@@ -36,8 +36,6 @@ rules! {
     birth,
     /// Proposal: two halves in the place of a source, by the score test.
     split,
-    /// Proposal: a faint source moves to a residual peak.
-    relocate,
     /// Proposal: one source in the place of a close pair.
     merge,
     /// Proposal: all unresolved pairs are merged at once.

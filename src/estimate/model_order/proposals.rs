@@ -1,4 +1,4 @@
-//! Proposals that change the number of sources: birth, split, relocation, merge, death. Each tries its hypotheses in turn and returns
+//! Proposals that change the number of sources: birth, split, merge, death, relocation inside. Each tries its hypotheses in turn and returns
 //! whether one was accepted.
 
 use crate::estimate::detect::matched_filter::Peak;
@@ -8,10 +8,9 @@ use crate::estimate::model_order::search::Search;
 use crate::estimate::uncertainty::pixel_posterior::WIDE_PIXEL;
 use crate::estimate::uncertainty::split_score_test::SplitProposal;
 
-/// Peaks, splits and faintest sources that a birth, a split and a relocation try.
+/// Peaks and splits that a birth and a split try.
 const MAX_BIRTHS: usize = 2;
 const MAX_SPLITS: usize = 3;
-const MAX_RELOCATIONS: usize = 3;
 /// Sources within this distance in pixels are proposed to be merged, where pixels are wide; the quadratic prediction of the merge is then ignored.
 const MERGE_PIXELS: f64 = 1.6;
 /// Merges proposed in a round: with narrow pixels, with wide ones.
@@ -54,19 +53,6 @@ pub(crate) fn split(search: &mut Search, candidate: &mut Candidate) -> bool {
     };
     splits.iter().take(MAX_SPLITS).take_while(|s| s.gain > least).any(|s| {
         let next = split_source(candidate, s);
-        search.try_accept(candidate, next)
-    })
-}
-
-/// A faint source moves to the highest residual peak of a frame that is not explained.
-pub(crate) fn relocate(search: &mut Search, candidate: &mut Candidate, peaks: &[Peak]) -> bool {
-    if !search.rules().relocate || search.is_explained_by(candidate) {
-        return false;
-    }
-    let Some(peak) = peaks.first() else { return false };
-    faintest(candidate).into_iter().take(MAX_RELOCATIONS).any(|index| {
-        let mut next = Hypothesis::clone(candidate);
-        next.sources[index] = PointSource::new(peak.u, peak.a);
         search.try_accept(candidate, next)
     })
 }

@@ -7,9 +7,7 @@ use crate::estimate::model::hypothesis::{Hypothesis, Nuisances};
 use crate::estimate::model_order::candidate::Candidate;
 use crate::estimate::model_order::map_search::{balance_pair, divide, explore_ill_determined, unite};
 use crate::estimate::model_order::power_prior::PowerPrior;
-use crate::estimate::model_order::proposals::{
-    birth, death, merge, merge_all, merge_pairs, relocate, relocate_inside, split,
-};
+use crate::estimate::model_order::proposals::{birth, death, merge, merge_all, merge_pairs, relocate_inside, split};
 use crate::estimate::model_order::search::Search;
 use crate::estimate::rules::Rules;
 use crate::estimate::test_frame::{Shown, hypothesis};
@@ -116,23 +114,6 @@ fn merge_all_merges_two_unresolved_pairs_at_once_and_leaves_one_to_merge() {
     assert_near(&found, &sources.map(|(u, _)| u), NEAR);
     let (is_accepted, found) = propose_from("merge_all", &showing(&sources), &halves[1..], 0, merge_all);
     assert!(!is_accepted && found.sources.len() == 3, "one pair alone");
-}
-
-#[test]
-fn relocate_moves_a_faint_source_to_the_residual_peak() {
-    let sources = [([-2.0, 1.0], ENERGY), ([2.0, -1.5], ENERGY)];
-    let peaks_and_relocate = |search: &mut Search, candidate: &mut Candidate| {
-        let peaks = search.residual_peaks(candidate);
-        relocate(search, candidate, &peaks)
-    };
-    // Without steps the second source stays where there is no light.
-    let places = [[-2.0, 1.0], [-3.5, -3.5]];
-    let (is_accepted, found) = propose_from("relocate", &showing(&sources), &places, 0, peaks_and_relocate);
-    assert!(is_accepted);
-    assert_near(&found, &sources.map(|(u, _)| u), NEAR);
-    let lone = &sources[..1];
-    let (is_accepted, _) = propose_from("relocate", &showing(lone), &places, 0, peaks_and_relocate);
-    assert!(!is_accepted, "an explained frame keeps its sources");
 }
 
 #[test]
