@@ -44,8 +44,6 @@ rules! {
     death,
     /// Proposal: a source beyond the sensor's edge moves inside and another one is removed.
     relocate_inside,
-    /// Where pixels are wide, pairs are merged within a distance in pixels and whatever the quadratic prediction says.
-    merge_wide_pixels,
     /// `map`, proposal: several users in the place of one source that has the light of several.
     divide,
     /// `map`, proposal: the light of a pair is divided evenly among as many users as it is of.
