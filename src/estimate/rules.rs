@@ -48,8 +48,6 @@ rules! {
     divide,
     /// `map`, proposal: the light of a pair is divided evenly among as many users as it is of.
     balance_pairs,
-    /// `map`, proposal: one source in the place of a pair, where there are more sources than users' light.
-    unite,
     /// `map`: fits with tight energy priors and from positions displaced along the ill-determined directions.
     explore_ill_determined,
     /// `map`: the mean along the least determined direction is reported instead of the mode.

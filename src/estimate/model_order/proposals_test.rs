@@ -5,7 +5,7 @@ use crate::estimate::fit::levenberg_marquardt::fit;
 use crate::estimate::fit::work_budget::WorkBudget;
 use crate::estimate::model::hypothesis::{Hypothesis, Nuisances};
 use crate::estimate::model_order::candidate::Candidate;
-use crate::estimate::model_order::map_search::{balance_pair, divide, explore_ill_determined, unite};
+use crate::estimate::model_order::map_search::{balance_pair, divide, explore_ill_determined};
 use crate::estimate::model_order::power_prior::PowerPrior;
 use crate::estimate::model_order::proposals::{birth, death, merge, merge_all, merge_pairs, relocate_inside, split};
 use crate::estimate::model_order::search::Search;
@@ -186,14 +186,6 @@ fn divide_finds_two_users_in_a_spot_of_twice_the_light() {
     assert!(is_accepted && found.sources.len() == 2, "{:?}", found.sources);
     assert!(found.sources.iter().all(|s| s.power.is_some()), "both are users");
     assert!(!with_known_power(&showing(&users(&[[0.0, 0.0]])), &[[0.0, 0.0]], divide).0);
-}
-
-#[test]
-fn unite_leaves_one_source_where_there_is_the_light_of_one_user() {
-    let sources = users(&[[0.3, 0.0]]);
-    let (is_accepted, found) = with_known_power(&showing(&sources), &[[-0.2, 0.0], [0.8, 0.0]], unite);
-    assert!(is_accepted);
-    assert_near(&found, &[sources[0].0], 0.05);
 }
 
 #[test]
