@@ -19,7 +19,7 @@ const SPACING: [f64; 2] = [0.1, 0.8];
 const MAX_PARTS: usize = 4;
 /// Second moment, σ², of a divided source's parts where the frame says nothing of it.
 const TYPICAL_MOMENT: f64 = 1.0;
-/// The total light may differ from that of one user per source by this many users before divisions or unions are proposed.
+/// The total light may differ from that of one user per source by this many users before any source is proposed to be divided.
 const MAX_SURPLUS: f64 = 0.4;
 /// Brightest sources divided in a round, and pairs tried in a round.
 const MAX_DIVISIONS: usize = 6;
@@ -51,9 +51,6 @@ pub(crate) fn maximum_posterior(search: &mut Search, prior: &PowerPrior, hypothe
         }
         if rules.balance_pairs {
             balance_pair(search, prior, &mut candidate);
-        }
-        if rules.unite {
-            unite(search, prior, &mut candidate);
         }
         shrink(search, &mut candidate);
         grow(search, &mut candidate);
@@ -164,18 +161,6 @@ pub(crate) fn balance_pair(search: &mut Search, prior: &PowerPrior, candidate: &
             next.sources.extend(divide_source(united, parts, direction, moment));
             search.try_accept(candidate, next)
         })
-    })
-}
-
-/// One source in the place of a pair, where there are more sources than users' light.
-pub(crate) fn unite(search: &mut Search, prior: &PowerPrior, candidate: &mut Candidate) -> bool {
-    if source_surplus(prior, candidate) > -MAX_SURPLUS {
-        return false;
-    }
-    let pairs = close_pairs(candidate, INDEPENDENT);
-    pairs.into_iter().take(MAX_PAIRS).any(|(_, i, j)| {
-        let next = merge_pairs(candidate, &[(i, j)]);
-        search.try_accept(candidate, next)
     })
 }
 

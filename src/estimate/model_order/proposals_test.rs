@@ -5,11 +5,9 @@ use crate::estimate::fit::levenberg_marquardt::fit;
 use crate::estimate::fit::work_budget::WorkBudget;
 use crate::estimate::model::hypothesis::{Hypothesis, Nuisances};
 use crate::estimate::model_order::candidate::Candidate;
-use crate::estimate::model_order::map_search::{balance_pair, divide, explore_ill_determined, unite};
+use crate::estimate::model_order::map_search::{balance_pair, divide, explore_ill_determined};
 use crate::estimate::model_order::power_prior::PowerPrior;
-use crate::estimate::model_order::proposals::{
-    birth, death, merge, merge_all, merge_pairs, relocate, relocate_inside, split,
-};
+use crate::estimate::model_order::proposals::{birth, death, merge, merge_all, merge_pairs, relocate_inside, split};
 use crate::estimate::model_order::search::Search;
 use crate::estimate::rules::Rules;
 use crate::estimate::test_frame::{Shown, hypothesis};
@@ -119,23 +117,6 @@ fn merge_all_merges_two_unresolved_pairs_at_once_and_leaves_one_to_merge() {
 }
 
 #[test]
-fn relocate_moves_a_faint_source_to_the_residual_peak() {
-    let sources = [([-2.0, 1.0], ENERGY), ([2.0, -1.5], ENERGY)];
-    let peaks_and_relocate = |search: &mut Search, candidate: &mut Candidate| {
-        let peaks = search.residual_peaks(candidate);
-        relocate(search, candidate, &peaks)
-    };
-    // Without steps the second source stays where there is no light.
-    let places = [[-2.0, 1.0], [-3.5, -3.5]];
-    let (is_accepted, found) = propose_from("relocate", &showing(&sources), &places, 0, peaks_and_relocate);
-    assert!(is_accepted);
-    assert_near(&found, &sources.map(|(u, _)| u), NEAR);
-    let lone = &sources[..1];
-    let (is_accepted, _) = propose_from("relocate", &showing(lone), &places, 0, peaks_and_relocate);
-    assert!(!is_accepted, "an explained frame keeps its sources");
-}
-
-#[test]
 fn death_removes_a_source_of_no_light() {
     let lone = [([-2.0, 1.0], ENERGY)];
     let (is_accepted, found) = propose("death", &showing(&lone), &[[-2.0, 1.0], [3.0, -2.0]], death);
@@ -205,14 +186,6 @@ fn divide_finds_two_users_in_a_spot_of_twice_the_light() {
     assert!(is_accepted && found.sources.len() == 2, "{:?}", found.sources);
     assert!(found.sources.iter().all(|s| s.power.is_some()), "both are users");
     assert!(!with_known_power(&showing(&users(&[[0.0, 0.0]])), &[[0.0, 0.0]], divide).0);
-}
-
-#[test]
-fn unite_leaves_one_source_where_there_is_the_light_of_one_user() {
-    let sources = users(&[[0.3, 0.0]]);
-    let (is_accepted, found) = with_known_power(&showing(&sources), &[[-0.2, 0.0], [0.8, 0.0]], unite);
-    assert!(is_accepted);
-    assert_near(&found, &[sources[0].0], 0.05);
 }
 
 #[test]
