@@ -41,7 +41,13 @@ pub mod study;
 #[allow(clippy::disallowed_methods, reason = "progress and latencies are shown to people")]
 pub mod cli;
 pub mod config;
-#[allow(clippy::disallowed_methods, reason = "it lives in the present and hands the time down")]
+#[allow(
+    clippy::disallowed_methods,
+    reason = "it lives in the present and hands the time down"
+)]
 pub mod daemon;
-#[allow(clippy::disallowed_methods, reason = "a stage's time is a metric and decides nothing")]
+#[allow(
+    clippy::disallowed_methods,
+    reason = "a stage's time is a metric and decides nothing"
+)]
 pub mod pipeline;
