@@ -70,6 +70,8 @@ rules! {
     abort_fits,
     /// A poor fit ends after a few steps that hardly improve it.
     stop_stalled_fits,
+    /// A fit exceeds its number of steps while each improves it much.
+    extend_fast_fits,
     /// Groups of sources that no longer move are fitted no further.
     source_groups,
 }

@@ -9,7 +9,9 @@ use rand_distr::{Distribution, StandardNormal};
 use crate::estimate::dense_linalg::dot;
 use crate::estimate::fit::context::FitContext;
 use crate::estimate::fit::evaluation::Evaluation;
-use crate::estimate::fit::levenberg_marquardt::{JOINT_STEPS, Termination, evaluate, fit, fit_below, linearise};
+use crate::estimate::fit::levenberg_marquardt::{
+    JOINT_STEPS, MAX_STEP_FACTOR, Termination, evaluate, fit, fit_below, linearise,
+};
 use crate::estimate::fit::problem::Problem;
 use crate::estimate::fit::work_budget::WorkBudget;
 use crate::estimate::fit::workspace::Workspace;
@@ -79,7 +81,7 @@ proptest! {
         // The reported deviance is that of the reported parameters.
         evaluate(&mut context, &mut hypothesis);
         prop_assert!((hypothesis.deviance - after).abs() <= 1e-9 * (1.0 + before.abs()), "{} is said to be {after}", hypothesis.deviance);
-        prop_assert!(budget.steps <= (steps + JOINT_STEPS) as u64);
+        prop_assert!(budget.steps <= (MAX_STEP_FACTOR * (steps + JOINT_STEPS)) as u64);
     }
 }
 
@@ -261,8 +263,20 @@ fn a_fit_says_why_it_ended() {
         (at.sources[0].u[0] - 0.3).abs() < 0.02 && (at.sources[0].a - 1e3).abs() < 20.0,
         "{at:?}"
     );
-    let (end, at, steps) = end_of(&one, &[[2.0, 1.0]], 1, open, 0.0, all);
+    let (end, at, steps) = end_of(
+        &one,
+        &[[2.0, 1.0]],
+        1,
+        open,
+        0.0,
+        Rules::without("extend_fast_fits").expect("a rule"),
+    );
     assert_eq!((end, at.converged, steps), (Termination::StepLimit, false, 1));
+    let (end, _, steps) = end_of(&one, &[[2.0, 1.0]], 1, open, 0.0, all);
+    assert!(
+        end != Termination::StepLimit || steps > 1,
+        "each step is large: {end:?} after {steps}"
+    );
     let (end, at, _) = end_of(&one, &[[1.0, 0.0]], 20, -1e9, 0.0, all);
     assert_eq!((end, at.converged), (Termination::OutOfReach, false));
     let (end, at, steps) = end_of(&one, &[[1.0, 0.0]], 20, open, 1e12, all);

@@ -42,6 +42,10 @@ const POOR_FIT_FACTOR: f64 = 100.0;
 /// bend of a valley.
 const STALLED_SHARE: f64 = 1e-2;
 const STALLED_STEPS: usize = 3;
+/// A fit exceeds its number of steps, up to `MAX_STEP_FACTOR` times, while each decreases the deviance by more than this share: a start far
+/// off would otherwise be compared before it has arrived.
+const FAST_SHARE: f64 = 0.2;
+pub(crate) const MAX_STEP_FACTOR: usize = 8;
 /// Steps of all sources together before only the groups that still move are fitted, and how often that is tried: after the first step every
 /// group moves, after many there is nothing left to save.
 pub(crate) const JOINT_STEPS: usize = 2;
@@ -86,6 +90,7 @@ impl Termination {
 /// How far a fit may go.
 #[derive(Clone, Copy)]
 struct Limits {
+    /// Most steps, and up to [`MAX_STEP_FACTOR`] times as many while each is large.
     steps: usize,
     /// The fit is aborted as soon as a deviance below this is out of reach.
     acceptance_threshold: f64,
@@ -98,7 +103,7 @@ pub(crate) struct Linearisation<'w> {
     pub scratch: &'w mut Scratch,
 }
 
-/// Fits `hypothesis` from where it stands, at most `steps` steps.
+/// Fits `hypothesis` from where it stands, at most `steps` steps, and up to [`MAX_STEP_FACTOR`] times as many while each is large.
 pub(crate) fn fit(context: &mut FitContext, hypothesis: &mut Hypothesis, steps: usize) -> Termination {
     fit_below(context, hypothesis, steps, f64::INFINITY)
 }
@@ -246,6 +251,7 @@ fn iterate(
     let mut lambda = LAMBDA_START;
     let mut small_decreases = 0;
     let mut is_linearised = false;
+    let mut is_fast = false;
     let mut stalled = 0;
     let mut has_step = false;
     let mut steps_taken = 0;
@@ -254,7 +260,7 @@ fn iterate(
         if let Some(reason) = end {
             break reason;
         }
-        if steps_taken >= limits.steps {
+        if steps_taken >= limits.steps && (!is_fast || steps_taken >= MAX_STEP_FACTOR * limits.steps) {
             break Termination::StepLimit;
         }
         if stalled >= STALLED_STEPS {
@@ -300,6 +306,7 @@ fn iterate(
                     0
                 };
                 let is_poor_fit = rules.stop_stalled_fits && next > POOR_FIT_FACTOR * problem.compressed.data_count;
+                is_fast = rules.extend_fast_fits && decrease > FAST_SHARE * deviance;
                 stalled = if is_poor_fit && decrease < STALLED_SHARE * deviance {
                     stalled + 1
                 } else {
