@@ -20,7 +20,7 @@ pub struct Args {
     /// Estimator to test; the default one when left out
     #[arg(long, value_name = "NAME")]
     estimator: Option<String>,
-    /// Leave out this rule of `ml` and `map`: which cases need it
+    /// Leave out this rule of the estimator: which cases need it
     #[arg(long, value_name = "RULE", value_parser = clap::builder::PossibleValuesParser::new(Rules::NAMES))]
     without: Option<String>,
     /// Only cases whose group or name contains this

@@ -29,7 +29,7 @@ pub struct Args {
     /// Only these estimators, as "pencil,ml"
     #[arg(long, alias = "rungs", value_name = "NAME", value_delimiter = ',')]
     estimators: Vec<String>,
-    /// What each of these rules of `ml` and `map` gains and costs, measured with and without it; `all` takes each in turn
+    /// What each of these rules gains and costs, measured with and without it; `all` takes each in turn
     #[arg(long, value_name = "RULE", value_delimiter = ',')]
     without: Vec<String>,
     /// Folder of trained networks with their cards: `network` and `hybrid` are measured with each where it was trained
@@ -52,7 +52,11 @@ pub fn run(args: Args) -> Outcome {
     if args.oracle {
         return oracle(&args);
     }
-    let mut plan = if args.quick { Plan::quick() } else { Plan::full() };
+    let mut plan = match (args.quick, args.without.is_empty()) {
+        (true, _) => Plan::quick(),
+        (false, true) => Plan::full(),
+        (false, false) => Plan::ablation(),
+    };
     if let Some(frames) = args.frames {
         plan.frames = frames.max(1);
     }
@@ -120,7 +124,7 @@ fn oracle(args: &Args) -> Outcome {
 }
 
 /// Estimators with rules to leave out.
-const RULED: [&str; 2] = ["ml", "map"];
+const RULED: [&str; 6] = ["peak-fit", "greedy-fit", "pencil", "pencil-fit", "ml", "map"];
 
 fn ablate(plan: &Plan, args: &Args) -> Outcome {
     let is_wanted = |rule: &&&str| args.without.iter().any(|name| name == "all" || name == **rule);

@@ -26,6 +26,9 @@ pub enum Condition {
     Dead,
     /// One pixel in a hundred is off by a normal variate of thirty times the noise, another one in every frame.
     Spikes,
+    /// Every pixel's gain is off by a normal variate of a hundredth, another one in every frame. The bound knows the gains: r is far above
+    /// 1. Only [`super::Plan::ablation`] asks for it.
+    Gains,
 }
 
 const WIDER: f64 = 1.05;
@@ -36,6 +39,7 @@ const HEADROOM: f64 = 2.0;
 const CLIP: f64 = 0.6;
 const DEAD: f64 = 0.01;
 const SPIKE: f64 = 30.0;
+const GAIN: f64 = 0.01;
 
 impl Condition {
     pub const ALL: [Self; 7] = [
@@ -57,6 +61,7 @@ impl Condition {
             Self::Saturated => "saturated",
             Self::Dead => "dead",
             Self::Spikes => "spikes",
+            Self::Gains => "gains",
         }
     }
 
@@ -147,6 +152,12 @@ impl Condition {
                         *pixel += SPIKE * truth.noise_std_j * spike;
                         *bad = true;
                     }
+                }
+            }
+            Some(Self::Gains) => {
+                for pixel in pixels.iter_mut() {
+                    let gain: f64 = StandardNormal.sample(rng);
+                    *pixel *= 1.0 + GAIN * gain;
                 }
             }
         }

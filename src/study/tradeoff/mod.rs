@@ -54,12 +54,7 @@ impl Plan {
             cells.push(Cell::new(Noise::Energy, 1.0, 100).holding(emitters));
         }
         for condition in Condition::ALL {
-            let cells_of = [
-                Cell::new(Noise::Energy, 2.0, 64),
-                Cell::new(Noise::Energy, 4.0, 20),
-                Cell::new(Noise::Paper, 8.0, 60),
-            ];
-            cells.extend(cells_of.map(|c| c.under(condition)));
+            cells.extend(cells_under(condition));
         }
         Self {
             cells,
@@ -68,6 +63,13 @@ impl Plan {
             frames: 250,
             seed: 1,
         }
+    }
+
+    /// [`Plan::full`], and cells whose noise grows with the light, which some of the estimators' rules are for.
+    pub fn ablation() -> Self {
+        let mut plan = Self::full();
+        plan.cells.extend(cells_under(Condition::Gains));
+        plan
     }
 
     /// Few cells and frames, under a minute.
@@ -106,6 +108,15 @@ impl Plan {
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
+}
+
+fn cells_under(condition: Condition) -> [Cell; 3] {
+    let cells = [
+        Cell::new(Noise::Energy, 2.0, 64),
+        Cell::new(Noise::Energy, 4.0, 20),
+        Cell::new(Noise::Paper, 8.0, 60),
+    ];
+    cells.map(|c| c.under(condition))
 }
 
 fn names() -> Vec<&'static str> {
