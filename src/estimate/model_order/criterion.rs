@@ -4,9 +4,10 @@ use crate::estimate::model::bases::Bases;
 use crate::estimate::model::hypothesis::{Hypothesis, Width};
 use crate::estimate::model_order::power_prior::PowerPrior;
 
-/// Least decrease of the deviance for a nuisance parameter.
+/// Least decrease of the deviance for a nuisance parameter: the 97.5 % point of χ² with one degree of freedom, as each is tested once.
 pub(crate) const NUISANCE_PENALTY: f64 = 5.0;
-/// Slack on the acceptance bound for the unknown evidence term.
+/// Slack on the acceptance bound for the unknown evidence term: larger fits hopeless candidates further, smaller aborts some that the
+/// evidence would have accepted.
 const ACCEPTANCE_SLACK: f64 = 30.0;
 
 /// −2 ln of a hypothesis's likelihood with the penalties of its sources and nuisances, or of its posterior probability.

@@ -12,13 +12,14 @@ use crate::estimate::model_order::search::Search;
 use crate::estimate::preprocess::noise_variance::VarianceFunction;
 use crate::estimate::preprocess::screening::PreprocessedFrame;
 
-/// Extra emitters accepted before testing a background or width.
+/// Extra emitters accepted before testing a background or width: a background brings several peaks at once, and the test costs three fits.
 const ACCEPTED_EXTRA: usize = 2;
-/// Steps of a fit from the pencil's positions.
+/// Steps of a fit from the pencil's positions; overlapping sources take many, and the count with the best fit is kept.
 const PENCIL_FIT_STEPS: usize = 100;
-/// Peaks below this share of the highest one wait for the next round.
+/// Peaks below this share of the highest one wait for the next round: what an imperfect fit leaves around a bright source would pass for
+/// faint ones.
 const STRONG_PEAK: f64 = 0.1;
-/// A rival that leaves less than this share of the deviance is no sign of noise that grows with the light.
+/// A rival that leaves less than this share of the deviance is no sign of noise that grows with the light: sources explain it.
 const RIVAL_SHARE: f64 = 0.5;
 /// The share of standard normal noise below −1.
 const BELOW_ONE: f64 = 0.1587;

@@ -12,23 +12,26 @@ use crate::estimate::uncertainty::ill_determined::{ill_determined_direction, pos
 
 /// Rounds of proposals.
 const ROUNDS: usize = 6;
-/// A source of this many times a known energy is proposed to be divided.
+/// A source of this many times a known energy is proposed to be divided: half-way to two users on a logarithmic scale.
 const MIN_MULTIPLE: f64 = 1.4;
-/// Least and largest spacing of a divided source's parts, σ, and most parts.
+/// Least and largest spacing of a divided source's parts, σ (parts farther apart than the largest are resolved without a prior), and most
+/// parts.
 const SPACING: [f64; 2] = [0.1, 0.8];
 const MAX_PARTS: usize = 4;
 /// Second moment, σ², of a divided source's parts where the frame says nothing of it.
 const TYPICAL_MOMENT: f64 = 1.0;
-/// The total light may differ from that of one user per source by this many users before any source is proposed to be divided.
+/// The total light may differ from that of one user per source by this many users before any source is proposed to be divided: four
+/// standard deviations of one user's energy.
 const MAX_SURPLUS: f64 = 0.4;
-/// Brightest sources divided in a round, and pairs tried in a round.
+/// Brightest sources divided in a round, and pairs tried in a round; each costs a fit or three.
 const MAX_DIVISIONS: usize = 6;
 const MAX_PAIRS: usize = 6;
-/// Factors on the energy priors' precision, one fit each.
+/// Factors on the energy priors' precision, one fit each: the first holds the energies, the last lets them go.
 const TIGHTNESS: [f64; 2] = [100.0, 10.0];
 /// Sources within this distance, σ, are first fitted with a tight prior.
 const OVERLAP_DISTANCE: f64 = 2.0;
-/// Ill-determined directions that are searched, the distances in standard deviations, and the largest distance in σ.
+/// Ill-determined directions that are searched, the distances in standard deviations, and the largest distance in σ, beyond which the
+/// quadratic model says nothing. Further directions and starts were tried and gain nothing.
 const DIRECTIONS: usize = 2;
 const DISTANCES: [f64; 4] = [-2.0, 2.0, -5.0, 5.0];
 const MAX_DISTANCE: f64 = 1.0;

@@ -12,11 +12,11 @@ use crate::estimate::model_order::pruning::prune_spurious;
 use crate::estimate::model_order::refine::refine;
 use crate::estimate::model_order::search::Search;
 
-/// Misfit in standard deviations from which nuisances are tried.
+/// Misfit in standard deviations from which nuisances are tried; twice that of an explained frame, so that no honest frame pays.
 const MISFIT_DEVIATIONS: f64 = 5.0;
-/// Overlapping sources above this number are first tested for nuisances.
+/// Overlapping sources above this number are first tested for nuisances: refining so many costs more than the test.
 const MAX_CLUSTER: usize = 10;
-/// Share of the work that is left for the last refinement.
+/// Share of the work that is left for the last refinement, whatever the search for nuisances has spent.
 const LAST_SHARE: f64 = 0.3;
 
 /// The hypothesis that scores best, from an initial one. Nuisances are fitted only where the frame cannot be explained without, and then

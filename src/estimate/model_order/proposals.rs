@@ -7,25 +7,29 @@ use crate::estimate::model_order::candidate::Candidate;
 use crate::estimate::model_order::search::Search;
 use crate::estimate::uncertainty::split_score_test::SplitProposal;
 
-/// Peaks and splits that a birth and a split try.
+/// Peaks and splits that a birth and a split try, the most promising first: each costs a fit, and the next round tries anew.
 const MAX_BIRTHS: usize = 2;
 const MAX_SPLITS: usize = 3;
-/// Merges proposed in a round.
+/// Merges proposed in a round, the nearest pairs first.
 const MAX_MERGES: usize = 3;
-/// Within this distance, σ, the quadratic prediction of a merge is unreliable and ignored.
+/// Within this distance, σ, the quadratic prediction of a merge is unreliable and ignored: the covariance of such a pair is rounding's.
 const UNRELIABLE_DISTANCE: f64 = 0.15;
-/// Predicted rise of the deviance, in source penalties, beyond which a merge is not tried.
+/// Predicted rise of the deviance, in source penalties, beyond which a merge is not tried: far above 1, since damping hides
+/// narrow valleys from the prediction (P1/64).
 const HOPELESS_MERGE: f64 = 8.0;
-/// Distance from the edge, σ, of a source that is relocated inside.
+/// Distance from the edge, σ, of a source that is relocated inside: nearer, the fit leads it back out.
 const INSET: f64 = 1.0;
-/// Removal candidates, the faintest first, when an off-sensor source moves inside.
+/// Removal candidates, the faintest first, when an off-sensor source moves inside; each costs a fit.
 const REMOVAL_CANDIDATES: usize = 3;
-/// Deaths proposed in a round, and Wald's statistic, in source penalties, below which a source may be removed.
+/// Deaths proposed in a round, and Wald's statistic, in source penalties, below which a source may be removed: other sources take up a part
+/// of its light, so that the deviance rises by less than the statistic of a lone one predicts.
 const MAX_DEATHS: usize = 6;
 const MORTAL: f64 = 4.0;
-/// Predicted gain, in source penalties, from which a split is proposed though the frame is explained.
+/// Predicted gain, in source penalties, from which a split is proposed though the frame is explained: the second-order prediction is some
+/// 20 % off (see its test), and a gain below the penalty is rejected after the fit.
 const LIKELY_SPLIT: f64 = 0.6;
-/// Least and largest distance of a split's halves from the source, σ.
+/// Least and largest distance of a split's halves from the source, σ: nearer, they are no two sources to the fit; the score sees only the
+/// second moment, which says little beyond.
 const SPLIT_DISTANCE: [f64; 2] = [0.4, 1.0];
 
 /// A source at a residual peak.

@@ -19,13 +19,15 @@ use crate::estimate::preprocess::noise_variance::VarianceFunction;
 use crate::estimate::preprocess::screening::PreprocessedFrame;
 use crate::estimate::rules::Rules;
 
-/// Steps of a candidate's fit before it is compared.
+/// Steps of a candidate's fit before it is compared: few, as most candidates are rejected; those accepted converge later.
 pub(crate) const TRIAL_STEPS: usize = 30;
-/// Steps of the last fit before a hypothesis is reported.
+/// Steps of the last fit before a hypothesis is reported; curved valleys of overlapping sources take many.
 const CONVERGE_STEPS: usize = 200;
-/// A source is first assigned to a user unless −2 ln probability rises by more than this.
+/// A source is first assigned to a user unless −2 ln probability rises by more than this: a start's energies are off by eight standard
+/// deviations at most, and what is wrong is corrected after the fit.
 pub(crate) const ASSIGNMENT_SLACK: f64 = 60.0;
-/// Largest masked fraction for which the matrix pencil and rotated ellipses are used: the pencil sees the fill values.
+/// Largest masked fraction for which the matrix pencil and rotated ellipses are used: the pencil sees the fill values. Above
+/// the share of dead pixels of the trade-off's cells, 1 %, where the pencil is as good as without.
 const MAX_MASKED_SHARE: f64 = 0.03;
 
 /// What searches of one frame after another share: the bases, the detectors made for them, scratch memory.
