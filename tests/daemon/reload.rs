@@ -120,8 +120,10 @@ fn a_reload_changes_claims_monitor_and_webhooks_and_keeps_the_rest() {
     );
     assert_eq!(daemon.post("/v1/webhooks/comes/test", "").0, 429, "once in a while");
     assert_eq!(daemon.post("/v1/webhooks/goes/test", "").0, 404, "configured ones only");
-    let (_, audit) = daemon.get("/v1/audit");
-    assert!(audit.contains("webhook.test"), "{audit}");
+    // Audit records are on disk a moment after the answer.
+    daemon.wait_for("/v1/audit", "the test in the audit log", |v| {
+        v.to_string().contains("webhook.test")
+    });
 
     daemon.signal("-TERM");
     let (code, log) = daemon.end();
