@@ -1,4 +1,4 @@
-//! A frame of nine emitters, at 64×64 and 100×100, separated and melted: each stage, and the whole by every rung of the ladder.
+//! A frame of nine emitters, at 64×64 and 100×100, separated and overlapping: each stage, and the whole by every estimator.
 
 mod timing;
 
@@ -57,13 +57,13 @@ fn main() {
             let (frame, places) = frame(&camera);
             let group = format!("{spots}/{pixels}");
             stages(&group, &camera, &frame, &places);
-            for rung in ESTIMATORS {
+            for spec in ESTIMATORS {
                 let config = Config {
-                    name: Some(rung.name.to_owned()),
+                    name: Some(spec.name.to_owned()),
                     ..Default::default()
                 };
-                let mut estimator = build(&config, &camera).expect("a rung of the ladder");
-                time(&format!("{group} {}", rung.name), || estimator.estimate(&frame));
+                let mut estimator = build(&config, &camera).expect("an estimator of the list");
+                time(&format!("{group} {}", spec.name), || estimator.estimate(&frame));
             }
         }
     }

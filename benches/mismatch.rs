@@ -8,7 +8,7 @@ use oapwatch::estimate::{Config, build};
 use oapwatch::scene::{Plan, Scene};
 
 const SCENE: &str = include_str!("../training/scenes/energy-1mm.toml");
-const RUNGS: [&str; 3] = ["network", "hybrid", "ml"];
+const ESTIMATORS: [&str; 3] = ["network", "hybrid", "ml"];
 const SEED: u64 = 11;
 const CUTOFF_M: f64 = 25.0;
 
@@ -73,19 +73,19 @@ fn main() {
     let nominal: Scene = toml::from_str(SCENE).expect("the scene is part of the repository");
     let camera = nominal.optics.camera().expect("valid optics");
     println!("{frames} frames of 5 to 9 emitters, σ_eff 1 mm, 1 µJ, 64 × 64 pixels, seed {SEED}.\n");
-    println!("| mismatch | rung | median m² | mean m² | missed | invented | N right | OSPA m | median ms |");
+    println!("| mismatch | estimator | median m² | mean m² | missed | invented | N right | OSPA m | median ms |");
     println!("|---|---|---|---|---|---|---|---|---|");
     for mismatch in &MISMATCHES {
         let mut scene: Scene = toml::from_str(&format!("{SCENE}\n{}", mismatch.effects)).expect("a valid scene");
         scene.optics.spot_sigma_m = Some(mismatch.spot_sigma_m);
         let plan = Plan::compile(&scene, SEED).expect("a valid scene");
         let frames = plan.frames(0, frames);
-        for rung in RUNGS {
+        for name in ESTIMATORS {
             let config = Config {
-                name: Some(rung.to_owned()),
+                name: Some(name.to_owned()),
                 ..Default::default()
             };
-            let mut estimator = build(&config, &camera).expect("a rung of the ladder");
+            let mut estimator = build(&config, &camera).expect("an estimator of the list");
             let (mut squared, mut times) = (Vec::new(), Vec::new());
             let (mut missed, mut invented, mut right, mut emitters, mut distance) = (0, 0, 0, 0, 0.0);
             for simulated in &frames {
@@ -110,7 +110,7 @@ fn main() {
             times.sort_by(f64::total_cmp);
             let share = |n: usize, of: usize| 100.0 * n as f64 / of as f64;
             println!(
-                "| {} | {rung} | {:.2e} | {:.2e} | {:.1} % | {:.1} % | {:.0} % | {:.3} | {:.1} |",
+                "| {} | {name} | {:.2e} | {:.2e} | {:.1} % | {:.1} % | {:.0} % | {:.3} | {:.1} |",
                 mismatch.name,
                 squared[squared.len() / 2],
                 squared.iter().sum::<f64>() / squared.len() as f64,

@@ -115,8 +115,8 @@ def frames_of(program, folder, sigma_m, n, noise, frames):
     return np.load(folder / "frames.npy").astype(float), truth
 
 
-def oapwatch(program, folder, rung):
-    arguments = ["locate", "--config", folder / "config.toml", "--estimator", rung, folder / "frames.npy"]
+def oapwatch(program, folder, estimator):
+    arguments = ["locate", "--config", folder / "config.toml", "--estimator", estimator, folder / "frames.npy"]
     output = subprocess.run([program, *arguments], check=True, capture_output=True, text=True).stdout
     lines = [json.loads(line) for line in output.splitlines()]
     found = [np.array([[e["x_m"], e["y_m"]] for e in line["emitters"]]).reshape(-1, 2) for line in lines]
@@ -149,9 +149,9 @@ def main():
             print("| program | median m² | over ml's | N right | µs a frame | over ml's |\n|---|---|---|---|---|---|")
             found, times = oapwatch(program, folder, "ml")
             best = row("oapwatch `ml`", found, truth, times)
-            for rung in ("greedy-fit", "peak-fit"):
-                found, times = oapwatch(program, folder, rung)
-                row(f"oapwatch `{rung}`", found, truth, times, best)
+            for estimator in ("greedy-fit", "peak-fit"):
+                found, times = oapwatch(program, folder, estimator)
+                row(f"oapwatch `{estimator}`", found, truth, times, best)
             sigma = sigma_m / SIDE_M * n
             for name, make in (
                 ("photutils, iterative PSF fit", photutils_fit),

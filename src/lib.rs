@@ -5,6 +5,8 @@
 //! ARCHITECTURE.md has the map.
 // frames/v4l2/sys alone allows it, for ioctls and mapped memory, with the reason at each place.
 #![deny(unsafe_code)]
+// No clock is read but where an exception says why.
+#![warn(clippy::disallowed_methods)]
 #![cfg_attr(not(test), warn(unused_crate_dependencies))]
 
 // The program's allocator, set in main.rs.
@@ -29,12 +31,23 @@ pub mod frames;
 
 pub mod monitor;
 
+#[allow(clippy::disallowed_methods, reason = "requests have deadlines and are dated")]
 pub mod api;
 pub mod journal;
 pub mod notify;
+#[allow(clippy::disallowed_methods, reason = "the time of an estimate is a result")]
 pub mod study;
 
+#[allow(clippy::disallowed_methods, reason = "progress and latencies are shown to people")]
 pub mod cli;
 pub mod config;
+#[allow(
+    clippy::disallowed_methods,
+    reason = "it lives in the present and hands the time down"
+)]
 pub mod daemon;
+#[allow(
+    clippy::disallowed_methods,
+    reason = "a stage's time is a metric and decides nothing"
+)]
 pub mod pipeline;

@@ -60,7 +60,7 @@ impl Pipeline {
         Ok(Self {
             estimator: estimate::build(&config.estimator, camera)?,
             budget: config.estimator.budget(),
-            saturation_j: camera.saturation_j.unwrap_or(f64::INFINITY),
+            saturation_j: camera.saturation_limit_j(),
             claims: Store::new(&config.claims),
             monitor: Monitor::new(&config.monitor, &config.claims, camera, source),
         })
@@ -68,6 +68,12 @@ impl Pipeline {
 
     pub fn estimator(&self) -> &'static str {
         self.estimator.name()
+    }
+
+    /// Goes on with other settings for claims and monitor; users, tracks and alerts stay.
+    pub fn reconfigure(&mut self, monitor: &monitor::Config, claims: &claims::Config) {
+        self.monitor.reconfigure(monitor, claims);
+        self.claims.reconfigure(claims);
     }
 
     /// Takes claims that came in at `now`, the frames' clock.

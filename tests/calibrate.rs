@@ -1,201 +1,26 @@
 //! A device with a bent lens, a wrong width and uneven pixels, found again from frames with known positions.
 
-use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
+use std::path::Path;
+use std::process::Output;
 
-use nalgebra::DMatrix;
-use ndarray::Array2;
-use oapwatch::assign::assign;
-use oapwatch::frames::npy;
-use oapwatch::optics::{Camera, Config, psf};
-use rand::{Rng, RngExt, SeedableRng};
+use oapwatch::study::device::{self, Device, Emitters, NOISE_J, record, write_config, write_truth};
+use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use rand_distr::{Distribution, Normal};
 
-const N: usize = 20;
-const SIGMA_M: f64 = 2e-3;
-const NOISE_J: f64 = 1e-6;
-
-type Emitters = Vec<([f64; 2], f64)>;
-
-/// The device as it is, which its config does not know.
-struct Device {
-    camera: Camera,
-    /// A corner is displaced by this share of its radius: r_d = r·(1 + bend·(r/R)²).
-    bend: f64,
-    gain: Array2<f64>,
-    /// Even light on all pixels, J.
-    light_j: f64,
-}
-
-impl Device {
-    fn new(noise_j: f64, bend: f64, width_error: f64, gain_scatter: f64, rng: &mut impl Rng) -> Self {
-        let optics = Config {
-            pixels: [N, N],
-            spot_sigma_m: Some(SIGMA_M * (1.0 + width_error)),
-            noise_std_j: noise_j,
-            ..Config::default()
-        };
-        let scatter = Normal::new(1.0, gain_scatter).unwrap();
-        Self {
-            camera: optics.camera().unwrap(),
-            bend,
-            gain: Array2::from_shape_simple_fn((N, N), || scatter.sample(rng)),
-            light_j: 0.0,
-        }
-    }
-
-    fn spot(&self, ground: [f64; 2]) -> [f64; 2] {
-        let s = ground.map(|p| p * self.camera.plane_distance_m / self.camera.altitude_m);
-        let corner2 = 2.0 * self.camera.x.half_width().powi(2);
-        s.map(|v| v * (1.0 + self.bend * (s[0] * s[0] + s[1] * s[1]) / corner2))
-    }
-
-    /// Pixels without noise, and their derivatives by each emitter's sensor position and energy.
-    fn expose(&self, emitters: &Emitters) -> (Array2<f64>, Vec<Array2<f64>>) {
-        let (camera, mut total, mut columns) = (&self.camera, Array2::zeros((N, N)), Vec::new());
-        let zero = psf::PixelResponse {
-            fraction: 0.0,
-            d_centre: 0.0,
-            d_sigma: 0.0,
-        };
-        for &(ground, energy) in emitters {
-            let [x, y] = self.spot(ground);
-            let (mut fx, mut fy) = (vec![zero; N], vec![zero; N]);
-            psf::profile_response(&camera.x, x, camera.spot_sigma_m, &mut fx);
-            psf::profile_response(&camera.y, y, camera.spot_sigma_m, &mut fy);
-            let map = |f: &dyn Fn(&psf::PixelResponse, &psf::PixelResponse) -> f64| {
-                Array2::from_shape_fn((N, N), |(r, c)| self.gain[[r, c]] * f(&fx[c], &fy[r]))
-            };
-            columns.push(map(&|x, y| energy * x.d_centre * y.fraction));
-            columns.push(map(&|x, y| energy * x.fraction * y.d_centre));
-            columns.push(map(&|x, y| x.fraction * y.fraction));
-            total = total + map(&|x, y| energy * x.fraction * y.fraction);
-        }
-        (total, columns)
-    }
-
-    fn frame(&self, emitters: &Emitters, rng: &mut impl Rng) -> Array2<f64> {
-        let noise = Normal::new(0.0, self.camera.noise_std_j).unwrap();
-        let light = self.gain.mapv(|g| g * self.light_j);
-        (self.expose(emitters).0 + light).mapv(|v| v + noise.sample(rng))
-    }
-
-    /// Cramér–Rao bound of each position, both axes summed, m² on the ground of the undistorted scale (the distortion
-    /// changes that by a few per cent at most).
-    fn bound(&self, emitters: &Emitters) -> Vec<f64> {
-        let (_, columns) = self.expose(emitters);
-        let j = DMatrix::from_fn(N * N, columns.len(), |p, k| {
-            columns[k][[p / N, p % N]] / self.camera.noise_std_j
-        });
-        // Columns in m and in J differ by orders of magnitude: scale them before inverting.
-        let scale: Vec<f64> = j.column_iter().map(|c| 1.0 / c.norm()).collect();
-        let scaled = DMatrix::from_fn(j.nrows(), j.ncols(), |r, c| j[(r, c)] * scale[c]);
-        let inverse = (scaled.transpose() * scaled).try_inverse().unwrap();
-        let ground2 = self.camera.ground_scale().powi(2);
-        (0..emitters.len())
-            .map(|i| {
-                (0..2)
-                    .map(|k| inverse[(3 * i + k, 3 * i + k)] * scale[3 * i + k].powi(2))
-                    .sum::<f64>()
-                    * ground2
-            })
-            .collect()
-    }
-}
-
-/// Emitters at least 25 m apart, so that what is measured is the calibration and not who can be told apart.
-fn emitters(rng: &mut impl Rng) -> Emitters {
-    let energy = Normal::new(0.0078, 0.0007).unwrap();
-    let mut out: Emitters = Vec::new();
-    let count = rng.random_range(5..=7);
-    while out.len() < count {
-        let at = [rng.random_range(-118.0..118.0), rng.random_range(-118.0..118.0)];
-        if out.iter().all(|(p, _)| (p[0] - at[0]).hypot(p[1] - at[1]) > 25.0) {
-            out.push((at, energy.sample(rng)));
-        }
-    }
-    out
-}
-
-fn record(dir: &Path, name: &str, device: &Device, frames: usize, rng: &mut impl Rng) -> (PathBuf, Vec<Emitters>) {
-    let path = dir.join(name);
-    let mut writer = npy::Writer::create(&path, (N, N)).unwrap();
-    let scenes: Vec<Emitters> = (0..frames).map(|_| emitters(rng)).collect();
-    for scene in &scenes {
-        writer.push(device.frame(scene, rng).view()).unwrap();
-    }
-    (path, scenes)
-}
-
-fn write_truth(path: &Path, scenes: &[Emitters], shift: impl Fn(usize, usize) -> f64) {
-    let lines = scenes.iter().enumerate().map(|(frame, scene)| {
-        let list = scene.iter().enumerate();
-        let list: Vec<_> = list
-            .map(|(k, (p, _))| serde_json::json!({"x_m": p[0] + shift(frame, k), "y_m": p[1]}))
-            .collect();
-        format!("{}\n", serde_json::json!({"frame": frame, "emitters": list}))
-    });
-    std::fs::write(path, lines.collect::<String>()).unwrap();
-}
-
-fn write_config(path: &Path, noise_j: f64, calibration: Option<&str>) {
-    let line = calibration
-        .map(|c| format!("calibration = \"{c}\"\n"))
-        .unwrap_or_default();
-    let text = format!("[optics]\npixels = [{N}, {N}]\nspot_sigma_m = {SIGMA_M}\nnoise_std_j = {noise_j}\n{line}");
-    std::fs::write(path, text).unwrap();
-}
+const PROGRAM: &str = env!("CARGO_BIN_EXE_oapwatch");
 
 fn oapwatch(args: &[&dyn AsRef<std::ffi::OsStr>]) -> Output {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_oapwatch"));
-    args.iter().for_each(|a| {
-        command.arg(a);
-    });
-    command.output().unwrap()
+    device::run(Path::new(PROGRAM), args)
 }
 
 fn calibrate(config: &Path, truth: &Path, out: &Path, frames: &Path) -> Output {
-    oapwatch(&[
-        &"calibrate",
-        &"--config",
-        &config,
-        &"--truth",
-        &truth,
-        &"--out",
-        &out,
-        &frames,
-    ])
+    device::calibrate(Path::new(PROGRAM), config, truth, out, frames)
 }
 
-/// Mean squared error of `locate` over matched pairs, m², over the mean bound of the same emitters; and how many of all
-/// emitters were found.
 fn error_over_bound(config: &Path, frames: &Path, device: &Device, scenes: &[Emitters]) -> (f64, f64) {
-    let out = oapwatch(&[&"locate", &"--config", &config, &frames]);
-    assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
-    let (mut squared, mut bound, mut found, mut total) = (0.0, 0.0, 0, 0);
-    for (line, scene) in String::from_utf8(out.stdout).unwrap().lines().zip(scenes) {
-        let line: serde_json::Value = serde_json::from_str(line).unwrap();
-        let at: Vec<[f64; 2]> = line["emitters"]
-            .as_array()
-            .unwrap()
-            .iter()
-            .map(|e| ["x_m", "y_m"].map(|k| e[k].as_f64().unwrap()))
-            .collect();
-        let distance2 = |t: usize, e: usize| (scene[t].0[0] - at[e][0]).powi(2) + (scene[t].0[1] - at[e][1]).powi(2);
-        let bounds = device.bound(scene);
-        total += scene.len();
-        for (t, e) in assign(scene.len(), at.len(), 625.0, distance2).pairs {
-            squared += distance2(t, e);
-            bound += bounds[t];
-            found += 1;
-        }
-    }
-    (squared / bound, f64::from(found) / total as f64)
+    device::error_over_bound(Path::new(PROGRAM), config, frames, device, scenes)
 }
 
-/// Calibrates on `frames` of the device as they are surveyed; `plain.toml` and `calibrated.toml` in `dir` are without and with
-/// what came of it. What was said.
 fn calibrated(
     dir: &Path,
     device: &Device,
@@ -203,22 +28,7 @@ fn calibrated(
     rng: &mut impl Rng,
     shift: impl Fn(usize, usize) -> f64,
 ) -> String {
-    let at = |name: &str| dir.join(name);
-    let (recorded, scenes) = record(dir, "beacons.npy", device, frames, rng);
-    write_truth(&at("truth.ndjson"), &scenes, shift);
-    let noise_j = device.camera.noise_std_j;
-    write_config(&at("plain.toml"), noise_j, None);
-    // The config may name the calibration before it is there.
-    write_config(&at("calibrated.toml"), noise_j, Some("calibration.toml"));
-    let out = calibrate(
-        &at("calibrated.toml"),
-        &at("truth.ndjson"),
-        &at("calibration.toml"),
-        &recorded,
-    );
-    let text = String::from_utf8_lossy(&out.stdout).into_owned() + &String::from_utf8_lossy(&out.stderr);
-    assert!(out.status.success(), "{text}");
-    text
+    device::calibrated(Path::new(PROGRAM), dir, device, frames, rng, shift)
 }
 
 #[test]
@@ -250,39 +60,6 @@ fn a_bent_lens_a_wrong_width_and_uneven_pixels_are_calibrated_away() {
     );
     assert!(before > 20.0 * after, "{before} {after}");
     assert!(found > 0.99, "{found}");
-}
-
-/// A device, beams of which a few are surveyed wrongly, and what `locate` makes of fresh frames: error over bound before and after.
-fn before_and_after(noise_j: f64, frames: usize, seed: u64) -> (f64, f64) {
-    let dir = tempfile::tempdir().unwrap();
-    let at = |name: &str| dir.path().join(name);
-    let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    let device = Device::new(noise_j, 0.02, 0.05, 0.01, &mut rng);
-    calibrated(dir.path(), &device, frames, &mut rng, |frame, k| {
-        match (7 * frame + k) % 20 {
-            0 => 30.0,
-            _ => 0.0,
-        }
-    });
-    let (fresh, scenes) = record(dir.path(), "fresh.npy", &device, 100, &mut rng);
-    let ratio = |config: &str| error_over_bound(&at(config), &fresh, &device, &scenes).0;
-    (ratio("plain.toml"), ratio("calibrated.toml"))
-}
-
-/// The table of docs/calibration.md: `cargo test --release --test calibrate -- --ignored --nocapture`.
-#[test]
-#[ignore = "minutes; a measurement"]
-fn what_is_left_of_the_error() {
-    println!("| noise of a pixel, µJ | frames | over the bound before | after, five devices |\n|---|---|---|---|");
-    for noise_j in [5e-6, 1e-6] {
-        for frames in [80, 200] {
-            let ratios: Vec<_> = (100..105).map(|seed| before_and_after(noise_j, frames, seed)).collect();
-            let before = ratios.iter().map(|r| r.0).sum::<f64>() / ratios.len() as f64;
-            let after: Vec<String> = ratios.iter().map(|r| format!("{:.2}", r.1)).collect();
-            println!("| {} | {frames} | {before:.0} | {} |", noise_j * 1e6, after.join(", "));
-            assert!(ratios.iter().all(|r| r.1 < 1.5), "the goal");
-        }
-    }
 }
 
 #[test]

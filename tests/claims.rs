@@ -3,11 +3,12 @@
 use std::fs::{self, OpenOptions};
 use std::io::Write;
 use std::path::{Path, PathBuf};
+use std::time::{Duration, SystemTime};
 
 use jiff::{SignedDuration, Timestamp};
 use oapwatch::claims::{
-    Beam, Claim, ClaimState, Config, Follower, LONGEST_LINE, MOST_UNANSWERED, Outcome, Poll, Store, parse_line,
-    read_log,
+    Beam, Bearing, Claim, ClaimState, Config, Follower, LONGEST_LINE, MOST_UNANSWERED, Outcome, Poll, Store,
+    parse_line, read_log,
 };
 
 fn at(s: f64) -> Timestamp {
@@ -98,6 +99,88 @@ fn rotation_loses_nothing_of_the_old_file() {
     assert_eq!(users(&log.follower.poll().unwrap()), ["e"]);
 }
 
+/// A writer that was not told of the rotation goes on in the old file, until that is deleted or rotated again.
+#[test]
+fn lines_written_to_the_old_file_after_the_rotation_are_read() {
+    let mut log = log();
+    let old = log.path.with_extension("1");
+    append(&log.path, &line("a", 0));
+    log.follower.poll().unwrap();
+    let half = line("b", 1);
+    append(&log.path, &half[..20]);
+    fs::rename(&log.path, &old).unwrap();
+    append(&log.path, &line("new", 2));
+    assert_eq!(users(&log.follower.poll().unwrap()), ["new"]);
+    append(&old, &half[20..]);
+    append(&old, &line("c", 3));
+    append(&log.path, &line("d", 4));
+    let poll = log.follower.poll().unwrap();
+    assert_eq!((users(&poll), poll.refused_count), (vec!["b", "c", "d"], 0));
+    append(&old, &line("e", 5));
+    append(&old, "{");
+    fs::remove_file(&old).unwrap();
+    let poll = log.follower.poll().unwrap();
+    assert_eq!((users(&poll), poll.refused_count), (vec!["e"], 1));
+}
+
+fn gzip(from: &Path, to: &Path) {
+    let mut packed = flate2::write::GzEncoder::new(fs::File::create(to).unwrap(), flate2::Compression::fast());
+    packed.write_all(&fs::read(from).unwrap()).unwrap();
+    packed.finish().unwrap();
+    fs::remove_file(from).unwrap();
+}
+
+#[test]
+fn a_live_log_that_was_just_rotated_and_packed_is_read_before_the_new_one() {
+    for (age_s, expected) in [(10, vec!["a", "b", "c"]), (1000, vec!["b", "c"])] {
+        let log = log();
+        let packed = log.path.with_file_name("claims.ndjson.1.gz");
+        append(&log.path, &line("a", 0));
+        gzip(&log.path, &packed);
+        let now = SystemTime::now();
+        let written = now - Duration::from_secs(age_s);
+        let file = fs::File::options().append(true).open(&packed).unwrap();
+        file.set_modified(written).unwrap();
+        append(&log.path, &line("b", 1));
+        let mut follower = Follower::new(&log.path, &Config::default()).live(now - Duration::from_secs(120));
+        let mut found = users(&follower.poll().unwrap()).join(" ");
+        append(&log.path, &line("c", 2));
+        found += &format!(" {}", users(&follower.poll().unwrap()).join(" "));
+        assert_eq!(found.split(' ').collect::<Vec<_>>(), expected);
+    }
+}
+
+#[test]
+fn a_review_reads_packed_logs_back_to_the_recording_s_start() {
+    let log = log();
+    for (k, user) in ["too-early", "early", "late"].iter().enumerate() {
+        append(&log.path, &format!("\u{feff}{}", line(user, 10 * k as u32)));
+        if k < 2 {
+            let rotated = log.path.with_file_name(format!("claims.ndjson.{}.gz", 2 - k));
+            gzip(&log.path, &rotated);
+            let written = SystemTime::UNIX_EPOCH + Duration::from_secs(k as u64);
+            fs::File::options()
+                .append(true)
+                .open(&rotated)
+                .unwrap()
+                .set_modified(written)
+                .unwrap();
+        }
+    }
+    for (since, expected) in [
+        (None, vec!["late"]),
+        (Some(25.0), vec!["late"]),
+        (Some(15.0), vec!["early", "late"]),
+        (Some(-5.0), vec!["too-early", "early", "late"]),
+    ] {
+        let poll = read_log(&log.path, &Config::default(), since.map(at)).unwrap();
+        assert_eq!((users(&poll), poll.refused_count), (expected, 0), "{since:?}");
+    }
+    let packed = log.path.with_extension("gz");
+    gzip(&log.path, &packed);
+    assert_eq!(users(&read_log(&packed, &Config::default(), None).unwrap()), ["late"]);
+}
+
 /// What the old file still held comes first; the folder is an error until a file stands there again.
 #[test]
 fn a_log_replaced_by_a_folder_loses_nothing_and_is_taken_up_again() {
@@ -183,7 +266,7 @@ fn any_bytes_are_survived() {
 fn a_review_reads_a_whole_log_by_time() {
     let log = log();
     append(&log.path, &(line("b", 5) + &line("a", 1) + line("c", 9).trim_end()));
-    let poll = read_log(&log.path, &Config::default()).unwrap();
+    let poll = read_log(&log.path, &Config::default(), None).unwrap();
     assert_eq!(users(&poll), ["a", "b", "c"]);
 }
 
@@ -310,7 +393,7 @@ fn who_is_claimed_beside_a_beam_that_is_nobodys_is_let_in_first() {
         position: [40.0, 3.0],
         is_answered: false,
     };
-    store.choose(&[beam], |_| true);
+    store.choose(&[beam], |_| Some(Bearing::InView));
     assert_eq!(store.insert(claim("far", 1.0, 70.0), at(1.0)), Outcome::Full);
     assert_eq!(store.insert(claim("beside", 1.0, 38.0), at(1.0)), Outcome::Accepted);
 }
@@ -330,7 +413,7 @@ fn a_frame_is_held_against_a_bounded_number_of_claims() {
         position: [77.0, 55.2],
         is_answered: false,
     };
-    store.choose(&[beam], |_| true);
+    store.choose(&[beam], |_| Some(Bearing::InView));
     let chosen: Vec<String> = store.chosen().map(|s| s.claim.user.clone()).collect();
     assert_eq!(chosen.len(), MOST_UNANSWERED + 1);
     assert_eq!(store.left_out(), 15_000 - chosen.len());
@@ -342,7 +425,7 @@ fn a_frame_is_held_against_a_bounded_number_of_claims() {
     assert!(chosen.is_sorted(), "by name");
     // Those that bear no more leave.
     for _ in 0..100 {
-        store.choose(&[], |s| s.claim.x_m < 1.0);
+        store.choose(&[], |s| (s.claim.x_m < 1.0).then_some(Bearing::InView));
     }
     assert_eq!((store.chosen().count(), store.left_out()), (101, 0));
 }
@@ -368,7 +451,7 @@ fn a_long_log_is_read_from_near_its_end() {
         tail_bytes: 65_536,
         ..Config::default()
     };
-    let mut follower = Follower::new(&log.path, &config).live();
+    let mut follower = Follower::new(&log.path, &config).live(SystemTime::UNIX_EPOCH);
     append(&log.path, &line("old", 0).repeat(5000));
     append(&log.path, &line("new", 1));
     let whole = fs::metadata(&log.path).unwrap().len();

@@ -229,8 +229,8 @@ fn the_same_frame_gives_the_same_bits() {
     let camera = camera(4e-3, 20, 1e-6);
     let mut rng = ChaCha8Rng::seed_from_u64(9);
     let pixels = render(&camera, &scatter(6, 50.0, &mut rng), &mut rng);
-    for rung in ESTIMATORS {
-        let mut used = estimator(Some(rung.name), &camera);
+    for spec in ESTIMATORS {
+        let mut used = estimator(Some(spec.name), &camera);
         let bits = |e: Estimate| -> Vec<u64> { places(&e).iter().flatten().map(|v| v.to_bits()).collect() };
         let first = bits(used.estimate(&frame(pixels.clone())).unwrap());
         used.estimate(&frame(render(&camera, &[[0.0, 0.0]], &mut rng))).unwrap();
@@ -238,12 +238,12 @@ fn the_same_frame_gives_the_same_bits() {
             first,
             bits(used.estimate(&frame(pixels.clone())).unwrap()),
             "{}",
-            rung.name
+            spec.name
         );
         assert_eq!(
             first,
             bits(
-                estimator(Some(rung.name), &camera)
+                estimator(Some(spec.name), &camera)
                     .estimate(&frame(pixels.clone()))
                     .unwrap()
             )
@@ -291,7 +291,7 @@ fn unusable_pixels_are_told_and_unusable_frames_refused() {
 }
 
 #[test]
-fn an_unknown_rung_is_refused_with_the_nearest() {
+fn an_unknown_estimator_is_refused_with_the_nearest() {
     let config = Config {
         name: Some("pencil-fot".into()),
         ..Default::default()
@@ -300,7 +300,7 @@ fn an_unknown_rung_is_refused_with_the_nearest() {
     assert!(message.contains("did you mean \"pencil-fit\"?"), "{message}");
 }
 
-/// A camera whose spots melt, and the `map` rung told what a user's beam brings.
+/// A camera whose spots melt, and the `map` estimator told what a user's beam brings.
 fn map(camera: &Camera) -> Box<dyn Estimator> {
     let config = Config {
         name: Some("map".into()),

@@ -3,16 +3,15 @@
 use axum::body::Bytes;
 use axum::extract::State as Shared;
 use axum::extract::rejection::BytesRejection;
-use axum::http::{HeaderMap, StatusCode, header};
+use axum::http::{HeaderMap, StatusCode};
 use axum::response::Response;
 use serde::Deserialize;
-use tokio::sync::oneshot;
 
 use super::client::Caller;
-use super::extract::Path;
+use super::extract::{Path, check_media_type};
 use super::problem::Problem;
 use super::state::{Acknowledged, Command, State};
-use super::{alerts, claims, respond};
+use super::{alerts, respond};
 use crate::journal::AuditAction;
 use crate::monitor::Alert;
 
@@ -40,15 +39,7 @@ fn note(headers: &HeaderMap, body: &[u8]) -> Result<Option<String>, Problem> {
         let detail = format!("expected a body of at most {LARGEST_BODY} bytes, found {}", body.len());
         return Err(Problem::new(StatusCode::PAYLOAD_TOO_LARGE, detail));
     }
-    if let Some(named) = headers.get(header::CONTENT_TYPE) {
-        let named = named.to_str().unwrap_or_default();
-        let essence = named.split(';').next().unwrap_or_default().trim().to_ascii_lowercase();
-        // What curl names by itself is believed to be JSON too.
-        if !["application/json", "application/x-www-form-urlencoded"].contains(&essence.as_str()) {
-            let detail = format!("Content-Type: expected application/json, found {named:?}");
-            return Err(Problem::new(StatusCode::UNSUPPORTED_MEDIA_TYPE, detail));
-        }
-    }
+    check_media_type(headers, &["application/json"])?;
     let parsed: Option<Acknowledge> =
         serde_json::from_slice(body).map_err(|e| unprocessable(format!("the body: {e}")))?;
     let Some(note) = parsed
@@ -97,14 +88,13 @@ pub async fn acknowledge(
     body: Result<Bytes, BytesRejection>,
 ) -> Result<Response, Problem> {
     let note = note(&headers, &body?)?;
-    let (reply, answer) = oneshot::channel();
-    let command = Command::Acknowledge {
+    let outcome = state.ask(|reply| Command::Acknowledge {
         id: id.clone(),
         by: caller.name(),
         note: note.clone(),
         reply,
-    };
-    let response = send(&state, command, answer, &id).await?;
+    });
+    let response = answer(&id, outcome.await?)?;
     state.audit.change(AuditAction::Acknowledge, &caller, &id, note);
     Ok(response)
 }
@@ -126,25 +116,18 @@ pub async fn unacknowledge(
     caller: Caller,
     Path(id): Path<String>,
 ) -> Result<Response, Problem> {
-    let (reply, answer) = oneshot::channel();
-    let command = Command::Unacknowledge {
+    let outcome = state.ask(|reply| Command::Unacknowledge {
         id: id.clone(),
         by: caller.name(),
         reply,
-    };
-    let response = send(&state, command, answer, &id).await?;
+    });
+    let response = answer(&id, outcome.await?)?;
     state.audit.change(AuditAction::Unacknowledge, &caller, &id, None);
     Ok(response)
 }
 
-async fn send(
-    state: &State,
-    command: Command,
-    answer: oneshot::Receiver<Acknowledged>,
-    id: &str,
-) -> Result<Response, Problem> {
-    claims::send(state, command)?;
-    match answer.await.map_err(|_| claims::busy())? {
+fn answer(id: &str, outcome: Acknowledged) -> Result<Response, Problem> {
+    match outcome {
         Acknowledged::Done(alert) => Ok(respond::json(&*alert)),
         Acknowledged::Unknown => Err(alerts::unknown(id)),
         Acknowledged::AlreadyCleared => Err(Problem::new(

@@ -1,14 +1,17 @@
 //! `/v1/alerts`: the list of alerts and one alert.
 
+use axum::body::{Body, Bytes};
 use axum::extract::State as Shared;
 use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
 use axum::response::Response;
+use futures_util::{StreamExt, stream};
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 
 use super::extract::{Path, Query, within};
 use super::problem::Problem;
 use super::state::State;
+use super::table::{self, Columns};
 use super::{conditional, respond};
 use crate::journal::{self, Cursor, Filter, Journal};
 use crate::monitor::{Alert, AlertKind, AlertState};
@@ -113,6 +116,79 @@ fn next_link(query: &ListQuery, limit: usize, cursor: &str) -> Option<HeaderValu
         .append_pair("limit", &limit.to_string())
         .append_pair("cursor", cursor);
     HeaderValue::from_str(&format!("</v1/alerts?{}>; rel=\"next\"", pairs.finish())).ok()
+}
+
+#[derive(Debug, Deserialize, utoipa::IntoParams)]
+#[into_params(parameter_in = Query)]
+#[serde(deny_unknown_fields)]
+pub struct TableQuery {
+    state: Option<AlertState>,
+    kind: Option<AlertKind>,
+    /// Raised at this time or later
+    #[param(value_type = Option<String>, format = DateTime)]
+    since: Option<Timestamp>,
+}
+
+const COLUMNS: &Columns = &[
+    ("id", "/id"),
+    ("kind", "/kind"),
+    ("severity", "/severity"),
+    ("state", "/state"),
+    ("raised_at", "/raised_at"),
+    ("cleared_at", "/cleared_at"),
+    ("user", "/user"),
+    ("x_m", "/x_m"),
+    ("y_m", "/y_m"),
+    ("cov_xx_m2", "/cov_m2/0/0"),
+    ("cov_xy_m2", "/cov_m2/0/1"),
+    ("cov_yy_m2", "/cov_m2/1/1"),
+    ("claimed_x_m", "/claimed/x_m"),
+    ("claimed_y_m", "/claimed/y_m"),
+    ("source", "/source/kind"),
+    ("frame", "/source/frame"),
+    ("file", "/source/file"),
+    ("acknowledged_at", "/acknowledgement/at"),
+    ("acknowledged_by", "/acknowledgement/by"),
+    ("note", "/acknowledgement/note"),
+    ("evidence", "/evidence"),
+];
+
+/// Alerts as a table (CSV), newest first
+///
+/// All that match, without pages; `evidence` is JSON. Text that a spreadsheet would take for a formula begins with an apostrophe.
+#[utoipa::path(get, path = "/v1/alerts.csv", tag = "alerts", params(TableQuery),
+    responses(
+        (status = 200, description = "A header and a row for each alert", body = String, content_type = "text/csv"),
+        (status = 400, description = "A parameter cannot be read", body = Problem, content_type = "application/problem+json"),
+        (status = 503, description = "The journal cannot be read", body = Problem, content_type = "application/problem+json"),
+    ))]
+pub async fn csv(Shared(state): Shared<State>, Query(query): Query<TableQuery>) -> Result<Response, Problem> {
+    let page = move |after| {
+        let filter = Filter {
+            state: query.state,
+            kind: query.kind,
+            since: query.since,
+            after,
+        };
+        let state = state.clone();
+        async move { read(&state, move |journal| journal.alerts(&filter, MAX_LIMIT)).await }
+    };
+    let rows = |alerts: &[Alert]| {
+        let object = |alert| serde_json::to_value(alert).expect("alerts are JSON");
+        Bytes::from(table::rows(COLUMNS, alerts.iter().map(object)))
+    };
+    // A journal that cannot be read is said so while there is still a status to say it with.
+    let first = page(None).await?;
+    let begin = [Bytes::from(table::head(COLUMNS)), rows(&first.alerts)].map(Ok::<_, std::io::Error>);
+    let rest = stream::try_unfold((page, first.next), move |(page, next)| async move {
+        let Some(next) = next else { return Ok(None) };
+        let found = page(Some(next))
+            .await
+            .map_err(|problem| std::io::Error::other(problem.detail))?;
+        Ok(Some((rows(&found.alerts), (page, found.next))))
+    });
+    let body = Body::from_stream(stream::iter(begin).chain(rest));
+    Ok(table::download("alerts.csv", body))
 }
 
 /// One alert

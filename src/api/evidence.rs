@@ -20,6 +20,7 @@ use super::problem::Problem;
 use super::state::State;
 use super::{alerts, conditional, frame, picture, positions, respond};
 use crate::claim::Claim;
+use crate::estimate::Emitter;
 use crate::frame::Frame;
 use crate::frames::npy::{self, Header};
 use crate::frames::record::{self, EvidenceFrame};
@@ -39,6 +40,9 @@ pub struct AlertEvidence {
     raised_at: Timestamp,
     /// Position in `evidence.npy` of the frame that raised the alert, or of the one nearest to it; null where none is usable.
     position: Option<u64>,
+    /// What the estimator finds in that frame; null where it cannot be used.
+    #[schema(value_type = Option<Vec<Object>>)]
+    emitters: Option<Vec<Emitter>>,
     /// Claims that stood when the recording begins, oldest first.
     claims: Vec<Claim>,
     /// What the monitor was given, in order, with the claims that came with it.
@@ -53,6 +57,19 @@ pub struct EvidenceQuery {
     /// when left out
     #[param(minimum = 1, maximum = 64)]
     scale: Option<usize>,
+    /// All of a recorded frame when left out; asked for all, what is not recorded has no picture
+    #[param(inline)]
+    panels: Option<Panels>,
+}
+
+/// What the picture shows, from left to right.
+#[derive(Clone, Copy, Debug, PartialEq, Deserialize, utoipa::ToSchema)]
+#[serde(rename_all = "lowercase")]
+enum Panels {
+    /// The frame.
+    Data,
+    /// The frame, the model that the estimator explains it by, and the residual in σ.
+    All,
 }
 
 async fn alert_of(state: &State, id: &str) -> Result<Alert, Problem> {
@@ -119,8 +136,18 @@ async fn read<T: Send + 'static>(
 pub async fn json(Shared(state): Shared<State>, Path(id): Path<String>) -> Result<Response, Problem> {
     let alert = alert_of(&state, &id).await?;
     let evidence = read(&state, &alert, record::Evidence::read).await?;
+    let frame = recorded_frame(&state, &alert).await?;
+    let emitters = match (frame, positions::latest(&state)) {
+        (Some(frame), Ok(latest)) => {
+            let (fitter, camera) = (state.fitter.clone(), latest.snapshot.camera.clone());
+            let fit = move || Some(fitter.fit(&camera, frame)?.emitters);
+            tokio::task::spawn_blocking(fit).await.expect("a fit does not panic")
+        }
+        _ => None,
+    };
     Ok(respond::json(&AlertEvidence {
         position: evidence.position_of(alert.source.frame, alert.raised_at),
+        emitters,
         raised_at: alert.raised_at,
         alert: alert.id,
         claims: evidence.claims,
@@ -187,6 +214,9 @@ fn frames_so_far(file: std::fs::File, header: Header) -> Body {
 }
 
 /// The frame that raised an alert as a picture, with its place and the place that was claimed marked
+///
+/// Beside it the model, in the same colours, and the residual: data minus model in standard deviations of a pixel's noise, from
+/// -5 (blue) over 0 (black) to 5 (orange).
 #[utoipa::path(get, path = "/v1/alerts/{id}/evidence.png", tag = "alerts",
     params(("id" = String, Path, description = "The alert's id"), EvidenceQuery),
     responses(
@@ -209,8 +239,17 @@ pub async fn png(
         Ok(None) => Err(nothing_recorded(&state, &alert)),
         Err(problem) => Err(problem),
     };
-    let png = match (recorded, state.feed.picture(&alert.id)) {
-        (Ok(frame), _) => draw(&state, frame, alert, scale).await?,
+    let kept = state
+        .feed
+        .picture(&alert.id)
+        .filter(|_| query.panels != Some(Panels::All));
+    let png = match (recorded, kept) {
+        (Ok(frame), _) => {
+            // What moves has left the place that the alert has now.
+            let events = alerts::read(&state, move |journal| journal.events(&id)).await?;
+            let raised = events.into_iter().next().map_or(alert, |first| first.event.alert);
+            draw(&state, frame, raised, scale, query.panels.unwrap_or(Panels::All)).await?
+        }
         (Err(_), Some(png)) => png,
         (Err(problem), None) => return Err(problem),
     };
@@ -231,14 +270,32 @@ async fn recorded_frame(state: &State, alert: &Alert) -> Result<Option<Frame>, P
     .await
 }
 
-async fn draw(state: &State, frame: Frame, alert: Alert, scale: Option<usize>) -> Result<Bytes, Problem> {
+async fn draw(
+    state: &State,
+    frame: Frame,
+    alert: Alert,
+    scale: Option<usize>,
+    panels: Panels,
+) -> Result<Bytes, Problem> {
     let camera = positions::latest(state)?.snapshot.camera.clone();
     let (ny, nx) = frame.pixels.dim();
-    let most = (frame::MAX_SIDE / nx.max(ny).max(1)).max(1);
-    let scale = scale.map_or_else(|| picture::scale_for(&frame, DEFAULT_SIDE), |scale| scale.min(most));
+    let width = match panels {
+        Panels::Data => nx,
+        Panels::All => 3 * nx,
+    };
+    let most = (frame::MAX_SIDE / width.max(ny).max(1)).max(1);
+    let scale = scale
+        .unwrap_or_else(|| picture::scale_for(&frame, DEFAULT_SIDE))
+        .min(most);
+    let fitter = state.fitter.clone();
     let draw = move || {
         let marks = picture::marks_of_alert(&alert, &camera);
-        picture::png(&frame, &camera, &marks, scale)
+        let fit =
+            (panels == Panels::All && camera.shape() == frame.pixels.dim()).then(|| fitter.fit(&camera, frame.clone()));
+        match fit.flatten() {
+            Some(fit) => picture::fit_png(&fit, &camera, &marks, scale),
+            None => picture::png(&frame, &camera, &marks, scale),
+        }
     };
     let drawn = tokio::task::spawn_blocking(draw).await.expect("drawing does not panic");
     let png = drawn.map_err(|e| Problem::new(StatusCode::INTERNAL_SERVER_ERROR, e.to_string()))?;

@@ -12,8 +12,10 @@ mod claims;
 mod client;
 mod conditional;
 mod config;
+mod connection;
 mod connection_quota;
 mod evidence;
+mod evidence_fit;
 mod extract;
 mod feed;
 mod frame;
@@ -34,16 +36,18 @@ mod snapshot;
 mod sse;
 mod state;
 mod stream;
+mod table;
+mod tokens;
 mod webhooks;
 mod websocket;
 
-pub use auth::TokenError;
 pub use config::{Config, ConfigError};
 pub use feed::Feed;
 pub use listener::{Listen, ListenError, Listener};
 pub use server::{Error, Server};
 pub use snapshot::{ClaimsStatus, FrameCounts, JournalStatus, Latency, Snapshot, SourceState, SourceStatus, Status};
 pub use state::{Acknowledged, Command, State};
+pub use tokens::TokenError;
 
 use std::num::NonZeroU32;
 use std::sync::Arc;
@@ -58,16 +62,17 @@ use axum::routing::get;
 use tower_http::catch_panic::CatchPanicLayer;
 use tower_http::compression::CompressionLayer;
 use tower_http::cors::{AllowOrigin, CorsLayer};
+use tower_http::decompression::RequestDecompressionLayer;
 use tower_http::set_header::SetResponseHeaderLayer;
 use tower_http::timeout::TimeoutLayer;
 
 use crate::metric;
 
-/// The largest body read: about 20,000 claims.
+/// The largest body read, after decompression: about 20,000 claims.
 const MAX_BODY_BYTES: usize = 4 << 20;
 
 /// All routes under all guards, the outermost last.
-fn router(state: State, config: &Config, tokens: Arc<auth::Tokens>, proxies: Arc<client::TrustedProxies>) -> Router {
+fn router(state: State, config: &Config, tokens: Arc<tokens::Tokens>, proxies: Arc<client::TrustedProxies>) -> Router {
     let (routes, description) = openapi::router();
     let required = tokens.required();
     let audit = state.audit.clone();
@@ -81,6 +86,7 @@ fn router(state: State, config: &Config, tokens: Arc<auth::Tokens>, proxies: Arc
         .route("/page/{*path}", get(page::asset))
         .fallback(|| async { StatusCode::NOT_FOUND })
         .layer(DefaultBodyLimit::max(MAX_BODY_BYTES))
+        .layer(RequestDecompressionLayer::new())
         .layer(CompressionLayer::new().gzip(true))
         .layer(from_fn_with_state(gate, auth::check))
         .layer(from_fn_with_state(origins, guard::origin))

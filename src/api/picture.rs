@@ -1,6 +1,7 @@
 //! A frame as a picture: the pixels in a perceptually even colour map, marks by shape and by colours that
 //! colour-blind readers can tell apart (Okabe and Ito, 2008).
 
+use super::evidence_fit::Fit;
 use super::snapshot::Snapshot;
 use crate::frame::Frame;
 use crate::monitor::{Alert, AlertKind, PositionStatus};
@@ -21,12 +22,52 @@ type Rgb = [u8; 3];
 
 /// Pixels, row by row from the top.
 struct Picture {
+    /// Of one panel.
+    panel: usize,
     width: usize,
     height: usize,
     pixels: Vec<Rgb>,
 }
 
 impl Picture {
+    /// Panels of (Ny, Nx) sensor pixels beside each other.
+    fn blank((ny, nx): (usize, usize), scale: usize, panels: usize) -> Self {
+        let width = panels * nx * scale + (panels - 1) * GAP;
+        let height = ny * scale;
+        Self {
+            panel: nx * scale,
+            width,
+            height,
+            pixels: vec![[255; 3]; width * height],
+        }
+    }
+
+    fn left(&self, panel: usize) -> usize {
+        panel * (self.panel + GAP)
+    }
+
+    /// Fills a panel; `shade` gets row and column of a sensor pixel. Row 0 (y_min) is at the bottom.
+    fn panel(&mut self, panel: usize, scale: usize, shade: impl Fn([usize; 2]) -> Rgb) {
+        let left = self.left(panel);
+        let rows = self.height / scale;
+        for py in 0..self.height {
+            let row = rows - 1 - py / scale;
+            let line = &mut self.pixels[py * self.width + left..][..self.panel];
+            for (pixels, column) in line.chunks_mut(scale).zip(0..) {
+                pixels.fill(shade([row, column]));
+            }
+        }
+    }
+
+    fn mark(&mut self, panel: usize, camera: &Camera, marks: &[Mark], scale: usize) {
+        let left = self.left(panel);
+        for Mark { at: [x, y], status } in marks {
+            let px = (x - camera.x.min_m) / camera.x.pitch_m * scale as f64;
+            let py = self.height as f64 - (y - camera.y.min_m) / camera.y.pitch_m * scale as f64;
+            mark(self, left, [px, py], *status);
+        }
+    }
+
     fn encode(&self) -> Result<Vec<u8>, png::EncodingError> {
         let mut out = Vec::new();
         let mut encoder = png::Encoder::new(&mut out, self.width as u32, self.height as u32);
@@ -81,33 +122,55 @@ pub fn scale_for(frame: &Frame, side: usize) -> usize {
     side.div_ceil(nx.max(ny).max(1)).clamp(1, 64)
 }
 
+/// Residuals are shown up to so many standard deviations.
+const RESIDUAL_SIGMA: f64 = 5.0;
+/// Picture pixels between two panels.
+pub const GAP: usize = 8;
+
 /// PNG of a frame, `scale` picture pixels a sensor pixel; row 0 (y_min) is at the bottom.
 pub fn png(frame: &Frame, camera: &Camera, marks: &[Mark], scale: usize) -> Result<Vec<u8>, png::EncodingError> {
-    let (ny, nx) = frame.pixels.dim();
     let (low, high) = range(frame);
-    let (width, height) = (nx * scale, ny * scale);
-    let shade = |index: usize| {
-        let column = index % width / scale;
-        let row = ny - 1 - index / width / scale;
-        let value = frame.pixels[[row, column]];
-        let masked = frame.masked.as_ref().is_some_and(|m| m[[row, column]]);
-        if masked || !value.is_finite() {
-            UNUSABLE
-        } else {
-            colour((value - low) / (high - low))
-        }
-    };
-    let mut picture = Picture {
-        width,
-        height,
-        pixels: (0..width * height).map(shade).collect(),
-    };
-    for Mark { at: [x, y], status } in marks {
-        let px = (x - camera.x.min_m) / camera.x.pitch_m * scale as f64;
-        let py = (ny as f64 - (y - camera.y.min_m) / camera.y.pitch_m) * scale as f64;
-        mark(&mut picture, [px, py], *status);
-    }
+    let mut picture = Picture::blank(frame.pixels.dim(), scale, 1);
+    picture.panel(0, scale, |at| light(frame, at, low, high));
+    picture.mark(0, camera, marks, scale);
     picture.encode()
+}
+
+/// PNG of a fit: the data, the model on the same scale of colours, and the residual, from -5 σ (blue) over black to +5 σ (orange).
+/// The place and the claim of the alert are marked in the data and in the residual.
+pub fn fit_png(fit: &Fit, camera: &Camera, marks: &[Mark], scale: usize) -> Result<Vec<u8>, png::EncodingError> {
+    let (low, high) = range(&fit.data);
+    let mut picture = Picture::blank(fit.data.pixels.dim(), scale, 3);
+    picture.panel(0, scale, |at| light(&fit.data, at, low, high));
+    picture.panel(1, scale, |at| colour((fit.model[at] - low) / (high - low)));
+    picture.panel(2, scale, |at| difference(fit.residual[at]));
+    picture.mark(0, camera, marks, scale);
+    picture.mark(2, camera, marks, scale);
+    picture.encode()
+}
+
+fn light(frame: &Frame, at: [usize; 2], low: f64, high: f64) -> Rgb {
+    let value = frame.pixels[at];
+    let masked = frame.masked.as_ref().is_some_and(|m| m[at]);
+    if masked || !value.is_finite() {
+        UNUSABLE
+    } else {
+        colour((value - low) / (high - low))
+    }
+}
+
+/// Colour of a residual in σ.
+fn difference(sigma: f64) -> Rgb {
+    if !sigma.is_finite() {
+        return UNUSABLE;
+    }
+    let full = if sigma < 0.0 {
+        [86.0, 180.0, 233.0]
+    } else {
+        [255.0, 150.0, 30.0]
+    };
+    let share = (sigma.abs() / RESIDUAL_SIGMA).min(1.0);
+    full.map(|c| (c * share).round() as u8)
 }
 
 /// Values shown darkest and lightest: the median, so that noise is dark, and the brightest pixel.
@@ -148,7 +211,8 @@ fn outline(status: PositionStatus, dx: f64, dy: f64) -> f64 {
     }
 }
 
-fn mark(picture: &mut Picture, [cx, cy]: [f64; 2], status: PositionStatus) {
+/// Draws a mark into the panel that begins at column `left`.
+fn mark(picture: &mut Picture, left: usize, [cx, cy]: [f64; 2], status: PositionStatus) {
     let black = [0, 0, 0];
     let (ink, halo) = match status {
         PositionStatus::Verified => ([86, 180, 233], black),
@@ -162,14 +226,14 @@ fn mark(picture: &mut Picture, [cx, cy]: [f64; 2], status: PositionStatus) {
             let (Ok(x), Ok(y)) = (usize::try_from(px), usize::try_from(py)) else {
                 continue;
             };
-            if x >= picture.width || y >= picture.height {
+            if x >= picture.panel || y >= picture.height {
                 continue;
             }
             let distance = outline(status, px as f64 + 0.5 - cx, py as f64 + 0.5 - cy);
             if distance < 1.5 {
-                picture.pixels[y * picture.width + x] = ink;
+                picture.pixels[y * picture.width + left + x] = ink;
             } else if distance < 3.0 {
-                picture.pixels[y * picture.width + x] = halo;
+                picture.pixels[y * picture.width + left + x] = halo;
             }
         }
     }

@@ -5,13 +5,15 @@ use axum::http::{HeaderMap, StatusCode};
 use axum::response::Response;
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
+use serde_json::json;
 
-use super::extract::{Path, Query};
+use super::extract::{Path, Query, within};
 use super::feed::Published;
-use super::history::Moment;
+use super::history::{Moment, PastBeam};
 use super::problem::Problem;
 use super::snapshot::Status;
 use super::state::State;
+use super::table::{self, Columns};
 use super::{conditional, respond};
 use crate::monitor::{Report, UserPosition};
 
@@ -105,7 +107,51 @@ pub struct Moments {
         (status = 400, description = "A parameter cannot be read", body = Problem, content_type = "application/problem+json"),
     ))]
 pub async fn history(Shared(state): Shared<State>, Query(query): Query<HistoryQuery>) -> Result<Response, Problem> {
-    let limit = super::extract::within("limit", query.limit.unwrap_or(3600), 1, 3600)?;
-    let moments = state.feed.history(|h| h.after(query.since, limit));
+    let moments = moments(&state, &query)?;
     Ok(respond::json(&Moments { moments }))
+}
+
+fn moments(state: &State, query: &HistoryQuery) -> Result<Vec<Moment>, Problem> {
+    let limit = within("limit", query.limit.unwrap_or(3600), 1, 3600)?;
+    Ok(state.feed.history(|h| h.after(query.since, limit)))
+}
+
+const COLUMNS: &Columns = &[
+    ("time", "/time"),
+    ("frame", "/frame"),
+    ("track", "/track"),
+    ("user", "/user"),
+    ("status", "/status"),
+    ("x_m", "/x_m"),
+    ("y_m", "/y_m"),
+];
+
+/// The same as a table (CSV), a row for each beam
+///
+/// Text that a spreadsheet would take for a formula begins with an apostrophe.
+#[utoipa::path(get, path = "/v1/history.csv", tag = "positions", params(HistoryQuery),
+    responses(
+        (status = 200, description = "A header and a row for each beam, oldest first", body = String, content_type = "text/csv"),
+        (status = 400, description = "A parameter cannot be read", body = Problem, content_type = "application/problem+json"),
+    ))]
+pub async fn history_csv(Shared(state): Shared<State>, Query(query): Query<HistoryQuery>) -> Result<Response, Problem> {
+    let moments = moments(&state, &query)?;
+    let make = move || {
+        let row = |moment: &Moment, beam: &PastBeam| {
+            let mut row = serde_json::to_value(beam).expect("beams are JSON");
+            row["time"] = json!(moment.time);
+            row["frame"] = json!(moment.frame);
+            // As JSON has them: a centimetre, and not the digits by which a single-precision number misses it.
+            for (key, metres) in [("x_m", beam.x_m), ("y_m", beam.y_m)] {
+                row[key] = json!((f64::from(metres) * 100.0).round() / 100.0);
+            }
+            row
+        };
+        let beams = moments
+            .iter()
+            .flat_map(|m| m.emitters.iter().map(move |beam| row(m, beam)));
+        [table::head(COLUMNS), table::rows(COLUMNS, beams)].concat()
+    };
+    let table = tokio::task::spawn_blocking(make).await.expect("writing does not panic");
+    Ok(table::download("history.csv", table))
 }

@@ -104,6 +104,7 @@ impl From<BytesRejection> for Problem {
 pub async fn for_every_error(request: Request, next: Next) -> Response {
     let method = request.method().clone();
     let path = request.uri().path().to_owned();
+    let encoding = request.headers().get(header::CONTENT_ENCODING).cloned();
     let response = next.run(request).await;
     let status = response.status();
     let plain = status.is_client_error() || status.is_server_error();
@@ -114,6 +115,12 @@ pub async fn for_every_error(request: Request, next: Next) -> Response {
         StatusCode::NOT_FOUND => format!("there is nothing at {path}; /openapi.json lists what there is"),
         StatusCode::METHOD_NOT_ALLOWED => format!("{path} does not take {method}"),
         StatusCode::PAYLOAD_TOO_LARGE => "the body is larger than this server reads".to_owned(),
+        StatusCode::UNSUPPORTED_MEDIA_TYPE => {
+            format!(
+                "Content-Encoding: expected gzip or none, found {:?}",
+                encoding.unwrap_or_else(|| HeaderValue::from_static(""))
+            )
+        }
         StatusCode::REQUEST_TIMEOUT => "the request did not arrive in time".to_owned(),
         _ => status.canonical_reason().unwrap_or("the request failed").to_owned(),
     };

@@ -11,11 +11,11 @@ use axum::response::Response;
 use axum::response::sse::{Event, KeepAlive, Sse};
 use futures_util::stream;
 
-use super::auth::Session;
 use super::extract::Query;
 use super::problem::Problem;
 use super::state::State;
 use super::stream::{self as feed, Reader};
+use super::tokens::Session;
 use super::websocket::{StreamQuery, stopped};
 
 /// The same messages as server-sent events
@@ -39,7 +39,7 @@ pub async fn events(
         .and_then(|v| v.parse().ok());
     let mut stopping = state.stopping.subscribe();
     let reader = Reader::join(state, last_seen.or(query.after)).await;
-    let counted = super::server::Counted::stream("sse");
+    let counted = super::connection::Counted::stream("sse");
     let messages = stream::unfold((reader, counted), |(mut reader, counted)| async move {
         let message = reader.next().await;
         let event = Event::default()

@@ -4,13 +4,17 @@ use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
+use axum::http::StatusCode;
 use metrics_exporter_prometheus::PrometheusHandle;
 use tokio::sync::{mpsc, oneshot, watch};
 
 use super::audit::Audit;
+use super::evidence_fit::Fitter;
 use super::feed::Feed;
 use super::picture_cache::PictureCache;
+use super::problem::Problem;
 use crate::claim::Claim;
+use crate::estimate;
 use crate::frames::record;
 use crate::journal::Journal;
 use crate::monitor::Alert;
@@ -32,6 +36,7 @@ pub struct State {
     pub(super) audit: Audit,
     /// The recorder's folder for evidence, where frames are recorded.
     pub(super) evidence: Option<Arc<Path>>,
+    pub(super) fitter: Arc<Fitter>,
     /// Turns true when the server stops: streams then close.
     pub(super) stopping: watch::Sender<bool>,
 }
@@ -49,6 +54,7 @@ impl State {
             commands,
             audit: Audit::new(journal.clone()),
             evidence: None,
+            fitter: Arc::new(Fitter::new(estimate::Config::default())),
             journal,
             metrics,
             ready,
@@ -58,16 +64,34 @@ impl State {
         }
     }
 
-    /// `folder` is the recorder's.
-    pub fn with_evidence(mut self, folder: &Path) -> Self {
+    /// `folder` is the recorder's; `estimator` explains what it recorded.
+    pub fn with_evidence(mut self, folder: &Path, estimator: &estimate::Config) -> Self {
+        self.fitter = Arc::new(Fitter::new(estimator.clone()));
         self.evidence = Some(folder.join(record::EVIDENCE).into());
         self
+    }
+
+    /// Asks the compute thread and waits for its answer; a full queue is overload.
+    pub(super) async fn ask<T>(&self, command: impl FnOnce(oneshot::Sender<T>) -> Command) -> Result<T, Problem> {
+        let (reply, answer) = oneshot::channel();
+        self.commands.try_send(command(reply)).map_err(|e| match e {
+            mpsc::error::TrySendError::Full(_) => busy(),
+            mpsc::error::TrySendError::Closed(_) => {
+                Problem::later(StatusCode::SERVICE_UNAVAILABLE, 5, "the monitor is stopping")
+            }
+        })?;
+        answer.await.map_err(|_| busy())
     }
 
     pub fn with_webhooks(mut self, notifier: Notifier) -> Self {
         self.notifier = Some(notifier);
         self
     }
+}
+
+pub(super) fn busy() -> Problem {
+    let detail = "the monitor is too busy to take this now";
+    Problem::later(StatusCode::SERVICE_UNAVAILABLE, 1, detail)
 }
 
 /// What a client may ask of the compute thread.

@@ -11,7 +11,7 @@ use super::problem::Problem;
 use super::respond;
 use super::state::State;
 use crate::journal::{AuditAction, DeadLetter};
-use crate::notify::{AskError, EndpointStatus, Notifier};
+use crate::notify::{AskError, EndpointStatus, Notifier, TestOutcome};
 
 /// Dead letters listed at most.
 const MAX_LETTERS: usize = 1000;
@@ -51,6 +51,7 @@ impl From<AskError> for Problem {
     fn from(error: AskError) -> Self {
         match error {
             AskError::Unknown(_) => Self::not_found(error.to_string()),
+            AskError::TooSoon(seconds) => Self::later(StatusCode::TOO_MANY_REQUESTS, seconds, error.to_string()),
             AskError::ReadOnly | AskError::Stopping | AskError::Journal(_) => {
                 Self::later(StatusCode::SERVICE_UNAVAILABLE, 5, error.to_string())
             }
@@ -126,4 +127,26 @@ pub async fn enable(
     notifier(&state, &name)?.enable(&name).await?;
     state.audit.change(AuditAction::EnableWebhook, &caller, &name, None);
     Ok(StatusCode::NO_CONTENT)
+}
+
+/// Sends a signed event that is marked as a test, once
+///
+/// Its `type` is `webhook.test`, and its alert is made up. It is sent whatever the webhook's kinds and state are, counts for no
+/// retry, and the answer is waited for 5 s.
+#[utoipa::path(post, path = "/v1/webhooks/{name}/test", tag = "webhooks",
+    params(("name" = String, Path, description = "The webhook's name")),
+    responses(
+        (status = 200, description = "What came back from the receiver", body = TestOutcome),
+        (status = 400, description = "The path cannot be read", body = Problem, content_type = "application/problem+json"),
+        (status = 404, description = "There is no such webhook", body = Problem, content_type = "application/problem+json"),
+        (status = 429, description = "Another test event was sent a moment ago", body = Problem, content_type = "application/problem+json"),
+        (status = 503, description = "The daemon is stopping", body = Problem, content_type = "application/problem+json"),
+    ))]
+pub async fn test(Shared(state): Shared<State>, caller: Caller, Path(name): Path<String>) -> Result<Response, Problem> {
+    let outcome = notifier(&state, &name)?.test(&name).await?;
+    let detail = outcome.error.clone().unwrap_or_else(|| "delivered".to_owned());
+    state
+        .audit
+        .change(AuditAction::TestWebhook, &caller, &name, Some(detail));
+    Ok(respond::json(&outcome))
 }

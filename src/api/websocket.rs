@@ -12,11 +12,11 @@ use serde::Deserialize;
 use tokio::sync::watch;
 use tokio::time::{Instant, interval, timeout};
 
-use super::auth::Session;
 use super::extract::Query;
 use super::problem::Problem;
 use super::state::State;
 use super::stream::{self, Reader};
+use super::tokens::Session;
 
 /// A ping is sent this often.
 const PING_EVERY: Duration = Duration::from_secs(15);
@@ -65,7 +65,7 @@ pub async fn websocket(
         .write_buffer_size(0)
         .max_write_buffer_size(MAX_WRITE_BUFFER)
         .on_upgrade(move |socket| async move {
-            let _counted = super::server::Counted::stream("websocket");
+            let _counted = super::connection::Counted::stream("websocket");
             converse(socket, state, query.after, session).await;
         })
 }

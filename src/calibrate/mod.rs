@@ -135,7 +135,7 @@ pub fn fit(
     beacons: &[Beacon],
     progress: &mut dyn FnMut(usize, f64, f64),
 ) -> Fitted {
-    let saturated = camera.saturation_j.unwrap_or(f64::INFINITY);
+    let saturated = camera.saturation_limit_j();
     let exposures = frames
         .iter()
         .map(|(frame, pixels)| Exposure {

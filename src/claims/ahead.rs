@@ -6,7 +6,8 @@ use jiff::Timestamp;
 
 use super::Claim;
 
-/// Claims that wait where a log is read ahead of its frames.
+/// Claims that wait where a log is read ahead of its frames. Fewer lose claims of a long recording that is read at once, more take memory.
+/// Not tuned.
 pub(super) const MOST_IN_A_REPLAY: usize = 500_000;
 /// Claims that wait in a live run, those of known names and all others apart: an honest log's clock is ahead by a second or two, and what falls
 /// due at one instant is placed within one frame.

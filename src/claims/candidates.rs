@@ -6,19 +6,33 @@ use std::collections::{BTreeMap, HashMap};
 /// Unanswered users handed to the monitor at most. At 4 µs each (compute thread, `siege_a_carpet_of_claims`) they cost a frame half as much again as
 /// its estimate; no honest scene has as many users that were never seen.
 pub const MOST_UNANSWERED: usize = 128;
-/// Users looked at again in each frame, because a claim's reach grows with its age: 20,000 take 80 frames, and as many as these none.
+/// Users looked at again in each frame, because a claim's reach grows with its age: 20,000 take 80 frames, and as many as these none. More
+/// find a user who comes into reach sooner, fewer cost a frame less. Not tuned.
 const SWEEP: usize = 256;
 /// Edge of a cell of the grid, m, and how many cells around a beam's are searched: 20,000 claims in view are five a cell, and a claim answers a
 /// beam within 13.5 m (5 σ at 5 m tolerated, σ 1 m).
 const CELL_M: f64 = 4.0;
 const RINGS: i32 = 4;
-/// Claims of a cell that are compared, newest users first, and claims kept for each beam.
+/// Claims of a cell that are compared, newest users first, and claims kept for each beam. More find the nearest of a denser carpet, fewer
+/// bound what an attacker can make a frame cost. Not tuned.
 const MOST_IN_A_CELL: usize = 32;
 const MOST_FOR_A_BEAM: usize = 4;
 /// Beams that are served: as many spots as an estimator finds.
 const MOST_BEAMS: usize = 32;
 
 type Cell = (i32, i32);
+
+/// How a claim bears on the view.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Bearing {
+    /// As it stands: it is claimed in the view, or as near to it as a user may honestly be off.
+    InView,
+    /// Its user may have come into the view since.
+    Beyond,
+}
+
+/// Order in which users are held against a frame: those in view first, and of these those known longest.
+type Rank = (Bearing, u64);
 
 /// Users that no beam answers, by slot of the store; those whose claim bears on the view also by place and by how long they are known.
 #[derive(Debug, Default)]
@@ -27,8 +41,11 @@ pub(super) struct Index {
     all: Vec<u32>,
     cursor: usize,
     unlooked: Vec<u32>,
-    near: BTreeMap<u64, Near>,
-    grid: HashMap<Cell, BTreeMap<u64, [f64; 2]>>,
+    near: BTreeMap<Rank, Near>,
+    /// How many of them are in view.
+    in_view: usize,
+    /// The same by place, and of each cell by the order in which users were first heard.
+    grid: HashMap<Cell, BTreeMap<u64, (Bearing, [f64; 2])>>,
 }
 
 #[derive(Clone, Debug, Default)]
@@ -37,7 +54,7 @@ struct Entry {
     at: Option<usize>,
     /// Order in which the user was first heard.
     sequence: u64,
-    is_near: bool,
+    near: Option<Bearing>,
     is_unlooked: bool,
 }
 
@@ -61,7 +78,7 @@ impl Index {
     /// Whether the user's claim bears on the view, or may: it has not been looked at yet.
     pub fn may_bear(&self, slot: u32) -> bool {
         let entry = self.entries.get(slot as usize);
-        entry.is_some_and(|e| e.is_near || e.is_unlooked)
+        entry.is_some_and(|e| e.near.is_some() || e.is_unlooked)
     }
 
     /// Adds a user, or notes that they have a new claim.
@@ -101,8 +118,9 @@ impl Index {
         *self = Self::default();
     }
 
-    /// Looks at every user with a new claim, and at some of the others in turn. `place` gives where a claim stands that bears on the view.
-    pub fn look(&mut self, place: impl Fn(u32) -> Option<[f64; 2]>) {
+    /// Looks at every user with a new claim, and at some of the others in turn. `place` gives where a claim stands that bears on the view,
+    /// and how.
+    pub fn look(&mut self, place: impl Fn(u32) -> Option<(Bearing, [f64; 2])>) {
         for slot in std::mem::take(&mut self.unlooked) {
             // A slot may have been given to another user since, or to nobody.
             if std::mem::take(&mut self.entries[slot as usize].is_unlooked) {
@@ -116,41 +134,46 @@ impl Index {
         }
     }
 
-    fn set(&mut self, slot: u32, position: Option<[f64; 2]>) {
+    fn set(&mut self, slot: u32, place: Option<(Bearing, [f64; 2])>) {
         let Some(entry) = self.entries.get_mut(slot as usize) else {
             return;
         };
         let sequence = entry.sequence;
-        if std::mem::replace(&mut entry.is_near, position.is_some()) {
-            let Some(known) = self.near.get_mut(&sequence) else {
-                return;
-            };
-            if Some(known.position) == position {
+        let before = std::mem::replace(&mut entry.near, place.map(|(bearing, _)| bearing));
+        if let Some(bearing) = before
+            && let Some(near) = self.near.get(&(bearing, sequence))
+        {
+            if place == Some((bearing, near.position)) {
                 return;
             }
-            let old = cell(known.position);
+            let old = cell(near.position);
             if let Some(there) = self.grid.get_mut(&old) {
                 there.remove(&sequence);
                 if there.is_empty() {
                     self.grid.remove(&old);
                 }
             }
-            if position.is_none() {
-                self.near.remove(&sequence);
-            }
+            self.near.remove(&(bearing, sequence));
+            self.in_view -= usize::from(bearing == Bearing::InView);
         }
-        if let Some(position) = position {
-            self.near.insert(sequence, Near { slot, position });
-            self.grid.entry(cell(position)).or_default().insert(sequence, position);
+        if let Some((bearing, position)) = place {
+            self.near.insert((bearing, sequence), Near { slot, position });
+            self.in_view += usize::from(bearing == Bearing::InView);
+            let there = self.grid.entry(cell(position)).or_default();
+            there.insert(sequence, (bearing, position));
         }
     }
 
-    /// Users to hold the frame against, and how many that bear on it are left out.
-    pub fn pick(&mut self, beams: &[[f64; 2]], place: impl Fn(u32) -> Option<[f64; 2]>) -> (Vec<u32>, usize) {
+    /// Users to hold the frame against, and how many in view are left out.
+    pub fn pick(
+        &mut self,
+        beams: &[[f64; 2]],
+        place: impl Fn(u32) -> Option<(Bearing, [f64; 2])>,
+    ) -> (Vec<u32>, usize) {
         if self.near.len() <= MOST_UNANSWERED {
             return (self.near.values().map(|near| near.slot).collect(), 0);
         }
-        let mut chosen: Vec<u64> = Vec::with_capacity(MOST_UNANSWERED + MOST_FOR_A_BEAM);
+        let mut chosen: Vec<Rank> = Vec::with_capacity(MOST_UNANSWERED + MOST_FOR_A_BEAM);
         for beam in beams.iter().take(MOST_BEAMS) {
             chosen.extend(self.nearest(*beam));
         }
@@ -158,32 +181,35 @@ impl Index {
         chosen.dedup();
         chosen.truncate(MOST_UNANSWERED);
         let mut over = Vec::new();
-        let mut oldest = Vec::new();
-        for (sequence, near) in self.near.iter().take(2 * MOST_UNANSWERED) {
-            if chosen.len() + oldest.len() == MOST_UNANSWERED {
+        let mut first = Vec::new();
+        for (rank, near) in self.near.iter().take(2 * MOST_UNANSWERED) {
+            if chosen.len() + first.len() == MOST_UNANSWERED {
                 break;
             }
-            if chosen.binary_search(sequence).is_ok() {
+            if chosen.binary_search(rank).is_ok() {
                 continue;
             }
             match place(near.slot) {
-                Some(_) => oldest.push(*sequence),
+                Some(_) => first.push(*rank),
                 None => over.push(near.slot),
             }
         }
-        chosen.extend(oldest);
+        chosen.extend(first);
         for slot in over {
             self.set(slot, None);
         }
-        let left_out = self.near.len() - chosen.len();
-        let slots = chosen.iter().filter_map(|s| self.near.get(s)).map(|near| near.slot);
-        (slots.collect(), left_out)
+        let slots = chosen
+            .iter()
+            .filter_map(|rank| self.near.get(rank))
+            .map(|near| near.slot);
+        let in_view = chosen.iter().filter(|(bearing, _)| *bearing == Bearing::InView).count();
+        (slots.collect(), self.in_view - in_view)
     }
 
     /// The users claimed nearest to a beam.
-    fn nearest(&self, beam: [f64; 2]) -> Vec<u64> {
+    fn nearest(&self, beam: [f64; 2]) -> Vec<Rank> {
         let (column, row) = cell(beam);
-        let mut found: Vec<(f64, u64)> = Vec::new();
+        let mut found: Vec<(f64, Rank)> = Vec::new();
         for ring in 0..=RINGS {
             // What the ring before has found may be farther off than what this one finds.
             let is_enough = found.len() >= MOST_FOR_A_BEAM;
@@ -192,25 +218,29 @@ impl Index {
                     continue;
                 };
                 let newest = there.iter().rev().take(MOST_IN_A_CELL);
-                found.extend(newest.map(|(sequence, [x, y])| ((x - beam[0]).hypot(y - beam[1]), *sequence)));
+                found.extend(newest.map(|(sequence, (bearing, [x, y]))| {
+                    let away = (x - beam[0]).hypot(y - beam[1]);
+                    (away, (*bearing, *sequence))
+                }));
             }
             if is_enough {
                 break;
             }
         }
-        found.sort_by(|a, b| a.0.total_cmp(&b.0).then(b.1.cmp(&a.1)));
+        found.sort_by(|a, b| a.0.total_cmp(&b.0).then(b.1.1.cmp(&a.1.1)));
         found.truncate(MOST_FOR_A_BEAM);
-        found.into_iter().map(|(_, sequence)| sequence).collect()
+        found.into_iter().map(|(_, rank)| rank).collect()
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use super::Bearing::{Beyond, InView};
     use super::*;
 
     /// Users on a grid 1 m apart, all in view.
-    fn index(users: u32) -> (Index, impl Fn(u32) -> Option<[f64; 2]> + Copy) {
-        let place = |slot: u32| Some([f64::from(slot % 100), f64::from(slot / 100)]);
+    fn index(users: u32) -> (Index, impl Fn(u32) -> Option<(Bearing, [f64; 2])> + Copy) {
+        let place = |slot: u32| Some((InView, [f64::from(slot % 100), f64::from(slot / 100)]));
         let mut index = Index::default();
         for slot in 0..users {
             index.note(slot, u64::from(slot));
@@ -247,9 +277,32 @@ mod tests {
     fn a_claim_that_moves_is_found_where_it_is() {
         let (mut index, place) = index(5000);
         index.note(17, 17);
-        index.look(|slot| if slot == 17 { Some([500.0, 500.0]) } else { place(slot) });
-        assert_eq!(index.nearest([500.0, 501.0]), [17]);
-        assert_eq!(index.nearest([510.0, 510.0]), [17], "a ring or two away");
-        assert!(!index.nearest([17.0, 0.0]).contains(&17));
+        index.look(|slot| {
+            if slot == 17 {
+                Some((InView, [500.0, 500.0]))
+            } else {
+                place(slot)
+            }
+        });
+        assert_eq!(index.nearest([500.0, 501.0]), [(InView, 17)]);
+        assert_eq!(index.nearest([510.0, 510.0]), [(InView, 17)], "a ring or two away");
+        assert!(!index.nearest([17.0, 0.0]).contains(&(InView, 17)));
+    }
+
+    #[test]
+    fn users_beyond_the_view_are_picked_last_and_never_left_out() {
+        let mut index = Index::default();
+        let place = |slot: u32| Some((if slot < 1000 { Beyond } else { InView }, [f64::from(slot), 0.0]));
+        (0..1100).for_each(|slot| index.note(slot, u64::from(slot)));
+        index.look(place);
+        // Nobody in view is left out by a thousand beyond it who were heard before.
+        let (picked, left_out) = index.pick(&[[20.0, 0.0]], place);
+        assert_eq!((picked.len(), left_out), (MOST_UNANSWERED, 0));
+        assert!((1000..1100).all(|slot| picked.contains(&slot)) && picked.contains(&20));
+        // They come into the view.
+        let place = |slot: u32| Some((InView, [f64::from(slot), 0.0]));
+        (0..1100).for_each(|slot| index.note(slot, u64::from(slot)));
+        index.look(place);
+        assert_eq!(index.pick(&[], place).1, 1100 - MOST_UNANSWERED);
     }
 }

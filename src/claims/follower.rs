@@ -4,8 +4,11 @@ use std::fs::{File, Metadata};
 use std::io::{self, Read, Seek, SeekFrom};
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
+use std::time::SystemTime;
 
-use super::{Claim, Config, LineError, parse_line};
+use jiff::Timestamp;
+
+use super::{Claim, Config, LineError, parse_line, rotated};
 
 /// Longest line accepted; a longer one is refused as a whole.
 pub const LONGEST_LINE: usize = 64 * 1024;
@@ -23,6 +26,10 @@ pub struct Follower {
     path: PathBuf,
     config: Config,
     open: Option<Open>,
+    /// The file before, which its writer may go on with until it opens the new one.
+    rotated: Option<Open>,
+    /// A file that was rotated away after this time is read before the log itself.
+    missed_since: Option<SystemTime>,
     /// How far behind the log's end reading may be before what lies between is passed over.
     most_behind: Option<u64>,
 }
@@ -130,6 +137,13 @@ impl Lines {
         };
     }
 
+    /// Ends the line at hand if it is a claim without its newline; more may come of one that is not.
+    fn finish_claim(&mut self, config: &Config, poll: &mut Poll) {
+        if !self.is_cut && !self.overlong && parse_line(&self.partial, config).is_ok() {
+            self.finish(config, poll);
+        }
+    }
+
     fn is_midline(&self) -> bool {
         self.overlong || !self.partial.is_empty()
     }
@@ -141,14 +155,31 @@ impl Follower {
             path: path.to_owned(),
             config: config.clone(),
             open: None,
+            rotated: None,
+            missed_since: None,
             most_behind: None,
         }
     }
 
-    /// Follows a live log: reading that is more than `[claims] tail_bytes` behind the log's end, at the start or later, goes on from there.
-    pub fn live(self) -> Self {
-        let most_behind = Some(self.config.tail_bytes);
-        Self { most_behind, ..self }
+    /// Follows a live log: reading that is more than `[claims] tail_bytes` behind the log's end, at the start or later, goes on
+    /// from there. If the log was rotated after `since`, the file before it is read first.
+    pub fn live(self, since: SystemTime) -> Self {
+        Self {
+            most_behind: Some(self.config.tail_bytes),
+            missed_since: Some(since),
+            ..self
+        }
+    }
+
+    /// Reads lines by other rules from now on, and another log from its start where `path` is another.
+    pub fn change(&mut self, path: &Path, config: &Config) {
+        if path != self.path {
+            self.path = path.to_owned();
+            self.open = None;
+            self.rotated = None;
+        }
+        self.config = config.clone();
+        self.most_behind = self.most_behind.map(|_| config.tail_bytes);
     }
 
     /// Reads what has been written since the last poll. A log that does not exist (yet) gives nothing. An error says
@@ -159,6 +190,15 @@ impl Follower {
             Err(e) if e.kind() == io::ErrorKind::NotFound => None,
             other => Some(other),
         };
+        if let Some(since) = self.missed_since.take() {
+            let before = rotated::predecessors(&self.path).into_iter().next();
+            let missed = before.filter(|(written, _)| *written >= since);
+            self.rotated = missed.and_then(|(_, path)| Open::new(&path).ok());
+        }
+        self.read_rotated(&mut poll);
+        if poll.more {
+            return Ok(poll);
+        }
         if let Some(open) = &mut self.open {
             if open.was_rewritten()? {
                 open.restart()?;
@@ -174,17 +214,28 @@ impl Follower {
             if !replaced || poll.more {
                 return Ok(poll);
             }
-            // The old file has been read to its end; nobody will finish its last line.
-            if open.lines.is_midline() {
-                open.lines.finish(&self.config, &mut poll);
+            open.lines.finish_claim(&self.config, &mut poll);
+            let before = std::mem::replace(&mut self.rotated, self.open.take());
+            if let Some(mut before) = before {
+                before.end(&self.config, &mut poll);
             }
-            self.open = None;
             poll.restarted = true;
         }
         match self.begin(on_disk, &mut poll) {
-            Err(e) if !poll.restarted => Err(e),
+            Err(e) if !poll.restarted && poll.claims.is_empty() && poll.refused_count == 0 => Err(e),
             // The next poll meets the error again.
             _ => Ok(poll),
+        }
+    }
+
+    /// Reads the file before until the next rotation, or until it has been deleted.
+    fn read_rotated(&mut self, poll: &mut Poll) {
+        let Some(before) = &mut self.rotated else { return };
+        let is_deleted = before.file.metadata().is_ok_and(|meta| meta.nlink() == 0);
+        let outcome = before.read(&self.config, self.most_behind, poll);
+        if outcome.is_err() || is_deleted && !poll.more {
+            before.end(&self.config, poll);
+            self.rotated = None;
         }
     }
 
@@ -212,15 +263,21 @@ impl Follower {
 
 impl Open {
     fn new(path: &Path) -> io::Result<Self> {
-        let file = File::open(path)?;
-        let meta = file.metadata()?;
+        let meta = std::fs::metadata(path)?;
         Ok(Self {
-            file,
+            file: rotated::open(path)?,
             identity: (meta.dev(), meta.ino()),
             offset: 0,
             head: Vec::new(),
             lines: Lines::default(),
         })
+    }
+
+    /// Nobody will finish the last line.
+    fn end(&mut self, config: &Config, poll: &mut Poll) {
+        if self.lines.is_midline() {
+            self.lines.finish(config, poll);
+        }
     }
 
     fn was_rewritten(&mut self) -> io::Result<bool> {
@@ -276,9 +333,28 @@ impl Open {
     }
 }
 
-/// Reads a whole log for a review: claims by rising time (lines of equal time in the log's order). The last line
-/// may lack its newline.
-pub fn read_log(path: &Path, config: &Config) -> io::Result<Poll> {
+/// Reads a whole log for a review: claims by rising time (lines of equal time in the log's order). The last line may lack its
+/// newline. Where the log begins after `since`, what was rotated away before it is read too.
+pub fn read_log(path: &Path, config: &Config, since: Option<Timestamp>) -> io::Result<Poll> {
+    let mut poll = read_whole(path, config)?;
+    for (_, path) in rotated::predecessors(path) {
+        let first = poll.claims.iter().map(|claim| claim.time).min();
+        if since.is_none_or(|since| first.is_some_and(|first| first <= since)) {
+            break;
+        }
+        tracing::info!(
+            "the claims log begins after the recording; reading {} too",
+            path.display()
+        );
+        let before = read_whole(&path, config)?;
+        poll.refused_count += before.refused_count;
+        poll.claims.splice(0..0, before.claims);
+    }
+    poll.claims.sort_by_key(|claim| claim.time);
+    Ok(poll)
+}
+
+fn read_whole(path: &Path, config: &Config) -> io::Result<Poll> {
     let mut open = Open::new(path)?;
     let mut poll = Poll::default();
     loop {
@@ -288,9 +364,6 @@ pub fn read_log(path: &Path, config: &Config) -> io::Result<Poll> {
             break;
         }
     }
-    if open.lines.is_midline() {
-        open.lines.finish(config, &mut poll);
-    }
-    poll.claims.sort_by_key(|claim| claim.time);
+    open.end(config, &mut poll);
     Ok(poll)
 }

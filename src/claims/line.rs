@@ -11,6 +11,9 @@ const LONGEST_USER: usize = 256;
 /// A local coordinate beyond this is a mistake of units or axes.
 const FARTHEST_M: f64 = 1e7;
 
+/// Some editors and Windows programs begin a UTF-8 file with it.
+const BYTE_ORDER_MARK: &[u8] = b"\xef\xbb\xbf";
+
 /// Why a line is no claim.
 #[derive(Debug, thiserror::Error)]
 pub enum LineError {
@@ -31,6 +34,7 @@ pub enum LineError {
 /// Reads one line of the network's log: a JSON object with the fields that `config` names, by default
 /// `{"time", "user", "x_m", "y_m", "sigma_m"?, "power_w"?, "state"?}`. Other fields are ignored.
 pub fn parse_line(line: &[u8], config: &Config) -> Result<Claim, LineError> {
+    let line = line.strip_prefix(BYTE_ORDER_MARK).unwrap_or(line);
     let object: Value = serde_json::from_slice(line)?;
     if !object.is_object() {
         return Err(wrong("the line", "a JSON object", &object));

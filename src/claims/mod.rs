@@ -10,10 +10,12 @@ mod inbox;
 mod line;
 mod outcome;
 mod pressure;
+mod registry;
 mod roster;
+mod rotated;
 mod store;
 
-pub use candidates::MOST_UNANSWERED;
+pub use candidates::{Bearing, MOST_UNANSWERED};
 pub use config::{Config, ConfigError, Fields, Origin};
 pub use follower::{Follower, LONGEST_LINE, Poll, Refused, read_log};
 pub use history::Standing;

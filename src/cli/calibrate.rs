@@ -16,7 +16,7 @@ use crate::optics::Camera;
 
 #[derive(Debug, clap::Args)]
 #[command(
-    after_help = "Examples:\n  oapwatch calibrate --config oapwatch.toml --truth positions.ndjson --out calibration.toml frames.npy"
+    after_help = "Examples:\n  oapwatch calibrate --config oapwatch.toml --truth positions.ndjson \\\n    --out calibration.toml frames.npy"
 )]
 pub struct Args {
     /// Config with the data sheet of the device; the result must improve on a calibration that it names

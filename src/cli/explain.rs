@@ -25,6 +25,7 @@ pub struct Args {
     /// Which frame to draw
     #[arg(long, default_value_t = 0)]
     frame: u64,
+    /// Of the frame that is drawn
     #[arg(long, default_value_t = 0)]
     seed: u64,
     /// Print one JSON object instead of a table

@@ -18,6 +18,7 @@ use crate::frames::npy;
     after_help = "Examples:\n  oapwatch locate --config oapwatch.toml frames.npy > emitters.ndjson\n  ssh camera cat frames.npy | oapwatch locate --config oapwatch.toml -"
 )]
 pub struct Args {
+    /// Config with the optics of the frames
     #[arg(long)]
     config: PathBuf,
     /// Estimator to use instead of the configured one; `oapwatch tradeoff` compares them

@@ -47,6 +47,14 @@ const FILES: [(&str, &str); 4] = [
 
 const ENVIRONMENT: [(&str, &str); 1] = [("OAPWATCH_LOG", "Log level or filter; wins over [log] level.")];
 
+const SIGNALS: [(&str, &str); 2] = [
+    (
+        "SIGHUP",
+        "Loads [monitor], [claims], [[webhook]] and [log] again, all or, where the file is bad, nothing.",
+    ),
+    ("SIGTERM, SIGINT", "Stop within two seconds."),
+];
+
 /// Writes one page for the program and one for each command.
 pub fn run(args: Args) -> Outcome {
     write_pages(&args.out).map_err(Failure::Other)
@@ -78,6 +86,7 @@ fn write_pages(folder: &Path) -> anyhow::Result<()> {
 fn page(out: &mut dyn Write, command: Command, is_program: bool) -> io::Result<()> {
     let help = command.get_after_help().map(ToString::to_string).unwrap_or_default();
     let examples = help.strip_prefix("Examples:").unwrap_or_default().to_owned();
+    let is_daemon = command.get_name() == "run";
     let has_version = command.get_version().is_some();
     let man = Man::new(command);
     man.render_title(out)?;
@@ -96,6 +105,9 @@ fn page(out: &mut dyn Write, command: Command, is_program: bool) -> io::Result<(
         writeln!(out, ".fi")?;
     }
     section(out, "EXIT STATUS", &EXIT_STATUS)?;
+    if is_daemon {
+        section(out, "SIGNALS", &SIGNALS)?;
+    }
     section(out, "ENVIRONMENT", &ENVIRONMENT)?;
     section(out, "FILES", &FILES)?;
     if !is_program {
@@ -137,6 +149,7 @@ mod tests {
             }
         }
         assert!(page("oapwatch.1").contains("SUBCOMMANDS"));
+        assert!(page("oapwatch-run.1").contains("SIGHUP"));
         assert_eq!(super::escaped(".a\\b-c"), "\\&.a\\eb\\-c");
     }
 }

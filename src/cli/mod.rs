@@ -16,6 +16,7 @@ mod run;
 mod simulate;
 mod simulated_recording;
 mod stability;
+mod study;
 mod tradeoff;
 mod training_data;
 
@@ -59,6 +60,9 @@ enum Command {
     TrainingData(training_data::Args),
     /// Run a catalogue of hard cases and print which requirements hold
     Stability(stability::Args),
+    /// Measure how often honest users raise an alert, and how soon an attack does
+    #[command(hide = true)]
+    Study(study::Args),
     /// Validate a config or scene without running it
     Check(check::Args),
     /// List V4L2 devices with their formats and sizes
@@ -90,6 +94,7 @@ pub fn main() -> ExitCode {
         Command::Golden(args) => golden::run(args),
         Command::TrainingData(args) => training_data::run(args),
         Command::Stability(args) => stability::run(args),
+        Command::Study(args) => study::run(args),
         Command::Check(args) => check::run(args),
         Command::Devices(args) => devices::run(args),
         Command::Completions(args) => completions::run(args),

@@ -42,7 +42,7 @@ pub fn run(args: Args) -> Outcome {
         true => Failure::config(e),
         false => Failure::input(e),
     })?;
-    let mut upcoming = claims_of(&config.claims)?.into_iter().peekable();
+    let mut upcoming = claims_of(&config.claims, config.source.start)?.into_iter().peekable();
     let mut out = std::io::BufWriter::new(std::io::stdout().lock());
     let bar = progress::count("frames");
     loop {
@@ -74,11 +74,11 @@ pub fn run(args: Args) -> Outcome {
     out.flush().map_err(Failure::other)
 }
 
-fn claims_of(config: &claims::Config) -> Result<Vec<claims::Claim>, Failure> {
+fn claims_of(config: &claims::Config, start: Option<jiff::Timestamp>) -> Result<Vec<claims::Claim>, Failure> {
     let Some(path) = &config.log else {
         return Ok(Vec::new());
     };
-    let log = read_log(path, config).map_err(|e| {
+    let log = read_log(path, config, start).map_err(|e| {
         Failure::input(anyhow!(
             "claims log {}: expected a readable file, found: {e}",
             path.display()

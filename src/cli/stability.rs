@@ -5,20 +5,24 @@ use std::path::PathBuf;
 
 use super::progress::Steps;
 use super::{Failure, Outcome};
-use crate::estimate;
+use crate::estimate::{self, Rules};
 use crate::study::stability::{Options, catalogue, markdown};
 
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Examples:\n  oapwatch stability --only NaN")]
+#[command(after_help = "Examples:\n  oapwatch stability --only NaN\n  oapwatch stability --without reweighting")]
 pub struct Args {
     /// Frames of each kind
     #[arg(long, value_name = "N", default_value_t = 20, value_parser = clap::value_parser!(u32).range(1..))]
     frames: u32,
+    /// The same seed gives the same frames
     #[arg(long, value_name = "S", default_value_t = 1)]
     seed: u64,
     /// Estimator to test; the default one when left out
     #[arg(long, value_name = "NAME")]
     estimator: Option<String>,
+    /// Leave out this rule of `ml` and `map`: which cases need it
+    #[arg(long, value_name = "RULE", value_parser = clap::builder::PossibleValuesParser::new(Rules::NAMES))]
+    without: Option<String>,
     /// Only cases whose group or name contains this
     #[arg(long, value_name = "TEXT")]
     only: Option<String>,
@@ -33,6 +37,7 @@ pub fn run(args: Args) -> Outcome {
         seed: args.seed,
         estimator: estimate::Config {
             name: args.estimator,
+            rules: args.without.as_deref().and_then(Rules::without).unwrap_or_default(),
             ..estimate::Config::default()
         },
     };

@@ -11,7 +11,7 @@ use crate::study::tradeoff::{Oracle, Plan, Trained, run as study};
 
 #[derive(Debug, clap::Args)]
 #[command(
-    after_help = "Examples:\n  oapwatch tradeoff --quick --out out\n  oapwatch tradeoff --cells P8/60,E1/64 --rungs ml,map --frames 1000 --out out\n  oapwatch tradeoff --oracle --quick"
+    after_help = "Examples:\n  oapwatch tradeoff --quick --out out\n  oapwatch tradeoff --cells P8/60,E1/64 --estimators ml,map --frames 1000 --out out\n  oapwatch tradeoff --without all --frames 40\n  oapwatch tradeoff --oracle --quick"
 )]
 pub struct Args {
     /// Folder for tradeoff.md, tradeoff.json and the pictures; measurements already there are kept
@@ -27,8 +27,8 @@ pub struct Args {
     #[arg(long, value_delimiter = ',')]
     cells: Vec<String>,
     /// Only these estimators, as "pencil,ml"
-    #[arg(long, value_delimiter = ',')]
-    rungs: Vec<String>,
+    #[arg(long, alias = "rungs", value_name = "NAME", value_delimiter = ',')]
+    estimators: Vec<String>,
     /// What each of these rules of `ml` and `map` gains and costs, measured with and without it; `all` takes each in turn
     #[arg(long, value_name = "RULE", value_delimiter = ',')]
     without: Vec<String>,
@@ -39,7 +39,7 @@ pub struct Args {
     #[arg(long)]
     seed: Option<u64>,
     /// Print instead how far `map` is from the most probable hypothesis: its search against one that starts from the truth
-    #[arg(long, conflicts_with_all = ["rungs", "networks"])]
+    #[arg(long, conflicts_with_all = ["estimators", "networks"])]
     oracle: bool,
 }
 
@@ -62,15 +62,15 @@ pub fn run(args: Args) -> Outcome {
     if !args.cells.is_empty() {
         plan.cells.retain(|c| args.cells.contains(&c.name()));
     }
-    if !args.rungs.is_empty() {
-        plan.rungs.retain(|r| args.rungs.iter().any(|name| name == r));
+    if !args.estimators.is_empty() {
+        plan.estimators.retain(|r| args.estimators.iter().any(|name| name == r));
     }
     if let Some(folder) = &args.networks {
         plan.networks = Trained::in_folder(folder).map_err(Failure::input)?;
     }
     if plan.is_empty() {
         return Err(Failure::input(anyhow::anyhow!(
-            "nothing to measure: no such cell or estimator; a run without --cells and --rungs names them all"
+            "nothing to measure: no such cell or estimator; a run without --cells and --estimators names them all"
         )));
     }
     if !args.without.is_empty() {
@@ -78,7 +78,7 @@ pub fn run(args: Args) -> Outcome {
     }
     let mut steps = Steps::new(plan.len() as u64);
     study(&plan, &args.out, &mut |row| {
-        steps.next(&format!("{} {}", row.cell.name(), row.rung));
+        steps.next(&format!("{} {}", row.cell.name(), row.estimator));
     })
     .map_err(Failure::other)?;
     steps.finish();
@@ -134,7 +134,12 @@ fn ablate(plan: &Plan, args: &Args) -> Outcome {
     }
     let plan = ablation::Plan {
         cells: plan.cells.clone(),
-        estimators: plan.rungs.iter().copied().filter(|name| RULED.contains(name)).collect(),
+        estimators: plan
+            .estimators
+            .iter()
+            .copied()
+            .filter(|name| RULED.contains(name))
+            .collect(),
         without,
         frames: plan.frames,
         seed: plan.seed,

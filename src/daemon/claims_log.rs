@@ -2,14 +2,13 @@
 
 use std::collections::{HashMap, HashSet, VecDeque};
 use std::io;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
-use std::time::{Duration, Instant};
+use std::path::{Path, PathBuf};
+use std::sync::mpsc::{Receiver, Sender, SyncSender, TryRecvError, channel, sync_channel};
+use std::time::{Duration, Instant, SystemTime};
 
 use jiff::Timestamp;
 
-use crate::claims::{Claim, Follower, Inbox, MOST_NEW, Poll};
+use crate::claims::{Claim, Config, Follower, Inbox, MOST_NEW, Poll};
 
 /// How often the log is looked at.
 const FOLLOW_EVERY: Duration = Duration::from_millis(100);
@@ -28,28 +27,43 @@ pub enum ClaimsLog {
         follower: Box<Follower>,
         looked: Option<Instant>,
     },
-    /// A thread leaves the claims in the inbox, and says what else it found; it waits until that is taken.
-    Thread(Receiver<io::Result<Poll>>),
+    /// A thread leaves the claims in the inbox, and says what else it found; it waits until that is taken. It ends when nobody
+    /// can change its settings any more.
+    Thread {
+        polls: Receiver<io::Result<Poll>>,
+        changes: Sender<(PathBuf, Config)>,
+    },
 }
 
 impl ClaimsLog {
-    pub fn new(follower: Follower, inbox: Inbox, is_replay: bool, stop: Arc<AtomicBool>) -> io::Result<Self> {
+    pub fn new(follower: Follower, inbox: Inbox, is_replay: bool) -> io::Result<Self> {
         if is_replay {
             let follower = Box::new(follower);
             return Ok(Self::Inline { follower, looked: None });
         }
-        let (polls, log) = sync_channel(0);
-        let follower = follower.live();
+        let (found, polls) = sync_channel(0);
+        let (changes, settings) = channel();
+        let since = SystemTime::now() - Duration::from_secs_f64(OLD_AT_START_S);
+        let follower = follower.live(since);
         std::thread::Builder::new()
             .name("claims".into())
-            .spawn(move || read(follower, &inbox, &polls, &stop))?;
-        Ok(Self::Thread(log))
+            .spawn(move || read(follower, &inbox, &found, &settings))?;
+        Ok(Self::Thread { polls, changes })
+    }
+
+    /// Goes on with other settings, and another log where `path` is another.
+    pub fn change(&mut self, path: &Path, config: &Config) {
+        match self {
+            Self::Inline { follower, .. } => follower.change(path, config),
+            // The thread lives as long as `polls` is read.
+            Self::Thread { changes, .. } => drop(changes.send((path.to_owned(), config.clone()))),
+        }
     }
 
     /// What has been read since, if anything. `again` asks an inline log at once.
     pub fn next(&mut self, again: bool) -> Option<io::Result<Poll>> {
         match self {
-            Self::Thread(log) => log.try_recv().ok(),
+            Self::Thread { polls, .. } => polls.try_recv().ok(),
             Self::Inline { follower, looked } => {
                 if !again && looked.is_some_and(|t| t.elapsed() < FOLLOW_EVERY) {
                     return None;
@@ -61,10 +75,23 @@ impl ClaimsLog {
     }
 }
 
-/// Reads until it is told to stop, or nobody listens any more.
-fn read(mut follower: Follower, inbox: &Inbox, polls: &SyncSender<io::Result<Poll>>, stop: &AtomicBool) {
+/// Reads until nobody listens any more.
+fn read(
+    mut follower: Follower,
+    inbox: &Inbox,
+    found: &SyncSender<io::Result<Poll>>,
+    settings: &Receiver<(PathBuf, Config)>,
+) {
     let mut backlog = Some(Backlog::default());
-    while !stop.load(Ordering::Relaxed) {
+    loop {
+        match settings.try_recv() {
+            Ok((path, config)) => {
+                follower.change(&path, &config);
+                backlog = Some(Backlog::default());
+            }
+            Err(TryRecvError::Empty) => {}
+            Err(TryRecvError::Disconnected) => return,
+        }
         let mut poll = follower.poll();
         let more = poll.as_ref().is_ok_and(|p| p.more);
         if let Ok(poll) = &mut poll {
@@ -82,7 +109,7 @@ fn read(mut follower: Follower, inbox: &Inbox, polls: &SyncSender<io::Result<Pol
             Ok(p) => p.restarted || p.refused_count > 0 || p.skipped_at_start_bytes + p.skipped_bytes > 0,
             Err(_) => true,
         };
-        if is_news && polls.send(poll).is_err() {
+        if is_news && found.send(poll).is_err() {
             return;
         }
         // Half of a core at most, while there is more.

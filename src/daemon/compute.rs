@@ -11,6 +11,7 @@ use tokio::sync::mpsc;
 use super::claims_log::ClaimsLog;
 use super::posts::Posts;
 use super::publish::Outlet;
+use super::reload::Settings;
 use super::status::State;
 use super::supervisor::Supervisor;
 use crate::api::{ClaimsStatus, Command, FrameCounts, JournalStatus, Snapshot, SourceState, SourceStatus, Status};
@@ -45,6 +46,8 @@ pub struct Compute {
     /// Claims that the recorder does not have yet.
     pub unrecorded: Vec<Claim>,
     pub commands: mpsc::Receiver<Command>,
+    /// Loaded again while running.
+    pub settings: mpsc::Receiver<Settings>,
     pub follower: Option<ClaimsLog>,
     pub outlet: Outlet,
     pub journal: Journal,
@@ -65,6 +68,7 @@ impl Compute {
     pub fn run(mut self) {
         let mut last_event = Instant::now();
         while !self.stop.load(Ordering::Relaxed) {
+            self.take_settings();
             self.follow_log();
             self.handle_commands();
             let patience = if self.posts.is_empty() { PATIENCE } else { POSTING };
@@ -172,7 +176,8 @@ impl Compute {
             .recorder
             .as_mut()
             .map(|r| r.unusable(index, time, &reason, &self.unrecorded));
-        self.recorded(recorded.flatten(), replayed);
+        let recorded = recorded.flatten().map(|_| Taken { file: None });
+        self.recorded(recorded, replayed);
         let report = self.pipeline.unusable(index, time, &reason);
         let s = &mut self.state;
         s.clock = time;
@@ -218,8 +223,10 @@ impl Compute {
 
     fn publish(&mut self, mut report: Report, frame: Option<Arc<Frame>>) {
         for event in &mut report.events {
+            // What came before an alert without a frame is recorded too, but is no file with its frame.
             if let (AlertEventKind::Raised, Some(recorder)) = (event.event, &mut self.recorder)
                 && let Some(file) = recorder.evidence(&event.alert.id, report.time)
+                && frame.is_some()
             {
                 self.state.evidence.insert(event.alert.id.clone(), file);
             }

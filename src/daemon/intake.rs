@@ -2,10 +2,12 @@
 
 use std::time::{Duration, Instant};
 
+use super::claims_log::ClaimsLog;
 use super::compute::Compute;
+use super::reload::Settings;
 use crate::api::{Acknowledged, Command};
 use crate::claim::escape_undisplayable;
-use crate::claims::Refused;
+use crate::claims::{Follower, Refused};
 use crate::metric;
 use crate::monitor::{Acknowledgement, AlertEvent, AlertState, Withdrawal};
 
@@ -67,6 +69,26 @@ impl Compute {
             Ok(Some(alert)) => Acknowledged::Done(Box::new(alert)),
             Ok(None) | Err(_) => Acknowledged::Unknown,
         }
+    }
+
+    /// Takes settings that were loaded again.
+    pub(super) fn take_settings(&mut self) {
+        let Ok(Settings { monitor, claims }) = self.settings.try_recv() else {
+            return;
+        };
+        self.pipeline.reconfigure(&monitor, &claims);
+        match (&mut self.follower, &claims.log) {
+            (_, None) => self.follower = None,
+            (Some(follower), Some(path)) => follower.change(path, &claims),
+            (none, Some(path)) => {
+                let follower = Follower::new(path, &claims);
+                match ClaimsLog::new(follower, self.inbox.clone(), self.is_replay) {
+                    Ok(log) => *none = Some(log),
+                    Err(error) => tracing::error!(%error, "the claims log is not followed: no thread for it"),
+                }
+            }
+        }
+        self.claims_log = claims.log.map(|path| path.display().to_string());
     }
 
     /// Takes in what the claims log has gained.

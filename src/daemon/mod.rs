@@ -31,6 +31,7 @@ use crate::{api, logging, metric, notify};
 use claims_log::ClaimsLog;
 use compute::Compute;
 use publish::Outlet;
+use reload::Reload;
 use status::State;
 use supervisor::Supervisor;
 
@@ -122,11 +123,12 @@ impl Daemon {
             stops(),
         );
         let (commands, orders) = mpsc::channel(COMMANDS);
+        let (reloaded, settings) = mpsc::channel(1);
         let ready = Arc::new(AtomicBool::new(false));
         let state = api::State::new(feed, commands, self.journal.clone(), metrics.clone(), ready.clone());
         let mut state = state.with_webhooks(notifier.clone());
         if let Some(folder) = &self.config.record.folder {
-            state = state.with_evidence(folder);
+            state = state.with_evidence(folder, &self.config.estimator);
         }
 
         let source = &self.config.source;
@@ -159,12 +161,13 @@ impl Daemon {
             posts: posts::Posts::default(),
             unrecorded: Vec::new(),
             commands: orders,
+            settings,
             follower: log
-                .map(|l| ClaimsLog::new(Follower::new(l, &self.config.claims), inbox, is_replay, halt.clone()))
+                .map(|l| ClaimsLog::new(Follower::new(l, &self.config.claims), inbox, is_replay))
                 .transpose()?,
             outlet,
             journal: self.journal.clone(),
-            webhooks: notifier,
+            webhooks: notifier.clone(),
             supervisor: Supervisor::default(),
             camera: Arc::new(self.camera),
             claims_log: log.map(|l| l.display().to_string()),
@@ -178,8 +181,15 @@ impl Daemon {
         let mut serving = tokio::spawn(self.server.serve(listener, state, stops()));
         let upkeep = tokio::spawn(maintain(self.journal.clone(), metrics, started_at));
 
+        let reload = Reload {
+            current: self.config,
+            path: self.path,
+            logging,
+            webhooks: notifier,
+            settings: reloaded,
+        };
         let outcome = tokio::select! {
-            signal = reload::until_stopped(&self.config, self.path.as_deref(), &logging) => signal,
+            signal = reload::until_stopped(reload) => signal,
             ended = &mut compute => Err(ended.err().map_or(
                 anyhow::anyhow!("the compute thread ended by itself"),
                 |panic| anyhow::anyhow!("the compute thread panicked: {panic}"),

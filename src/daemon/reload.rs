@@ -1,20 +1,37 @@
 //! Signals: stop the daemon, or reload the config.
 
-use std::path::Path;
+use std::path::PathBuf;
 
 use anyhow::Result;
 use tokio::signal::unix::{SignalKind, signal};
+use tokio::sync::mpsc;
 
 use super::supervisor::Supervisor;
 use crate::config::Config;
-use crate::logging;
+use crate::{claims, logging, monitor, notify};
+
+/// What the compute thread takes while it runs.
+#[derive(Debug)]
+pub struct Settings {
+    pub monitor: monitor::Config,
+    pub claims: claims::Config,
+}
+
+/// What a reload reads and changes.
+pub struct Reload {
+    /// In force.
+    pub current: Config,
+    pub path: Option<PathBuf>,
+    pub logging: logging::Handle,
+    pub webhooks: notify::Notifier,
+    pub settings: mpsc::Sender<Settings>,
+}
 
 /// Waits for SIGTERM or SIGINT. On SIGHUP the config is reloaded; tables that only a restart can change are logged.
-pub async fn until_stopped(config: &Config, path: Option<&Path>, logging: &logging::Handle) -> Result<()> {
+pub async fn until_stopped(mut reload: Reload) -> Result<()> {
     let mut terminate = signal(SignalKind::terminate())?;
     let mut interrupt = signal(SignalKind::interrupt())?;
     let mut hangup = signal(SignalKind::hangup())?;
-    let mut current = config.clone();
     loop {
         tokio::select! {
             _ = terminate.recv() => return Ok(()),
@@ -22,9 +39,8 @@ pub async fn until_stopped(config: &Config, path: Option<&Path>, logging: &loggi
             _ = hangup.recv() => {
                 let supervisor = Supervisor::default();
                 supervisor.reloading();
-                match path {
-                    Some(path) => reload(&mut current, path, logging),
-                    None => tracing::info!("there is no config file to read again"),
+                if let Err(error) = reload.run().await {
+                    tracing::error!("the config is bad; nothing was changed: {error:#}");
                 }
                 supervisor.reloaded();
             }
@@ -32,26 +48,47 @@ pub async fn until_stopped(config: &Config, path: Option<&Path>, logging: &loggi
     }
 }
 
-/// Applies a changed config; an invalid file changes nothing.
-fn reload(current: &mut Config, path: &Path, logging: &logging::Handle) {
-    let new = match Config::load(path) {
-        Ok(new) => new,
-        Err(error) => return tracing::error!(%error, "the config is bad; nothing was changed"),
-    };
-    if new.log != current.log {
-        match logging.set(&new.log) {
-            Ok(()) => tracing::info!(level = new.log.level, "log level changed"),
-            Err(error) => return tracing::error!(%error, "the config is bad; nothing was changed"),
+impl Reload {
+    /// Applies a changed config. All of it is checked before anything is changed, so that an invalid file changes nothing.
+    async fn run(&mut self) -> Result<()> {
+        let Some(path) = &self.path else {
+            tracing::info!("there is no config file to read again");
+            return Ok(());
+        };
+        let new = Config::load(path)?;
+        new.monitor.validate()?;
+        new.claims.validate()?;
+        new.journal.validate()?;
+        let endpoints = notify::load(&new.webhook)?;
+        for warning in new.warnings(&new.camera()?) {
+            tracing::warn!("{warning}");
         }
-        current.log = new.log.clone();
-    }
-    let fixed = new.tables_that_differ(current);
-    if fixed.is_empty() {
-        tracing::info!("config re-read");
-    } else {
-        tracing::warn!(
-            tables = fixed.join(", "),
-            "config re-read; these tables change with the next restart only"
-        );
+        if new.log != self.current.log {
+            self.logging.set(&new.log)?;
+        }
+        let changed = new.tables_that_differ(&self.current);
+        self.webhooks.replace(endpoints).await?;
+        let settings = Settings {
+            monitor: new.monitor.clone(),
+            claims: new.claims.clone(),
+        };
+        // An error would mean that the compute thread has ended, and with it the daemon.
+        let _ = self.settings.send(settings).await;
+        self.current.log = new.log.clone();
+        self.current.monitor = new.monitor.clone();
+        self.current.claims = new.claims.clone();
+        self.current.webhook = new.webhook.clone();
+        let (fixed, changed): (Vec<_>, Vec<_>) = {
+            let fixed = new.tables_that_differ(&self.current);
+            changed.into_iter().partition(|table| fixed.contains(table))
+        };
+        tracing::info!(changed = changed.join(", "), "config re-read");
+        if !fixed.is_empty() {
+            tracing::warn!(
+                tables = fixed.join(", "),
+                "these tables of the config change with the next restart only"
+            );
+        }
+        Ok(())
     }
 }

@@ -1,6 +1,27 @@
 //! Small dense linear algebra on plain slices: inlined, so that it is compiled for the CPU that the caller's
 //! dispatch found, and without allocation.
 
+/// Evaluates an expression of the values given, compiled for the best instructions that this processor has. What it calls is compiled so
+/// where it is `#[inline(always)]`; closures never are.
+macro_rules! dispatch {
+    (<$($life:lifetime),+> $($name:ident: $kind:ty = $value:expr),+ => $out:ty: $body:expr) => {{
+        struct Call<$($life),+> {
+            $($name: $kind),+
+        }
+        impl<$($life),+> pulp::NullaryFnOnce for Call<$($life),+> {
+            type Output = $out;
+
+            #[inline(always)]
+            fn call(self) -> $out {
+                let Self { $($name),+ } = self;
+                $body
+            }
+        }
+        pulp::Arch::new().dispatch(Call { $($name: $value),+ })
+    }};
+}
+pub(crate) use dispatch;
+
 /// Σ a b over slices of equal length.
 #[inline(always)]
 pub(crate) fn dot(a: &[f64], b: &[f64]) -> f64 {

@@ -36,8 +36,6 @@ rules! {
     birth,
     /// Proposal: two halves in the place of a source, by the score test.
     split,
-    /// Proposal: a faint source moves to a residual peak.
-    relocate,
     /// Proposal: one source in the place of a close pair.
     merge,
     /// Proposal: all unresolved pairs are merged at once.
@@ -46,14 +44,10 @@ rules! {
     death,
     /// Proposal: a source beyond the sensor's edge moves inside and another one is removed.
     relocate_inside,
-    /// Where pixels are wide, pairs are merged within a distance in pixels and whatever the quadratic prediction says.
-    merge_wide_pixels,
     /// `map`, proposal: several users in the place of one source that has the light of several.
     divide,
     /// `map`, proposal: the light of a pair is divided evenly among as many users as it is of.
     balance_pairs,
-    /// `map`, proposal: one source in the place of a pair, where there are more sources than users' light.
-    unite,
     /// `map`: fits with tight energy priors and from positions displaced along the ill-determined directions.
     explore_ill_determined,
     /// `map`: the mean along the least determined direction is reported instead of the mode.
@@ -76,8 +70,6 @@ rules! {
     abort_fits,
     /// A poor fit ends after a few steps that hardly improve it.
     stop_stalled_fits,
-    /// A fit exceeds its number of steps while each improves it much.
-    extend_fast_fits,
     /// Groups of sources that no longer move are fitted no further.
     source_groups,
 }

@@ -5,10 +5,20 @@ mod config;
 mod error;
 pub mod npy;
 pub mod record;
+#[allow(clippy::disallowed_methods, reason = "frames are paced by their clock")]
 mod replay;
+#[allow(clippy::disallowed_methods, reason = "frames are paced by their clock")]
 mod simulator;
+#[allow(
+    clippy::disallowed_methods,
+    reason = "a wait has an end, and a frame's age is a metric"
+)]
 mod slot;
 mod source;
+#[allow(
+    clippy::disallowed_methods,
+    reason = "a device's silence is measured, its clock compared"
+)]
 pub mod v4l2;
 
 pub use capture::Capture;

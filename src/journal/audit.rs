@@ -15,6 +15,8 @@ pub enum AuditAction {
     ReplayWebhook,
     #[serde(rename = "webhook.enable")]
     EnableWebhook,
+    #[serde(rename = "webhook.test")]
+    TestWebhook,
     /// A request was refused: wrong token, foreign host or origin, too many requests.
     #[serde(rename = "request.refused")]
     Refused,

@@ -2,15 +2,15 @@
 //! disk.
 
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 use std::sync::mpsc::{Receiver, Sender};
 use std::time::Instant;
 
 use jiff::{SignedDuration, Timestamp};
 
+use super::outbox::Subscriptions;
 use super::retention::Retention;
 use super::store::{Store, Write};
-use super::{Error, Subscription, health};
+use super::{Error, health};
 use crate::metric;
 
 /// Time between two retention rounds.
@@ -26,7 +26,7 @@ const WRITES_BETWEEN_ROUNDS: usize = 1_000;
 /// State of the disk thread. It answers every batch.
 pub(super) struct Disk {
     path: PathBuf,
-    subscriptions: Arc<[Subscription]>,
+    subscriptions: Subscriptions,
     retention: Retention,
     store: Option<Store>,
     opened: Option<FileId>,
@@ -38,12 +38,7 @@ pub(super) struct Disk {
 pub(super) type Answer = Result<u64, Error>;
 
 impl Disk {
-    pub(super) fn new(
-        path: PathBuf,
-        subscriptions: Arc<[Subscription]>,
-        retention: Retention,
-        store: Option<Store>,
-    ) -> Self {
+    pub(super) fn new(path: PathBuf, subscriptions: Subscriptions, retention: Retention, store: Option<Store>) -> Self {
         Self {
             opened: FileId::of(&path),
             path,

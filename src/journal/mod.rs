@@ -7,6 +7,7 @@
 
 mod audit;
 mod config;
+#[allow(clippy::disallowed_methods, reason = "a hanging disk is known by the time it takes")]
 mod disk;
 mod error;
 mod follow;
@@ -30,6 +31,7 @@ use tokio::sync::watch;
 
 use crate::monitor::{Alert, AlertEvent};
 use disk::Disk;
+use outbox::Subscriptions;
 use retention::Retention;
 use store::{Store, Write};
 use writer::{Link, Shared, Writer, lock};
@@ -87,7 +89,7 @@ impl Journal {
     /// Opens or creates the journal. A full or read-only disk is no error here: the journal starts in memory and
     /// writes once it can. A file that is not ours, or newer than us, is.
     pub fn open(config: &Config, subscriptions: Vec<Subscription>) -> Result<Self, Error> {
-        let subscriptions: Arc<[Subscription]> = subscriptions.into();
+        let subscriptions: Subscriptions = Arc::new(arc_swap::ArcSwap::from_pointee(subscriptions));
         let overlay = Store::open(None, subscriptions.clone())?;
         let mut health = Health {
             path: config.path.clone(),
@@ -195,6 +197,11 @@ impl Journal {
     /// [`Journal::last_seq`] as it grows.
     pub fn heard(&self) -> watch::Receiver<u64> {
         self.shared.heard.subscribe()
+    }
+
+    /// Writes outbox rows for these endpoints from the next event on. Rows of others stay.
+    pub fn subscribe(&self, subscriptions: Vec<Subscription>) {
+        self.shared.subscriptions.store(Arc::new(subscriptions));
     }
 
     /// The journal's own random name, for ids that stay unique over journals.

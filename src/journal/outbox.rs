@@ -1,5 +1,8 @@
 //! Rows of the webhook outbox and what the journal remembers of each endpoint.
 
+use std::sync::Arc;
+
+use arc_swap::ArcSwap;
 use jiff::Timestamp;
 
 use crate::monitor::{AlertEvent, AlertKind};
@@ -12,6 +15,9 @@ pub struct Subscription {
     /// All kinds when `None`.
     pub kinds: Option<Vec<AlertKind>>,
 }
+
+/// The subscriptions in force.
+pub(super) type Subscriptions = Arc<ArcSwap<Vec<Subscription>>>;
 
 /// An outbox row that is still to be sent.
 #[derive(Clone, Debug, PartialEq)]

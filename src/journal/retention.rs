@@ -123,7 +123,8 @@ impl Store {
     }
 
     fn give_up_unwanted(&mut self, before_us: i64, now: Timestamp) -> Result<usize, rusqlite::Error> {
-        let wanted: Vec<&str> = self.subscriptions.iter().map(|s| s.endpoint.as_str()).collect();
+        let subscriptions = self.subscriptions.load();
+        let wanted: Vec<&str> = subscriptions.iter().map(|s| s.endpoint.as_str()).collect();
         self.db.execute(
             "UPDATE delivery SET state = 'dead', settled_us = ?3, error = 'the endpoint is disabled or no longer in the config'
              WHERE state = 'waiting'

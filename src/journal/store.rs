@@ -6,7 +6,8 @@ use std::sync::Arc;
 use jiff::Timestamp;
 use rusqlite::{Connection, TransactionBehavior, params};
 
-use super::{Attempt, AuditRecord, Error, Outcome, Subscription, schema};
+use super::outbox::Subscriptions;
+use super::{Attempt, AuditRecord, Error, Outcome, schema};
 use crate::monitor::{AlertEvent, AlertEventKind};
 
 /// One change of the journal. Applying it must never fail for what it holds, only for the disk: a write
@@ -55,11 +56,11 @@ impl Write {
 /// One SQLite connection with the journal's statements.
 pub(super) struct Store {
     pub(super) db: Connection,
-    pub(super) subscriptions: Arc<[Subscription]>,
+    pub(super) subscriptions: Subscriptions,
 }
 
 impl Store {
-    pub(super) fn open(path: Option<&Path>, subscriptions: Arc<[Subscription]>) -> Result<Self, Error> {
+    pub(super) fn open(path: Option<&Path>, subscriptions: Subscriptions) -> Result<Self, Error> {
         let db = schema::open_writable(path)?;
         Ok(Self { db, subscriptions })
     }
@@ -67,7 +68,7 @@ impl Store {
     pub(super) fn open_readable(path: &Path) -> Result<Self, rusqlite::Error> {
         Ok(Self {
             db: schema::open_readable(path)?,
-            subscriptions: Arc::from([]),
+            subscriptions: Subscriptions::default(),
         })
     }
 
@@ -85,7 +86,7 @@ impl Store {
             match write {
                 Write::Event { seq, event, at, now } => {
                     put_event(&tx, *seq, event, *at, *now)?;
-                    for subscription in self.subscriptions.iter().filter(|s| s.wants(event)) {
+                    for subscription in self.subscriptions.load().iter().filter(|s| s.wants(event)) {
                         tx.prepare_cached(
                             "INSERT OR REPLACE INTO delivery VALUES (?1, ?2, 'waiting', 0, 0, ?3, NULL, NULL)",
                         )?

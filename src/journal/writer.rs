@@ -10,9 +10,10 @@ use std::time::Duration;
 use jiff::Timestamp;
 use tokio::sync::watch;
 
+use super::outbox::Subscriptions;
 use super::retention::Retention;
 use super::store::{Store, Write};
-use super::{Attempt, AuditEntry, AuditRecord, Error, Health, Outcome, Subscription, disk};
+use super::{Attempt, AuditEntry, AuditRecord, Error, Health, Outcome, disk};
 use crate::metric;
 
 /// Alert events that may wait for a disk that refuses them.
@@ -34,7 +35,7 @@ const RETRY: Duration = Duration::from_secs(1);
 /// What the writer thread, the readers and those who record share.
 pub(super) struct Shared {
     pub(super) path: Option<PathBuf>,
-    pub(super) subscriptions: Arc<[Subscription]>,
+    pub(super) subscriptions: Subscriptions,
     pub(super) retention: Retention,
     queue: Mutex<Queue>,
     wake: Condvar,
@@ -73,7 +74,7 @@ pub(super) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
 impl Shared {
     pub(super) fn new(
         path: Option<PathBuf>,
-        subscriptions: Arc<[Subscription]>,
+        subscriptions: Subscriptions,
         retention: Retention,
         overlay: Store,
         last_seq: u64,

@@ -141,6 +141,37 @@ impl Alert {
         let is_named = self.user.is_some() || spot(self).is_some();
         self.kind == other.kind && self.user == other.user && spot(self) == spot(other) && (is_named || is_near)
     }
+
+    /// A step in its life, with the alert as it is now.
+    pub(super) fn event(&self, event: AlertEventKind) -> AlertEvent {
+        AlertEvent {
+            event,
+            alert: self.clone(),
+        }
+    }
+
+    /// Takes an operator's note of it. Whether that changes anything: an alert that is acknowledged takes only another note.
+    pub(super) fn acknowledge(&mut self, acknowledgement: Acknowledgement) -> bool {
+        if self.state == AlertState::Acknowledged && acknowledgement.note.is_none() {
+            return false;
+        }
+        self.state = AlertState::Acknowledged;
+        self.acknowledgement = Some(acknowledgement);
+        true
+    }
+
+    /// Undoes the acknowledgement, if there is one.
+    pub(super) fn withdraw(&mut self, withdrawal: Withdrawal) -> bool {
+        if self.state != AlertState::Acknowledged {
+            return false;
+        }
+        self.state = AlertState::Open;
+        // An alert that was acknowledged before acknowledgements were kept has none.
+        if let Some(acknowledgement) = &mut self.acknowledgement {
+            acknowledgement.withdrawn = Some(withdrawal);
+        }
+        true
+    }
 }
 
 impl AlertEventKind {
@@ -170,4 +201,75 @@ pub enum AlertEventKind {
 pub struct AlertEvent {
     pub event: AlertEventKind,
     pub alert: Alert,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// An alert about `user`, or about a beam at (`x`, 0), m.
+    fn alert(user: Option<&str>, x: f64) -> Alert {
+        Alert {
+            id: String::new(),
+            kind: AlertKind::UnclaimedEmitter,
+            severity: Severity::Warning,
+            state: AlertState::Open,
+            raised_at: Timestamp::UNIX_EPOCH,
+            cleared_at: None,
+            user: user.map(str::to_owned),
+            x_m: Some(x),
+            y_m: Some(0.0),
+            cov_m2: None,
+            claimed: None,
+            evidence: serde_json::json!({}),
+            source: AlertSource {
+                kind: "replay".into(),
+                frame: 0,
+                file: None,
+            },
+            acknowledgement: None,
+        }
+    }
+
+    #[test]
+    fn an_alert_is_acknowledged_once_or_with_a_note_and_can_be_reopened() {
+        let mut alert = alert(None, 0.0);
+        let acknowledgement = |note: Option<&str>| Acknowledgement {
+            at: Timestamp::UNIX_EPOCH,
+            by: None,
+            note: note.map(str::to_owned),
+            withdrawn: None,
+        };
+        let withdrawal = || Withdrawal {
+            at: Timestamp::UNIX_EPOCH,
+            by: None,
+        };
+        assert!(!alert.withdraw(withdrawal()));
+        assert!(alert.acknowledge(acknowledgement(None)));
+        assert_eq!(alert.state, AlertState::Acknowledged);
+        assert!(!alert.acknowledge(acknowledgement(None)));
+        assert!(alert.acknowledge(acknowledgement(Some("known"))));
+        assert!(alert.withdraw(withdrawal()));
+        assert_eq!(alert.state, AlertState::Open);
+        assert!(alert.acknowledgement.unwrap().withdrawn.is_some());
+    }
+
+    #[test]
+    fn a_cause_is_told_by_user_or_by_place() {
+        assert!(alert(Some("a"), 0.0).has_cause_of(&alert(Some("a"), 99.0)));
+        assert!(!alert(Some("a"), 0.0).has_cause_of(&alert(Some("b"), 0.0)));
+        assert!(alert(None, 0.0).has_cause_of(&alert(None, 9.9)));
+        assert!(!alert(None, 0.0).has_cause_of(&alert(None, 10.1)));
+        let mut shared = alert(None, 0.0);
+        shared.evidence = serde_json::json!({ SHARED_SPOT: "a" });
+        assert!(!shared.has_cause_of(&alert(None, 0.0)));
+    }
+
+    #[test]
+    fn ten_seconds_make_an_alert_critical() {
+        assert_eq!(
+            [9.9, 10.0].map(Severity::of_duration),
+            [Severity::Warning, Severity::Critical]
+        );
+    }
 }

@@ -6,30 +6,22 @@ use jiff::Timestamp;
 use serde_json::Value;
 
 use super::alert::{
-    Acknowledgement, Alert, AlertEvent, AlertEventKind, AlertKind, AlertSource, AlertState, SAME_PLACE_M, SHARED_SPOT,
-    Withdrawal,
+    Acknowledgement, Alert, AlertEvent, AlertEventKind, AlertKind, AlertSource, AlertState, Withdrawal,
 };
+use super::alert_ids::AlertIds;
+use super::cleared_causes::ClearedCauses;
 use super::finding::{Cause, Content, Finding};
 use crate::claims::seconds;
-
-/// Absence after which an alert clears at the first occurrence of its cause, s. Longer keeps alerts open after their cause
-/// has gone; shorter splits one cause into several alerts. Doubled at each recurrence, so that only a cause's first
-/// minute depends on it. Not tuned.
-const CLEAR_S: f64 = 1.0;
-/// Cleared causes that are remembered for their recurrences; bounds memory under a flood of alerts.
-const MAX_CLEARED: usize = 10_000;
 
 /// The alerts of a run: one per cause, from raise to clear.
 #[derive(Debug)]
 pub(super) struct AlertLifecycle {
     open: BTreeMap<Cause, OpenAlert>,
-    cleared: BTreeMap<Cause, ClearedCause>,
-    /// Alerts of each kind raised at the newest instant, for their ids.
-    numbered: (Timestamp, BTreeMap<AlertKind, u32>),
+    cleared: ClearedCauses,
+    ids: AlertIds,
     events: Vec<AlertEvent>,
     source_kind: String,
     source_file: Option<String>,
-    cool_down_s: f64,
     has_caught_up: bool,
 }
 
@@ -44,34 +36,22 @@ struct OpenAlert {
     is_restored: bool,
 }
 
-/// A cause that cleared lately.
-#[derive(Clone, Copy, Debug)]
-struct ClearedCause {
-    at: Timestamp,
-    recurrences: u32,
-    place: Option<[f64; 2]>,
-}
-
-impl OpenAlert {
-    /// Absence that clears, s.
-    fn hold_s(&self, cool_down_s: f64) -> f64 {
-        (CLEAR_S * 2f64.powi(self.recurrences.min(20) as i32)).min(cool_down_s)
-    }
-}
-
 impl AlertLifecycle {
     /// `cool_down_s` bounds the absence for which an alert whose cause comes and goes stays open.
     pub fn new(source_kind: String, source_file: Option<String>, cool_down_s: f64) -> Self {
         Self {
             open: BTreeMap::new(),
-            cleared: BTreeMap::new(),
-            numbered: (Timestamp::UNIX_EPOCH, BTreeMap::new()),
+            cleared: ClearedCauses::new(cool_down_s),
+            ids: AlertIds::default(),
             events: Vec::new(),
             source_kind,
             source_file,
-            cool_down_s,
             has_caught_up: false,
         }
+    }
+
+    pub fn set_cool_down(&mut self, cool_down_s: f64) {
+        self.cleared.cool_down_s = cool_down_s;
     }
 
     /// Forgets all causes; gives the alerts that are open.
@@ -112,15 +92,13 @@ impl AlertLifecycle {
 
     /// Users with an open alert of this kind.
     pub fn users_with(&self, kind: AlertKind) -> BTreeSet<&str> {
-        self.open.keys().filter_map(|cause| user_of(cause, kind)).collect()
+        self.open.keys().filter_map(|cause| cause.user_with(kind)).collect()
     }
 
     /// Users with an alert of this kind that is open or cleared within the cool-down.
     pub fn users_lately_with(&self, kind: AlertKind, now: Timestamp) -> BTreeSet<&str> {
-        let recent = |c: &ClearedCause| seconds(c.at, now) <= self.cool_down_s;
-        let cleared = self.cleared.iter().filter(|(_, c)| recent(c)).map(|(cause, _)| cause);
-        let open = self.open.keys();
-        open.chain(cleared).filter_map(|cause| user_of(cause, kind)).collect()
+        let open = self.open.keys().filter_map(|cause| cause.user_with(kind));
+        open.chain(self.cleared.users_with(kind, now)).collect()
     }
 
     /// Whether an open alert is about this user: their position, absence or claims, or a second beam in their spot.
@@ -163,43 +141,22 @@ impl AlertLifecycle {
     /// `None` when no open alert has this id, or it is acknowledged already and there is nothing to add.
     pub fn acknowledge(&mut self, id: &str, acknowledgement: Acknowledgement) -> Option<AlertEvent> {
         let alert = &mut self.open.values_mut().find(|o| o.alert.id == id)?.alert;
-        if alert.state == AlertState::Acknowledged && acknowledgement.note.is_none() {
-            return None;
-        }
-        alert.state = AlertState::Acknowledged;
-        alert.acknowledgement = Some(acknowledgement);
-        Some(AlertEvent {
-            event: AlertEventKind::Acknowledged,
-            alert: alert.clone(),
-        })
+        alert
+            .acknowledge(acknowledgement)
+            .then(|| alert.event(AlertEventKind::Acknowledged))
     }
 
     /// `None` when no acknowledged alert has this id.
     pub fn unacknowledge(&mut self, id: &str, withdrawal: Withdrawal) -> Option<AlertEvent> {
         let alert = &mut self.open.values_mut().find(|o| o.alert.id == id)?.alert;
-        if alert.state != AlertState::Acknowledged {
-            return None;
-        }
-        alert.state = AlertState::Open;
-        // An alert that was acknowledged before acknowledgements were kept has none.
-        if let Some(acknowledgement) = &mut alert.acknowledgement {
-            acknowledgement.withdrawn = Some(withdrawal);
-        }
-        Some(AlertEvent {
-            event: AlertEventKind::Unacknowledged,
-            alert: alert.clone(),
-        })
+        alert
+            .withdraw(withdrawal)
+            .then(|| alert.event(AlertEventKind::Unacknowledged))
     }
 
-    /// Takes over an alert that was open when the last run ended. One that names neither user nor spot is about a track:
-    /// it gets `new_track`, an id that no track has.
+    /// Takes over an alert that was open when the last run ended; `new_track` gives an id that no track has.
     pub fn restore(&mut self, alert: Alert, new_track: impl FnOnce() -> u64) {
-        let cause = match (alert.kind, &alert.user, alert.evidence[SHARED_SPOT].as_str()) {
-            (AlertKind::UnclaimedEmitter, None, Some(shared)) => Cause::CoLocated(shared.to_owned()),
-            (kind, Some(user), _) => Cause::User(kind, user.clone()),
-            (AlertKind::UnclaimedEmitter, None, None) => Cause::Track(new_track()),
-            (kind, None, _) => Cause::System(kind),
-        };
+        let cause = Cause::of(&alert, new_track);
         // The first frame shows whether the sensor is back.
         let is_restored = cause != Cause::System(AlertKind::SensorLost);
         self.open.entry(cause).or_insert(OpenAlert {
@@ -218,7 +175,7 @@ impl AlertLifecycle {
     fn present(&mut self, cause: Cause, content: Content, now: Timestamp, frame: u64) {
         if let Some(open) = self.open.get_mut(&cause) {
             open.is_restored = false;
-            let hold_s = open.hold_s(self.cool_down_s);
+            let hold_s = self.cleared.hold_s(open.recurrences);
             let absent_since = open.absent_since.take();
             if absent_since.is_some_and(|since| seconds(since, now) >= 0.5 * hold_s) {
                 open.recurrences += 1;
@@ -227,15 +184,11 @@ impl AlertLifecycle {
             // An alert never becomes milder while its cause lasts.
             let severity = alert.severity.max(content.severity);
             let has_escalated = severity != alert.severity;
-            content.write_to(alert);
+            content.write_to(alert, open.recurrences);
             alert.severity = severity;
-            write_recurrences(alert, open.recurrences);
             if has_escalated {
                 alert.source.frame = frame;
-                self.events.push(AlertEvent {
-                    event: AlertEventKind::Updated,
-                    alert: alert.clone(),
-                });
+                self.events.push(alert.event(AlertEventKind::Updated));
             }
             return;
         }
@@ -243,9 +196,10 @@ impl AlertLifecycle {
     }
 
     fn raise(&mut self, cause: Cause, content: Content, now: Timestamp, frame: u64) {
-        let recurrences = self.cleared_lately(&cause, &content, now).map_or(0, |n| n + 1);
+        let place = content.x_m.zip(content.y_m).map(|(x, y)| [x, y]);
+        let recurrences = self.cleared.take(&cause, place, now).map_or(0, |n| n + 1);
         let mut alert = Alert {
-            id: self.new_id(cause.kind(), now),
+            id: self.ids.next(cause.kind(), now),
             kind: cause.kind(),
             severity: content.severity,
             state: AlertState::Open,
@@ -264,12 +218,8 @@ impl AlertLifecycle {
             },
             acknowledgement: None,
         };
-        content.write_to(&mut alert);
-        write_recurrences(&mut alert, recurrences);
-        self.events.push(AlertEvent {
-            event: AlertEventKind::Raised,
-            alert: alert.clone(),
-        });
+        content.write_to(&mut alert, recurrences);
+        self.events.push(alert.event(AlertEventKind::Raised));
         let open = OpenAlert {
             alert,
             absent_since: None,
@@ -277,23 +227,6 @@ impl AlertLifecycle {
             is_restored: false,
         };
         self.open.insert(cause, open);
-    }
-
-    /// How often a cause that cleared within the cool-down had come back by then. A beam that comes on again has a new
-    /// track: it is recognised by its place.
-    fn cleared_lately(&mut self, cause: &Cause, content: &Content, now: Timestamp) -> Option<u32> {
-        let cool_down = self.cool_down_s;
-        let is_recent = |c: &ClearedCause| seconds(c.at, now) <= cool_down;
-        let same = match (cause, content.x_m, content.y_m) {
-            (Cause::Track(_), Some(x), Some(y)) => self
-                .cleared
-                .iter()
-                .filter(|(other, c)| matches!(other, Cause::Track(_)) && is_recent(c))
-                .find(|(_, c)| c.place.is_some_and(|[px, py]| (px - x).hypot(py - y) < SAME_PLACE_M))
-                .map(|(other, _)| other.clone()),
-            _ => Some(cause.clone()),
-        };
-        self.cleared.remove(&same?).filter(is_recent).map(|c| c.recurrences)
     }
 
     /// Clears after a second of absence; after twice as long each time the cause has come back from half of that or within
@@ -306,7 +239,7 @@ impl AlertLifecycle {
             return;
         }
         let since = *open.absent_since.get_or_insert(now);
-        if seconds(since, now) >= open.hold_s(self.cool_down_s) {
+        if seconds(since, now) >= self.cleared.hold_s(open.recurrences) {
             self.clear(cause, now);
         }
     }
@@ -317,67 +250,15 @@ impl AlertLifecycle {
         };
         open.alert.state = AlertState::Cleared;
         open.alert.cleared_at = Some(now);
-        let cool_down = self.cool_down_s;
-        if self.cleared.len() >= MAX_CLEARED {
-            self.cleared.retain(|_, c| seconds(c.at, now) <= cool_down);
-        }
-        if self.cleared.len() < MAX_CLEARED {
-            let cleared = ClearedCause {
-                at: now,
-                recurrences: open.recurrences,
-                place: open.alert.x_m.zip(open.alert.y_m).map(|(x, y)| [x, y]),
-            };
-            self.cleared.insert(cause.clone(), cleared);
-        }
-        self.events.push(AlertEvent {
-            event: AlertEventKind::Cleared,
-            alert: open.alert,
-        });
+        let place = open.alert.x_m.zip(open.alert.y_m).map(|(x, y)| [x, y]);
+        self.cleared.push(cause.clone(), open.recurrences, place, now);
+        self.events.push(open.alert.event(AlertEventKind::Cleared));
     }
 
     fn rename(&mut self, from: &Cause, to: Cause) {
         if let Some(open) = self.open.remove(from) {
             self.open.insert(to, open);
         }
-    }
-
-    /// Kind, time and a count within the same instant: the same input gives the same ids.
-    fn new_id(&mut self, kind: AlertKind, now: Timestamp) -> String {
-        if self.numbered.0 != now {
-            self.numbered = (now, BTreeMap::new());
-        }
-        let next = self.numbered.1.entry(kind).or_default();
-        let number = *next;
-        *next += 1;
-        let kind = serde_json::to_value(kind).ok();
-        let kind = kind.as_ref().and_then(Value::as_str).unwrap_or("alert");
-        format!("{kind}-{}-{number}", now.strftime("%Y%m%dT%H%M%S%6fZ"))
-    }
-}
-
-impl Content {
-    fn write_to(self, alert: &mut Alert) {
-        alert.severity = self.severity;
-        alert.x_m = self.x_m;
-        alert.y_m = self.y_m;
-        alert.cov_m2 = self.cov_m2;
-        alert.claimed = self.claimed;
-        alert.evidence = self.evidence;
-    }
-}
-
-fn user_of(cause: &Cause, kind: AlertKind) -> Option<&str> {
-    match cause {
-        Cause::User(of, user) if *of == kind => Some(user),
-        _ => None,
-    }
-}
-
-fn write_recurrences(alert: &mut Alert, recurrences: u32) {
-    if recurrences > 0
-        && let Value::Object(evidence) = &mut alert.evidence
-    {
-        evidence.insert("recurrences".into(), recurrences.into());
     }
 }
 
@@ -476,31 +357,6 @@ mod tests {
     }
 
     #[test]
-    fn the_hold_is_at_most_the_cool_down() {
-        let mut alerts = AlertLifecycle::new("replay".into(), None, 3.0);
-        let cause = unseen("a");
-        let mut now = 0.0;
-        for _ in 0..5 {
-            apply(&mut alerts, present(&cause, Severity::Warning), now);
-            now = clears(&mut alerts, &cause, now) + 0.5;
-        }
-        apply(&mut alerts, present(&cause, Severity::Warning), now);
-        assert!((clears(&mut alerts, &cause, now) - now - 3.0).abs() < 0.11);
-    }
-
-    #[test]
-    fn a_beam_that_comes_on_again_within_ten_metres_is_the_same_cause() {
-        for (x, recurrences) in [(9.0, Some(1)), (11.0, None)] {
-            let mut alerts = lifecycle();
-            apply(&mut alerts, at_place(1, 0.0), 0.0);
-            clears(&mut alerts, &Cause::Track(1), 1.0);
-            apply(&mut alerts, at_place(2, x), 5.0);
-            let alert = alerts.open().next().unwrap().1;
-            assert_eq!(alert.evidence["recurrences"].as_u64(), recurrences, "{x}");
-        }
-    }
-
-    #[test]
     fn a_renamed_cause_keeps_its_alert() {
         let mut alerts = lifecycle();
         apply(&mut alerts, at_place(1, 0.0), 0.0);
@@ -512,32 +368,6 @@ mod tests {
         assert!(!alerts.is_open(&Cause::Track(1)));
         assert_eq!(alerts.raised_at(&Cause::CoLocated("a".into())), Some(at(0.0)));
         assert!(alerts.concerns("a") && !alerts.concerns("b"));
-    }
-
-    #[test]
-    fn ids_are_of_kind_time_and_number() {
-        let mut alerts = lifecycle();
-        alerts.apply(
-            vec![
-                at_place(1, 0.0),
-                at_place(2, 50.0),
-                present(&unseen("a"), Severity::Warning),
-            ],
-            at(0.0),
-            7,
-        );
-        let events = alerts.take_events();
-        let ids: Vec<_> = events.iter().map(|e| e.alert.id.as_str()).collect();
-        let time = "19700101T001640000000Z";
-        assert_eq!(
-            ids,
-            [
-                format!("unclaimed_emitter-{time}-0"),
-                format!("unclaimed_emitter-{time}-1"),
-                format!("user_unseen-{time}-0")
-            ]
-        );
-        assert!(events.iter().all(|e| e.alert.source.frame == 7));
     }
 
     #[test]
@@ -593,28 +423,20 @@ mod tests {
     }
 
     #[test]
-    fn an_alert_is_acknowledged_once_or_with_a_note_and_can_be_reopened() {
+    fn an_acknowledgement_and_its_withdrawal_are_events_of_an_open_alert() {
         let mut alerts = lifecycle();
         apply(&mut alerts, present(&unseen("a"), Severity::Warning), 0.0);
         let id = alerts.open().next().unwrap().1.id.clone();
-        let acknowledgement = |note: Option<&str>| Acknowledgement {
+        let acknowledgement = || Acknowledgement {
             at: at(1.0),
             by: None,
-            note: note.map(str::to_owned),
+            note: None,
             withdrawn: None,
         };
         let withdrawal = || Withdrawal { at: at(2.0), by: None };
         assert!(alerts.unacknowledge(&id, withdrawal()).is_none());
-        let event = alerts.acknowledge(&id, acknowledgement(None)).unwrap();
-        assert_eq!(
-            (event.event, event.alert.state),
-            (Acknowledged, AlertState::Acknowledged)
-        );
-        assert!(alerts.acknowledge(&id, acknowledgement(None)).is_none());
-        assert!(alerts.acknowledge(&id, acknowledgement(Some("known"))).is_some());
-        assert!(alerts.acknowledge("none", acknowledgement(None)).is_none());
-        let event = alerts.unacknowledge(&id, withdrawal()).unwrap();
-        assert_eq!((event.event, event.alert.state), (Unacknowledged, AlertState::Open));
-        assert!(event.alert.acknowledgement.unwrap().withdrawn.is_some());
+        assert_eq!(alerts.acknowledge(&id, acknowledgement()).unwrap().event, Acknowledged);
+        assert!(alerts.acknowledge("none", acknowledgement()).is_none());
+        assert_eq!(alerts.unacknowledge(&id, withdrawal()).unwrap().event, Unacknowledged);
     }
 }

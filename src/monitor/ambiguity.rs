@@ -5,8 +5,9 @@ use nalgebra::{Cholesky, DMatrix, DVector, Dyn, Vector2};
 use super::input::claim_state::ActiveClaim;
 use super::stats::robust::median_high;
 use super::track::association::Association;
+use super::track::beam_track::Track;
 use super::track::detection::{OVERLAP, snr, spot_m};
-use super::track::tracker::{Track, Tracker};
+use super::track::tracker::Tracker;
 use crate::estimate::Flags;
 use crate::optics::Camera;
 
@@ -16,7 +17,8 @@ use crate::optics::Camera;
 const MIN_DEVIANCE: f64 = 100.0;
 /// Neighbours that are considered, nearest first; bounds the cost where many stand together.
 const MAX_NEIGHBOURS: usize = 4;
-/// Standard deviations of a claim about its place that are considered too.
+/// Standard deviations of a claim about its place that are considered too. Larger excuses users who are really absent, smaller
+/// alerts those whose claim is a little off. Not measured.
 const CLAIM_REACH: f64 = 2.0;
 
 /// How far from its own place the beam of `track` may be taken for, m: the distance of the farthest other associated beam that

@@ -10,7 +10,8 @@ use super::stats::robust::median_high;
 /// and of a stranger, whose light may be off by any factor of ten. Assumed; they only weigh evidence that decides nothing.
 const HONEST_LN_STD: f64 = 0.3;
 const STRANGER_LN_STD: f64 = 2.3;
-/// Other users who report their power before anybody's is compared with it.
+/// Other users who report their power before anybody's is compared with it. With one, two users would each be compared with the
+/// other. It decides nothing.
 const MIN_OTHERS: usize = 2;
 
 /// The claim as an alert carries it.
@@ -79,10 +80,10 @@ mod tests {
         }
         // All are as far from the nadir. The same light of twice the reported power is half the yield.
         scene.claims[0].claim.power_w = Some(2.0);
-        let found = power_against_reported(&scene.context(), 0).unwrap();
+        let found = power_against_reported(scene.context(), 0).unwrap();
         assert!((found["ratio"].as_f64().unwrap() - 0.5).abs() < 1e-12);
         assert_eq!(found["reported_w"], 2.0);
         scene.claims[1].claim.power_w = None;
-        assert!(power_against_reported(&scene.context(), 0).is_none());
+        assert!(power_against_reported(scene.context(), 0).is_none());
     }
 }

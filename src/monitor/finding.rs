@@ -3,7 +3,7 @@
 use nalgebra::{Matrix2, Vector2};
 use serde_json::Value;
 
-use super::alert::{AlertKind, Severity};
+use super::alert::{Alert, AlertKind, SHARED_SPOT, Severity};
 
 /// What an alert is about. While an alert is open for a cause, the cause raises no other.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -18,11 +18,27 @@ pub(super) enum Cause {
 }
 
 impl Cause {
+    /// The cause of an alert from an earlier run. One that names neither user nor spot is about a track: it gets `new_track`, an id
+    /// that no track has.
+    pub fn of(alert: &Alert, new_track: impl FnOnce() -> u64) -> Self {
+        match (alert.kind, &alert.user, alert.evidence[SHARED_SPOT].as_str()) {
+            (AlertKind::UnclaimedEmitter, None, Some(shared)) => Self::CoLocated(shared.to_owned()),
+            (kind, Some(user), _) => Self::User(kind, user.clone()),
+            (AlertKind::UnclaimedEmitter, None, None) => Self::Track(new_track()),
+            (kind, None, _) => Self::System(kind),
+        }
+    }
+
     pub fn kind(&self) -> AlertKind {
         match self {
             Self::User(kind, _) | Self::System(kind) => *kind,
             Self::Track(_) | Self::CoLocated(_) => AlertKind::UnclaimedEmitter,
         }
+    }
+
+    /// The user of a cause of this kind.
+    pub fn user_with(&self, kind: AlertKind) -> Option<&str> {
+        self.user().filter(|_| self.kind() == kind)
     }
 
     /// The user that the alert names.
@@ -62,12 +78,26 @@ impl Finding {
         Self::Present(cause, Box::new(content))
     }
 
+    /// Present where there is something to say of it, else absent.
+    pub fn of(cause: Cause, content: Option<Content>) -> Self {
+        match content {
+            Some(content) => Self::present(cause, content),
+            None => Self::Absent(cause),
+        }
+    }
+
     /// The cause it is about; of a renamed one the new name.
     pub fn cause(&self) -> &Cause {
         match self {
             Self::Present(cause, _) | Self::Absent(cause) | Self::Renamed { to: cause, .. } => cause,
         }
     }
+}
+
+/// Whether one of the findings gives the cause another name.
+pub(super) fn is_renamed(findings: &[Finding], cause: &Cause) -> bool {
+    let is = |finding: &Finding| matches!(finding, Finding::Renamed { from, .. } if from == cause);
+    findings.iter().any(is)
 }
 
 impl Content {
@@ -88,6 +118,21 @@ impl Content {
         self.y_m = Some(position.y);
         self.cov_m2 = Some([[cov[(0, 0)], cov[(0, 1)]], [cov[(1, 0)], cov[(1, 1)]]]);
         self
+    }
+
+    /// Writes all of it to an alert, and how often its cause has come back.
+    pub fn write_to(mut self, alert: &mut Alert, recurrences: u32) {
+        if recurrences > 0
+            && let Value::Object(evidence) = &mut self.evidence
+        {
+            evidence.insert("recurrences".into(), recurrences.into());
+        }
+        alert.severity = self.severity;
+        alert.x_m = self.x_m;
+        alert.y_m = self.y_m;
+        alert.cov_m2 = self.cov_m2;
+        alert.claimed = self.claimed;
+        alert.evidence = self.evidence;
     }
 
     /// The claim that the position is compared with.

@@ -2,8 +2,11 @@
 //! no clock in here, so a replay gives the same alerts every time.
 
 mod alert;
+mod alert_ids;
 mod alert_lifecycle;
 mod ambiguity;
+mod by_user;
+mod cleared_causes;
 mod config;
 mod evidence;
 mod finding;

@@ -6,13 +6,13 @@ use super::alert::{AlertEvent, AlertKind};
 use super::finding::Cause;
 use super::frame_context::FrameContext;
 use super::report::{PositionStatus, Report, TrackedPosition};
-use super::track::tracker::Track;
+use super::track::beam_track::Track;
 use crate::estimate::Flags;
 
 /// The report of frame `index`; `never_seen` share one alert.
 pub(super) fn report(frame: &FrameContext, index: u64, never_seen: &[String], events: Vec<AlertEvent>) -> Report {
     let mut owners: BTreeMap<u64, &str> = BTreeMap::new();
-    for claim in frame.claims {
+    for claim in &frame.claims {
         let user = frame.users.get(&claim.claim.user).filter(|u| u.unseen_since.is_none());
         if let Some(track) = user.and_then(|u| u.track) {
             owners.entry(track).or_insert(&claim.claim.user);
@@ -76,7 +76,7 @@ mod tests {
         let mut scene = Scene::of_users(&[[0.0, 0.0], [50.0, 0.0]]);
         scene.show(&[[0.0, 0.0], [50.0, 0.0], [0.0, 60.0], [0.0, -60.0]]);
         let statuses = |scene: &Scene| {
-            let report = report(&scene.context(), 7, &["z".to_owned()], Vec::new());
+            let report = report(scene.context(), 7, &["z".to_owned()], Vec::new());
             assert_eq!((report.frame, report.unseen), (7, vec!["z".to_owned()]));
             let of = |e: TrackedPosition| (e.user.unwrap_or_default(), e.status);
             report.emitters.into_iter().map(of).collect::<Vec<_>>()

@@ -71,9 +71,38 @@ impl std::fmt::Display for Cause {
     }
 }
 
-/// Makes one signed request and judges the answer.
+/// What a receiver answered.
+pub(super) struct Answer {
+    pub(super) status: StatusCode,
+    retry_after: Option<Duration>,
+}
+
+impl Answer {
+    /// Why it is no confirmation; `None` where it is one.
+    pub(super) fn failure(&self) -> Option<Failure> {
+        match self.status {
+            status if status.is_success() => None,
+            status if status.is_redirection() => Some(Failure::Redirect(status)),
+            status => Some(Failure::Status(status)),
+        }
+    }
+}
+
+/// Delivers an event and judges the answer.
 pub(super) async fn send(endpoint: &Endpoint, id: &str, event: &Recorded, now: Timestamp) -> Verdict {
-    let body = payload::body(event);
+    let (failure, retry_after) = match post(endpoint, id, payload::body(event), now).await {
+        Ok(answer) if answer.status == StatusCode::GONE => return Verdict::Gone,
+        Ok(answer) => match answer.failure() {
+            None => return Verdict::Delivered,
+            Some(failure) => (failure, answer.retry_after),
+        },
+        Err(failure) => (failure, None),
+    };
+    Verdict::Failed { failure, retry_after }
+}
+
+/// Makes one signed request.
+pub(super) async fn post(endpoint: &Endpoint, id: &str, body: Vec<u8>, now: Timestamp) -> Result<Answer, Failure> {
     let unix_s = now.as_second();
     let request = endpoint
         .client
@@ -83,33 +112,17 @@ pub(super) async fn send(endpoint: &Endpoint, id: &str, event: &Recorded, now: T
         .header("webhook-timestamp", unix_s)
         .header("webhook-signature", endpoint.signer.sign(id, unix_s, &body))
         .body(body);
-    match request.send().await {
-        Ok(mut answer) => {
-            let status = answer.status();
-            let retry_after = retry_after(answer.headers(), now);
-            let mut read = 0;
-            while read < ANSWER
-                && let Ok(Some(chunk)) = answer.chunk().await
-            {
-                read += chunk.len();
-            }
-            match status {
-                StatusCode::GONE => Verdict::Gone,
-                _ if status.is_success() => Verdict::Delivered,
-                _ => Verdict::Failed {
-                    failure: match status.is_redirection() {
-                        true => Failure::Redirect(status),
-                        false => Failure::Status(status),
-                    },
-                    retry_after,
-                },
-            }
-        }
-        Err(error) => Verdict::Failed {
-            failure: describe(error.without_url()),
-            retry_after: None,
-        },
+    let mut answer = request.send().await.map_err(|error| describe(error.without_url()))?;
+    let mut read = 0;
+    while read < ANSWER
+        && let Ok(Some(chunk)) = answer.chunk().await
+    {
+        read += chunk.len();
     }
+    Ok(Answer {
+        status: answer.status(),
+        retry_after: retry_after(answer.headers(), now),
+    })
 }
 
 fn describe(error: reqwest::Error) -> Failure {

@@ -65,6 +65,10 @@ impl CoolDown {
         }
     }
 
+    pub(super) fn set_period(&mut self, period: Duration) {
+        self.period = period;
+    }
+
     /// Whether there is anything to judge.
     pub(super) fn is_off(&self) -> bool {
         self.period.is_zero()

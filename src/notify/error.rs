@@ -1,8 +1,9 @@
-//! Why a `[[webhook]]` cannot be used.
+//! Why a `[[webhook]]` cannot be used, or an operator's request not be met.
 
 use std::path::PathBuf;
 
 use super::signature::SecretError;
+use crate::journal;
 
 /// Why a `[[webhook]]` cannot be used. `index` counts the tables from 1.
 #[derive(Debug, thiserror::Error)]
@@ -57,4 +58,19 @@ pub enum AuthorityError {
     Malformed(#[from] reqwest::Error),
     #[error("holds no certificate")]
     Empty,
+}
+
+/// Why a request of the operator cannot be met.
+#[derive(Debug, thiserror::Error)]
+pub enum AskError {
+    #[error("there is no webhook `{0}`")]
+    Unknown(String),
+    #[error("the journal cannot be written now; dead letters stay where they are")]
+    ReadOnly,
+    #[error("a test event was sent a moment ago; come back in {0} s")]
+    TooSoon(u64),
+    #[error("the daemon is stopping")]
+    Stopping,
+    #[error(transparent)]
+    Journal(#[from] journal::Error),
 }

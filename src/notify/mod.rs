@@ -4,6 +4,7 @@
 //! what waits there until the receiver has confirmed it. docs/webhooks.md is the receiver's side of it.
 
 mod client;
+#[allow(clippy::disallowed_methods, reason = "the clock of deliveries, which tests speed up")]
 mod clock;
 mod config;
 mod cooling;
@@ -25,36 +26,22 @@ use rand_chacha::ChaCha8Rng;
 use tokio::sync::{mpsc, oneshot};
 use tokio::task::JoinHandle;
 
-use crate::journal::{self, DeadLetter, Journal};
+use crate::journal::{DeadLetter, Journal};
 use worker::{Command, Worker};
 
 pub use clock::Clock;
 pub use config::Config;
 pub use endpoint::{Endpoint, load};
-pub use error::Error;
-pub use status::{EndpointState, EndpointStatus};
+pub use error::{AskError, Error};
+pub use status::{EndpointState, EndpointStatus, TestOutcome};
 
 /// How long a replay waits for a busy disk, and how often it looks.
 const REPLAY_TIMEOUT: Duration = Duration::from_secs(3);
 const REPLAY_POLL: Duration = Duration::from_millis(100);
 
-/// Why a request of the operator cannot be met.
-#[derive(Debug, thiserror::Error)]
-pub enum AskError {
-    #[error("there is no webhook `{0}`")]
-    Unknown(String),
-    #[error("the journal cannot be written now; dead letters stay where they are")]
-    ReadOnly,
-    #[error("the daemon is stopping")]
-    Stopping,
-    #[error(transparent)]
-    Journal(#[from] journal::Error),
-}
-
 /// A handle on the webhook worker, for the API.
 #[derive(Clone)]
 pub struct Notifier {
-    names: Arc<[String]>,
     shown: Arc<Mutex<Vec<EndpointStatus>>>,
     commands: mpsc::Sender<Command>,
     journal: Journal,
@@ -70,14 +57,11 @@ pub fn spawn(
     seed: u64,
     shutdown: impl Future<Output = ()> + Send + 'static,
 ) -> (Notifier, JoinHandle<()>) {
-    let endpoints: Vec<Arc<Endpoint>> = endpoints.into_iter().map(Arc::new).collect();
-    let names = endpoints.iter().map(|e| e.name().to_owned()).collect();
-    let shown = Arc::new(Mutex::new(endpoints.iter().map(|e| EndpointStatus::new(e)).collect()));
+    let shown = Arc::new(Mutex::new(endpoints.iter().map(EndpointStatus::new).collect()));
     let (commands, receiver) = mpsc::channel(16);
     let rng = ChaCha8Rng::seed_from_u64(seed);
     let worker = Worker::new(endpoints, journal.clone(), clock, rng, receiver, shown.clone());
     let notifier = Notifier {
-        names,
         shown,
         commands,
         journal,
@@ -93,20 +77,20 @@ impl Notifier {
 
     /// Deliveries that the schedule gave up on, oldest first.
     pub fn dead_letters(&self, endpoint: &str, limit: usize) -> Result<Vec<DeadLetter>, AskError> {
-        self.index(endpoint)?;
+        self.known(endpoint)?;
         Ok(self.journal.dead_letters(endpoint, limit)?)
     }
 
     /// Sends to an endpoint again that had answered 410 Gone.
     pub async fn enable(&self, endpoint: &str) -> Result<(), AskError> {
-        let endpoint = self.index(endpoint)?;
+        let endpoint = self.known(endpoint)?;
         self.ask(|done| Command::Enable { endpoint, done }).await
     }
 
     /// Puts one dead letter, or all of them, back into the queue; gives how many. They go out beside later
     /// events of their alert that were sent meanwhile: the order is then the operator's.
     pub async fn replay(&self, endpoint: &str, seq: Option<u64>) -> Result<u64, AskError> {
-        let endpoint = self.index(endpoint)?;
+        let endpoint = self.known(endpoint)?;
         // A disk that is only busy is back within a moment.
         let mut waited = Duration::ZERO;
         while !self.journal.health().writable {
@@ -119,9 +103,22 @@ impl Notifier {
         self.ask(|done| Command::Replay { endpoint, seq, done }).await
     }
 
-    fn index(&self, name: &str) -> Result<usize, AskError> {
-        let found = self.names.iter().position(|n| n == name);
-        found.ok_or_else(|| AskError::Unknown(name.chars().take(64).collect()))
+    /// Sends an event that is marked as a test, and gives what came back.
+    pub async fn test(&self, endpoint: &str) -> Result<TestOutcome, AskError> {
+        let endpoint = self.known(endpoint)?;
+        self.ask(|done| Command::Test { endpoint, done }).await?
+    }
+
+    /// Sends to these endpoints from now on. Those that stay, by name, keep their queue; what waits for the others stays in the
+    /// journal.
+    pub async fn replace(&self, endpoints: Vec<Endpoint>) -> Result<(), AskError> {
+        self.ask(|done| Command::Replace { endpoints, done }).await
+    }
+
+    fn known(&self, name: &str) -> Result<String, AskError> {
+        let is_known = self.status().iter().any(|endpoint| endpoint.name == name);
+        let unknown = || AskError::Unknown(name.chars().take(64).collect());
+        is_known.then(|| name.to_owned()).ok_or_else(unknown)
     }
 
     async fn ask<T>(&self, command: impl FnOnce(oneshot::Sender<T>) -> Command) -> Result<T, AskError> {

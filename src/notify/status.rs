@@ -62,3 +62,16 @@ impl EndpointStatus {
         }
     }
 }
+
+/// What came back when an operator sent a test event.
+#[derive(Clone, Debug, PartialEq, serde::Serialize, utoipa::ToSchema)]
+pub struct TestOutcome {
+    /// The receiver confirmed it.
+    pub delivered: bool,
+    /// What the receiver answered; null where it did not.
+    pub status: Option<u16>,
+    /// Until the answer or the failure, ms.
+    pub took_ms: u64,
+    /// Why it was not delivered.
+    pub error: Option<String>,
+}

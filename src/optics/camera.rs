@@ -62,6 +62,11 @@ pub struct Camera {
 }
 
 impl Camera {
+    /// A pixel at or above this, J, is saturated; infinite where no level is known.
+    pub fn saturation_limit_j(&self) -> f64 {
+        self.saturation_j.unwrap_or(f64::INFINITY)
+    }
+
     /// Ground metres per sensor metre near the optical axis, h_u/z.
     pub fn ground_scale(&self) -> f64 {
         self.altitude_m / (self.plane_distance_m * self.distortion.focal_scale)

@@ -83,7 +83,7 @@ impl Questions {
         let plan = Plan::full();
         Self {
             cells: plan.cells,
-            estimators: plan.rungs,
+            estimators: plan.estimators,
             frames: 20,
             scenes,
             scene_frames: 300,

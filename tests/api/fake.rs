@@ -5,19 +5,27 @@ use std::net::{SocketAddr, TcpListener};
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
+use std::time::Duration;
 
 use jiff::Timestamp;
 use ndarray::Array2;
 use oapwatch::api::{self, Acknowledged, Command, Config, Feed, Listen, Listener, Server, State};
 use oapwatch::claim::Claim;
 use oapwatch::frame::Frame;
-use oapwatch::journal::{self, Journal};
+use oapwatch::journal::{self, AuditRecord, Journal};
 use oapwatch::monitor::{
     Acknowledgement, Alert, AlertEvent, AlertEventKind, AlertKind, AlertSource, AlertState, PositionStatus, Report,
     Severity, TrackedPosition, Withdrawal,
 };
 use oapwatch::optics;
+use reqwest::{Client, Response, header};
+use serde_json::Value;
+use tokio::io::AsyncReadExt;
+use tokio::net::TcpStream;
 use tokio::sync::{mpsc, oneshot};
+use tokio::time::timeout;
+
+pub const PATIENCE: Duration = Duration::from_secs(20);
 
 /// A running API and the strings that move it.
 pub struct Fake {
@@ -85,7 +93,7 @@ impl Fake {
         let metrics = oapwatch::metric::recorder().unwrap().handle();
         let mut state = State::new(feed.clone(), commands, journal.clone(), metrics, ready.clone());
         if let Some(folder) = recordings {
-            state = state.with_evidence(folder);
+            state = state.with_evidence(folder, &oapwatch::estimate::Config::default());
         }
         tokio::spawn(answer(received, feed.clone(), journal.clone()));
         let (stop, stopped) = oneshot::channel::<()>();
@@ -131,6 +139,42 @@ impl Fake {
     pub async fn alert(&self, id: &str, second: i64) {
         publish(&self.feed, &self.journal, AlertEventKind::Raised, alert(id, second)).await;
     }
+}
+
+pub async fn get(fake: &Fake, path: &str) -> Response {
+    Client::new().get(fake.url(path)).send().await.unwrap()
+}
+
+pub async fn json_of(response: Response) -> Value {
+    serde_json::from_slice(&response.bytes().await.unwrap()).unwrap()
+}
+
+/// Asserts problem details of this status and gives their detail.
+pub async fn problem(response: Response, status: u16) -> String {
+    assert_eq!(response.status().as_u16(), status);
+    assert_eq!(response.headers()[header::CONTENT_TYPE], "application/problem+json");
+    let body = json_of(response).await;
+    assert_eq!(body["status"], status);
+    assert_eq!(body["type"], "about:blank");
+    body["detail"].as_str().unwrap().to_owned()
+}
+
+/// Rows of the audit log about one action, newest first.
+pub async fn audited(fake: &Fake, action: &str) -> Vec<AuditRecord> {
+    fake.journal.settled().await;
+    let rows = fake.journal.audit_log(None, 100).unwrap();
+    let of = |r: &AuditRecord| serde_json::to_value(r.entry.action).unwrap() == action;
+    rows.into_iter().filter(of).collect()
+}
+
+/// Reads until the server closes; gives what it said.
+pub async fn until_closed(mut stream: TcpStream) -> String {
+    let mut said = Vec::new();
+    // A reset is a close too.
+    let _ = timeout(PATIENCE, stream.read_to_end(&mut said))
+        .await
+        .expect("the server closes");
+    String::from_utf8_lossy(&said).into_owned()
 }
 
 async fn publish(feed: &Feed, journal: &Journal, event: AlertEventKind, alert: Alert) {

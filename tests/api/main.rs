@@ -1,6 +1,11 @@
 //! The API from outside, over real connections.
 
+mod bodies;
+mod connections;
+mod evidence;
 mod fake;
 mod guards;
 mod rest;
 mod stream;
+mod tables;
+mod tokens;

@@ -1,32 +1,10 @@
-//! REST: positions, alerts, claims, evidence, problem details.
+//! REST: positions, alerts, claims, problem details.
 
-use ndarray::Array2;
 use oapwatch::api::Config;
-use oapwatch::claim::Claim;
-use oapwatch::frame::Frame;
-use oapwatch::frames::record::{self, Recorder};
-use reqwest::{Client, Response, StatusCode, header};
+use reqwest::{Client, StatusCode, header};
 use serde_json::{Value, json};
 
-use crate::fake::{Fake, at};
-
-async fn get(fake: &Fake, path: &str) -> Response {
-    Client::new().get(fake.url(path)).send().await.unwrap()
-}
-
-async fn json_of(response: Response) -> Value {
-    serde_json::from_slice(&response.bytes().await.unwrap()).unwrap()
-}
-
-/// Asserts problem details of this status and gives their detail.
-async fn problem(response: Response, status: u16) -> String {
-    assert_eq!(response.status().as_u16(), status);
-    assert_eq!(response.headers()[header::CONTENT_TYPE], "application/problem+json");
-    let body = json_of(response).await;
-    assert_eq!(body["status"], status);
-    assert_eq!(body["type"], "about:blank");
-    body["detail"].as_str().unwrap().to_owned()
-}
+use crate::fake::{Fake, get, json_of, problem};
 
 #[tokio::test]
 async fn positions_and_users_are_as_the_report_says() {
@@ -193,82 +171,6 @@ async fn an_acknowledgement_has_a_note_and_can_be_undone() {
     fake.stop().await;
 }
 
-/// Width and height of a PNG, all of whose pixels can be decoded.
-fn size_of(png: &[u8]) -> (u32, u32) {
-    let mut reader = png::Decoder::new(std::io::Cursor::new(png)).read_info().unwrap();
-    let mut pixels = vec![0; reader.output_buffer_size().unwrap()];
-    let info = reader.next_frame(&mut pixels).unwrap();
-    (info.width, info.height)
-}
-
-#[tokio::test]
-async fn evidence_is_served_as_frames_as_a_picture_and_with_claims() {
-    let dir = tempfile::tempdir().unwrap();
-    let config = record::Config {
-        folder: Some(dir.path().join("recordings")),
-        after_s: 2.0,
-        ..record::Config::default()
-    };
-    let folder = config.folder.clone().unwrap();
-    let mut recorder = Recorder::start(&config).unwrap().unwrap();
-    let claim: Claim = serde_json::from_value(json!({"time": at(0), "user": "u-1", "x_m": 1.0, "y_m": 2.0})).unwrap();
-    let mut file = None;
-    for k in 0..20 {
-        let frame = Frame {
-            index: k,
-            time: at(k as i64),
-            pixels: Array2::from_elem((64, 64), k as f64),
-            masked: None,
-        };
-        recorder.frame(&frame, std::slice::from_ref(&claim)).expect("taken");
-        if k == 10 {
-            file = recorder.evidence("a-1", frame.time);
-        }
-    }
-    drop(recorder);
-    let file = file.expect("the evidence has a file");
-    assert!(
-        file.is_file() && file.ends_with("evidence/a-1.npy"),
-        "{}",
-        file.display()
-    );
-
-    let fake = Fake::with_recordings(Config::default(), &folder).await;
-    fake.step(1);
-    fake.alert("a-1", 10).await;
-    fake.alert("a-2", 10).await;
-    let npy = get(&fake, "/v1/alerts/a-1/evidence.npy").await;
-    assert_eq!(npy.status(), StatusCode::OK);
-    assert_eq!(npy.bytes().await.unwrap(), std::fs::read(&file).unwrap());
-    let told = json_of(get(&fake, "/v1/alerts/a-1/evidence.json").await).await;
-    let position = told["position"].as_u64().unwrap() as usize;
-    assert_eq!(told["frames"][position]["index"], 10, "the alert's own frame");
-    assert_eq!(told["frames"][position]["claims"][0]["user"], "u-1");
-    let png = get(&fake, "/v1/alerts/a-1/evidence.png?scale=2").await;
-    assert_eq!(png.headers()[header::CONTENT_TYPE], "image/png");
-    assert_eq!(size_of(&png.bytes().await.unwrap()), (128, 128));
-
-    for ending in ["npy", "json", "png"] {
-        let detail = problem(get(&fake, &format!("/v1/alerts/a-2/evidence.{ending}")).await, 404).await;
-        assert!(detail.contains("recorded"), "{detail}");
-        problem(get(&fake, &format!("/v1/alerts/a-3/evidence.{ending}")).await, 404).await;
-    }
-    fake.stop().await;
-}
-
-#[tokio::test]
-async fn without_a_recorder_an_alert_of_this_run_has_a_picture() {
-    let fake = Fake::start(Config::default()).await;
-    fake.step(1);
-    fake.alert("a-1", 1).await;
-    problem(get(&fake, "/v1/alerts/a-1/evidence.png").await, 404).await;
-    let alert = fake.journal.alert("a-1").unwrap().unwrap();
-    fake.feed.illustrate(&[alert], &crate::fake::snapshot(1));
-    let png = get(&fake, "/v1/alerts/a-1/evidence.png").await;
-    assert_eq!(size_of(&png.bytes().await.unwrap()), (256, 256));
-    fake.stop().await;
-}
-
 #[tokio::test]
 async fn claims_are_counted_and_refused_one_by_one() {
     let fake = Fake::start(Config::default()).await;
@@ -362,6 +264,9 @@ async fn the_description_is_openapi_3_1_and_lists_every_path() {
         "/v1/positions",
         "/v1/users/{user}/position",
         "/v1/alerts",
+        "/v1/alerts.csv",
+        "/v1/history.csv",
+        "/v1/webhooks/{name}/test",
         "/v1/alerts/{id}",
         "/v1/alerts/{id}/acknowledge",
         "/v1/alerts/{id}/evidence.npy",

@@ -2,8 +2,8 @@
 
 mod over_http;
 mod process;
+mod reload;
 mod siege;
-mod viewers;
 
 use std::path::Path;
 use std::process::Command;
@@ -186,12 +186,15 @@ fn what_the_daemon_records_is_reviewed_to_the_same_alert() {
 #[test]
 fn a_camera_that_was_never_there_is_seen_by_rules_and_in_the_log() {
     let dir = tempfile::tempdir().unwrap();
-    let config =
-        "[optics]\njoules_per_count = 1e-9\n[source]\nkind = \"v4l2\"\ndevice = \"/dev/no-such-camera\"\nloop = true\n";
+    let config = "[optics]\njoules_per_count = 1e-9\n[record]\nfolder = \"recordings\"\n[source]\nkind = \"v4l2\"\n\
+                  device = \"/dev/no-such-camera\"\nloop = true\n";
     let daemon = Daemon::start(dir.path(), config);
-    daemon.wait_for("/v1/alerts", "lost sensor", |v| {
+    let list = daemon.wait_for("/v1/alerts", "lost sensor", |v| {
         alerts(v).iter().any(|a| a["kind"] == "sensor_lost")
     });
+    for alert in alerts(&list) {
+        assert!(alert["source"]["file"].is_null(), "no frame, no file: {alert}");
+    }
     let (_, metrics) = daemon.get("/metrics");
     for line in [
         "oapwatch_last_good_frame_timestamp_seconds 0",

@@ -1,14 +1,9 @@
 //! What operators and the network do to a running daemon over HTTP.
 
-use std::io::{Read, Write};
-use std::net::TcpListener;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicUsize, Ordering};
-
-use super::process::{Daemon, alerts};
+use super::process::{Daemon, alerts, receiver};
 
 /// One user who stands still and somebody nobody knows.
-const SCENE: &str = r#"
+pub const SCENE: &str = r#"
 rate_hz = 10.0
 
 [optics]
@@ -156,35 +151,6 @@ fn an_acknowledged_alert_is_the_same_one_after_kill_9() {
     assert_eq!(unclaimed.count(), 1, "{positions}");
 }
 
-/// A receiver that wants no more at first.
-fn receiver() -> (u16, Arc<AtomicUsize>) {
-    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
-    let port = listener.local_addr().unwrap().port();
-    let requests = Arc::new(AtomicUsize::new(0));
-    let count = requests.clone();
-    std::thread::spawn(move || {
-        for stream in listener.incoming() {
-            let Ok(mut stream) = stream else { return };
-            let mut request = Vec::new();
-            let mut buffer = [0; 4096];
-            // The body's end is the last brace: it is JSON.
-            while !request.ends_with(b"}") {
-                match stream.read(&mut buffer) {
-                    Ok(n) if n > 0 => request.extend_from_slice(&buffer[..n]),
-                    _ => break,
-                }
-            }
-            let first = count.fetch_add(1, Ordering::SeqCst) == 0;
-            let status = if first { "410 Gone" } else { "204 No Content" };
-            let _ = write!(
-                stream,
-                "HTTP/1.1 {status}\r\ncontent-length: 0\r\nconnection: close\r\n\r\n"
-            );
-        }
-    });
-    (port, requests)
-}
-
 #[test]
 fn a_webhook_that_is_gone_is_seen_and_enabled_over_the_api() {
     let dir = tempfile::tempdir().unwrap();
@@ -194,14 +160,14 @@ fn a_webhook_that_is_gone_is_seen_and_enabled_over_the_api() {
         "whsec_MDEyMzQ1Njc4OWFiY2RlZjAxMjM0NTY3ODlhYmNkZWY=\n",
     )
     .unwrap();
-    let (port, requests) = receiver();
+    let (port, requests) = receiver("410 Gone");
     let webhook =
         format!("[[webhook]]\nname = \"soc\"\nurl = \"http://127.0.0.1:{port}/\"\nsecret_file = \"secret\"\n");
     let daemon = Daemon::start(dir.path(), &format!("{CONFIG}{webhook}"));
     let endpoint = |v: &serde_json::Value| v["webhooks"][0].clone();
     let gone = daemon.wait_for("/v1/webhooks", "410", |v| endpoint(v)["state"] == "disabled");
     assert!(endpoint(&gone)["queued"].as_u64() >= Some(1), "{gone}");
-    assert_eq!(requests.load(Ordering::SeqCst), 1);
+    assert_eq!(requests.lock().unwrap().len(), 1);
     assert!(!gone.to_string().contains("whsec"), "{gone}");
 
     assert_eq!(daemon.post("/v1/webhooks/no-such/enable", "").0, 404);
@@ -209,7 +175,7 @@ fn a_webhook_that_is_gone_is_seen_and_enabled_over_the_api() {
     daemon.wait_for("/v1/webhooks", "delivery", |v| {
         endpoint(v)["state"] == "working" && endpoint(v)["queued"] == 0 && endpoint(v)["sent"].as_u64() >= Some(1)
     });
-    assert!(requests.load(Ordering::SeqCst) >= 2);
+    assert!(requests.lock().unwrap().len() >= 2);
 
     let (status, letters) = daemon.get("/v1/webhooks/soc/dead-letters");
     assert_eq!((status, letters.as_str()), (200, r#"{"dead_letters":[]}"#));

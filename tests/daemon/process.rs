@@ -4,6 +4,7 @@ use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{TcpListener, TcpStream};
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use serde_json::Value;
@@ -122,4 +123,34 @@ fn request(url: &str, method: &str, path: &str, header: &str, body: &str) -> Opt
 
 pub fn alerts(value: &Value) -> &[Value] {
     value["alerts"].as_array().map_or(&[], Vec::as_slice)
+}
+
+/// A webhook receiver that answers `first` once, then 204; gives its port and the requests so far.
+pub fn receiver(first: &'static str) -> (u16, Arc<Mutex<Vec<String>>>) {
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let port = listener.local_addr().unwrap().port();
+    let requests: Arc<Mutex<Vec<String>>> = Arc::default();
+    let seen = requests.clone();
+    std::thread::spawn(move || {
+        let answers = std::iter::once(first).chain(std::iter::repeat("204 No Content"));
+        for (stream, status) in listener.incoming().zip(answers) {
+            let Ok(mut stream) = stream else { return };
+            let mut request = Vec::new();
+            let mut buffer = [0; 4096];
+            // The body's end is the last brace: it is JSON.
+            while !request.ends_with(b"}") {
+                match stream.read(&mut buffer) {
+                    Ok(n) if n > 0 => request.extend_from_slice(&buffer[..n]),
+                    _ => break,
+                }
+            }
+            let request = String::from_utf8_lossy(&request).into_owned();
+            seen.lock().unwrap().push(request);
+            let _ = write!(
+                stream,
+                "HTTP/1.1 {status}\r\ncontent-length: 0\r\nconnection: close\r\n\r\n"
+            );
+        }
+    });
+    (port, requests)
 }

@@ -17,11 +17,11 @@ EMULATOR = ["qemu-aarch64-static", "-L", "/usr/aarch64-linux-gnu"]
 # which is far below its standard deviation. The learned heatmap only starts the fit.
 MOST_STDS = 0.01
 SCENES = ["builtin", "paper-energy", "hazy-noon"]
-RUNGS = ["ml", "map", "hybrid"]
+ESTIMATORS = ["ml", "map", "hybrid"]
 
 CONFIG = """
 [estimator]
-name = "{rung}"
+name = "{estimator}"
 {known}
 """
 KNOWN = "[estimator.known_power]\nenergies_j = [6.8e-3]\n"
@@ -67,9 +67,9 @@ def main():
             out([*native, "simulate", "--scene", file, "--frames", str(count), "--seed", "1", "--out", folder / scene])
             optics = re.search(r"(?ms)^\[optics\]$.*?(?=^\[|\Z)", file.read_text())
             optics = optics[0] if optics else ""
-            for rung in RUNGS:
+            for estimator in ESTIMATORS:
                 config = folder / "config.toml"
-                config.write_text(optics + CONFIG.format(rung=rung, known=KNOWN if rung == "map" else ""))
+                config.write_text(optics + CONFIG.format(estimator=estimator, known=KNOWN if estimator == "map" else ""))
                 here, _ = located(native, config, folder / scene / "frames.npy")
                 there, took = located(cross, config, folder / scene / "frames.npy")
                 found = [difference(a, b) for a, b in zip(here, there, strict=True)]
@@ -78,7 +78,7 @@ def main():
                 beams = sum(len(line["emitters"]) for line in here)
                 odd = len(found) - len(same)
                 print(
-                    f"{scene}, {rung}: {len(here)} frames, {beams} beams; largest difference {metres:.1e} m, {stds:.1e} standard "
+                    f"{scene}, {estimator}: {len(here)} frames, {beams} beams; largest difference {metres:.1e} m, {stds:.1e} standard "
                     f"deviations; {odd} frames with another number of beams; {took / len(here):.1f} s a frame under emulation"
                 )
                 failed |= odd > 0 or stds > MOST_STDS

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Gives the daemon ten times the frames it can handle and fails when its results grow old. Usage: overload.py PROGRAM [SECONDS].
 
-A crowd that takes the default rung some milliseconds a frame to tell apart. The age of a result is the wall clock when a client
+A crowd that takes the default estimator some milliseconds a frame to tell apart. The age of a result is the wall clock when a client
 of the stream has it, less the frame's own time.
 """
 

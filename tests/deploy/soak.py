@@ -95,7 +95,7 @@ def main():
     parser.add_argument("--seconds", type=int, default=600)
     parser.add_argument("--frames", type=int, default=1 << 62, help="stop once so many were looked at")
     parser.add_argument("--rate", type=float, default=400.0, help="frames the source offers a second")
-    parser.add_argument("--estimator", help="a rung; the default one when left out")
+    parser.add_argument("--estimator", help="an estimator; the default one when left out")
     parser.add_argument("--unasked", action="store_true", help="without the client: the status once a minute only")
     parser.add_argument("--samples", type=pathlib.Path, help="where to write them, for soak_picture.py")
     asked = parser.parse_args()

@@ -2,7 +2,7 @@
 
 use oapwatch::monitor::AlertKind::*;
 
-use crate::stories::{Actor, Story, crowd, tell};
+use crate::stories::{Actor, Expect, Story, crowd, tell};
 
 #[test]
 fn an_intruder_that_stays_is_still_the_same_alert() {

@@ -5,7 +5,7 @@ use std::time::Instant;
 use oapwatch::claims::{Claim, ClaimState};
 use oapwatch::monitor::AlertKind::{self, *};
 
-use crate::stories::{Actor, Story, at, crowd, tell, tell_with};
+use crate::stories::{Actor, Expect, Story, at, crowd, tell, tell_with};
 
 pub fn forged(user: &str, made: f64, x_m: f64, y_m: f64) -> Claim {
     Claim {

@@ -3,7 +3,7 @@
 use oapwatch::monitor::PositionStatus;
 
 use crate::SEEDS;
-use crate::stories::{Actor, Story, crowd, tell};
+use crate::stories::{Actor, Expect, Story, crowd, tell};
 
 #[test]
 fn an_honest_crowd_raises_nothing_and_is_verified() {

@@ -13,7 +13,7 @@ use base64::prelude::BASE64_STANDARD;
 use hmac::{Hmac, KeyInit, Mac};
 use jiff::{SignedDuration, Timestamp};
 use oapwatch::monitor::{AlertEventKind, AlertKind};
-use oapwatch::notify::{Clock, EndpointState};
+use oapwatch::notify::{AskError, Clock, EndpointState};
 
 use receiver::Receiver;
 use sender::{Daemon, KEY, event, life, on_disk, start, until, webhook};
@@ -169,5 +169,89 @@ async fn a_cool_down_tells_the_receiver_once_and_the_history_all() {
     daemon.journal.settled().await;
     assert_eq!(daemon.journal.events_after(0, 100).unwrap().len(), 9);
     assert!(daemon.journal.waiting(&daemon.status().name, 0).unwrap().is_empty());
+    daemon.stop().await;
+}
+
+#[tokio::test]
+async fn a_test_event_is_signed_marked_and_beside_the_queue() {
+    let dir = tempfile::tempdir().unwrap();
+    let receiver = Receiver::start(|k, _| [StatusCode::OK, StatusCode::FORBIDDEN][k].into_response()).await;
+    let mut config = webhook(dir.path(), &receiver.url);
+    config.name = Some("soc".to_owned());
+    let clock = Clock::fast(start(), 1000.0);
+    let daemon = Daemon::start(&on_disk(dir.path()), &[config], clock);
+    let outcome = daemon.notifier.test("soc").await.unwrap();
+    assert_eq!(
+        (outcome.delivered, outcome.status, outcome.error),
+        (true, Some(200), None)
+    );
+    let seen = &receiver.all()[0];
+    let json = seen.json();
+    assert_eq!(
+        (&json["type"], &json["event"]),
+        (&"webhook.test".into(), &"webhook.test".into())
+    );
+    assert_eq!(
+        (&json["alert"]["id"], &json["alert"]["evidence"]["test"]),
+        (&"test".into(), &true.into())
+    );
+    let (id, sent) = (&seen.headers["webhook-id"], &seen.headers["webhook-timestamp"]);
+    let mut mac = Hmac::<sha2::Sha256>::new_from_slice(KEY).unwrap();
+    mac.update(format!("{id}.{sent}.").as_bytes());
+    mac.update(&seen.body);
+    let expected = format!("v1,{}", BASE64_STANDARD.encode(mac.finalize().into_bytes()));
+    assert_eq!(seen.headers["webhook-signature"], expected);
+
+    // What came back is told; nothing is tried again.
+    let mut outcome = daemon.notifier.test("soc").await;
+    while matches!(outcome, Err(AskError::TooSoon(_))) {
+        tokio::time::sleep(std::time::Duration::from_millis(2)).await;
+        outcome = daemon.notifier.test("soc").await;
+    }
+    let outcome = outcome.unwrap();
+    assert_eq!((outcome.delivered, outcome.status), (false, Some(403)));
+    assert!(outcome.error.is_some_and(|error| error.contains("403")));
+    assert_eq!(receiver.all().len(), 2);
+    let status = daemon.status();
+    assert_eq!((status.sent, status.failed, status.queued), (0, 0, 0));
+    assert!(matches!(daemon.notifier.test("other").await, Err(AskError::Unknown(_))));
+    daemon.stop().await;
+}
+
+#[tokio::test]
+async fn an_endpoint_that_stays_keeps_its_queue_and_one_that_goes_leaves_it_in_the_journal() {
+    let dir = tempfile::tempdir().unwrap();
+    let down = Receiver::start(|_, _| StatusCode::SERVICE_UNAVAILABLE.into_response()).await;
+    let up = Receiver::accepting().await;
+    let named = |name: &str, url: &str| {
+        let mut config = webhook(dir.path(), url);
+        config.name = Some(name.to_owned());
+        config
+    };
+    let (stays, goes) = (named("stays", &down.url), named("goes", &down.url));
+    let daemon = Daemon::start(&on_disk(dir.path()), &[stays, goes.clone()], Clock::wall());
+    daemon.record(&life("a"));
+    until(|| {
+        daemon
+            .notifier
+            .status()
+            .iter()
+            .all(|s| s.queued == 3 && s.last_failure.is_some())
+    })
+    .await;
+
+    let load = |configs: &[oapwatch::notify::Config]| oapwatch::notify::load(configs).unwrap();
+    daemon.notifier.replace(load(&[named("stays", &up.url)])).await.unwrap();
+    assert_eq!(daemon.notifier.status().len(), 1);
+    assert_eq!(daemon.status().url, up.url);
+    daemon.record(&life("b"));
+    // The address is another, the delivery's next attempt is not: a new alert goes out beside it.
+    until(|| up.accepted().iter().filter(|(id, _)| id == "b").count() == 3).await;
+    until(|| up.accepted().iter().filter(|(id, _)| id == "a").count() == 3).await;
+
+    daemon.notifier.replace(load(&[named("goes", &up.url)])).await.unwrap();
+    until(|| daemon.status().queued == 0 && daemon.status().sent == 3).await;
+    let of_b = up.accepted().iter().filter(|(id, _)| id == "b").count();
+    assert_eq!(of_b, 3, "events while it was not configured are not sent to it");
     daemon.stop().await;
 }

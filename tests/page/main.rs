@@ -50,7 +50,9 @@ async fn an_eavesdropper_comes_is_acknowledged_and_goes_and_a_restart_is_survive
         .expect("a free port")
         .port();
     let config = dir.path().join("oapwatch.toml");
-    let text = format!("[api]\nlisten = \"127.0.0.1:{port}\"\n[journal]\npath = \"journal.db\"\n");
+    let text = format!(
+        "[api]\nlisten = \"127.0.0.1:{port}\"\n[journal]\npath = \"journal.db\"\n[record]\nfolder = \"recordings\"\n"
+    );
     std::fs::write(&config, text).expect("the config is written");
     let daemon = Daemon::start(&config);
     let Some(mut page) = Browser::open(&dir.path().join("profile"), &format!("http://127.0.0.1:{port}/")).await else {
@@ -106,6 +108,14 @@ async fn an_eavesdropper_comes_is_acknowledged_and_goes_and_a_restart_is_survive
         &mut page,
         "with a picture",
         &format!("document.querySelector('{card} .thumbnail img').naturalWidth >= 256"),
+    )
+    .await;
+    page.eval(&format!("document.querySelector('{card} details').open = true"))
+        .await;
+    until(
+        &mut page,
+        "with its model and residual beside",
+        &format!("document.querySelector('{card} .fit img').naturalWidth > 3 * 512"),
     )
     .await;
     until(

@@ -3,7 +3,7 @@
 use oapwatch::monitor::AlertKind::*;
 use oapwatch::monitor::PositionStatus;
 
-use super::stage::{Story, review};
+use super::stage::{Expect, Story, review};
 
 #[test]
 fn an_eavesdropper_far_from_everybody_is_one_alert() {

@@ -2,7 +2,7 @@
 
 use oapwatch::monitor::AlertKind::*;
 
-use super::stage::{Story, review};
+use super::stage::{Expect, Story, review, scene_file};
 
 #[test]
 fn a_shift_of_all_claims_is_our_own_pose_and_nothing_else() {
@@ -93,7 +93,7 @@ fn a_log_that_stops_is_stale_and_hides_no_intruder() {
 /// A lamp over half of the array: the alert is there in a second, and no frame takes long to say nothing.
 #[test]
 fn a_lamp_on_the_lens_is_a_lost_sensor_at_once() {
-    let mut story = Story::file(1, "config/scenes/blinding.toml");
+    let mut story = scene_file(1, "config/scenes/blinding.toml");
     story.seconds = 14.0;
     let began = std::time::Instant::now();
     let told = review(&story);

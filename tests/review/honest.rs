@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use super::stage::{CROWD, Reviewed, Story, review};
+use super::stage::{CROWD, Expect, Reviewed, Story, review, scene_file};
 
 /// Which track answered for a user over the story, each once.
 fn identities(told: &Reviewed) -> BTreeMap<String, Vec<u64>> {
@@ -89,7 +89,7 @@ fn the_scenes_without_an_attacker_raise_nothing() {
         ("narrow-beam", 40.0),
         ("windy", 60.0),
     ] {
-        let mut story = Story::file(1, &format!("config/scenes/{name}.toml"));
+        let mut story = scene_file(1, &format!("config/scenes/{name}.toml"));
         story.seconds = seconds;
         let told = review(&story);
         assert!(told.raised().is_empty(), "{name}: {:?}", told.raised());

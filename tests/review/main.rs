@@ -3,6 +3,5 @@
 mod attacks;
 mod faults;
 mod honest;
-mod power;
 mod stage;
 mod tracks;

@@ -1,184 +1,26 @@
-//! Scenes rendered by the program's own simulator, pixel by pixel, through estimator, tracks and verdicts.
+//! Stories through pixels, and what a test expects of one.
 
 #[path = "../stories/expected.rs"]
 mod expected;
 
-use jiff::Timestamp;
-use oapwatch::config::Config;
-use oapwatch::monitor::{AlertEvent, AlertEventKind, AlertKind, Report};
-use oapwatch::pipeline::Pipeline;
-use oapwatch::scene::{Fate, Plan, Scene, SimulatedFrame, Truth};
+use oapwatch::monitor::AlertKind;
+pub use oapwatch::study::stories::pixels::{CROWD, PixelStory as Story, Reviewed, review};
 
-pub const RATE_HZ: f64 = 10.0;
-
-/// The paper's optics at σ_eff = 1 mm on 40 × 40 pixels, its fading and pointing, and five honest users.
-const COMMON: &str = r#"
-rate_hz = 10.0
-[optics]
-pixels = [40, 40]
-spot_sigma_m = 0.001
-noise_std_j = 1.0e-6
-[link]
-integration_time_s = 0.1
-[claims]
-noise_m = 0.3
-sigma_m = 0.3
-[effects]
-attenuation = { kappa_per_m = 0.001 }
-fading = { alpha = 4.0, beta = 2.0 }
-pointing = { jitter_m = 0.1 }
-thermal_noise = {}
-"#;
-
-const USERS: &str = r#"
-[[user]]
-name = "u-1"
-motion.walk = { through_m = [[-80, -60], [-20, -70], [-40, -10]], speed_m_s = 1.4 }
-[[user]]
-name = "u-2"
-motion.still = [60, -50]
-[[user]]
-name = "u-3"
-motion.walk = { through_m = [[40, 60], [90, 70], [70, 20]], speed_m_s = 1.2 }
-[[user]]
-name = "u-4"
-motion.still = [-70, 60]
-"#;
-
-/// Four more who mill about within two spot widths.
-pub const CROWD: &str = r#"
-[[user]]
-name = "r-1"
-motion.roam = { home_m = [0, 0], spread_m = 12, time_s = 12 }
-[[user]]
-name = "r-2"
-motion.roam = { home_m = [10, 5], spread_m = 12, time_s = 12 }
-[[user]]
-name = "r-3"
-motion.roam = { home_m = [3, 9], spread_m = 12, time_s = 20 }
-[[user]]
-name = "r-4"
-motion.roam = { home_m = [-6, 4], spread_m = 12, time_s = 9 }
-"#;
-
-pub struct Story {
-    scene: Scene,
-    pub seed: u64,
-    pub seconds: f64,
-    pub config: Config,
-    /// What happens to a frame and its claims on their way.
-    pub tamper: Box<dyn Fn(f64, &mut SimulatedFrame)>,
+/// A scene file of the repository.
+pub fn scene_file(seed: u64, path: &str) -> Story {
+    let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join(path);
+    Story::file(seed, &path).unwrap()
 }
 
-impl Story {
-    /// Four honest users and whoever else `toml` names.
-    pub fn with(seed: u64, toml: &str) -> Self {
-        Self::of(seed, &format!("{COMMON}{USERS}{toml}"))
-    }
-
-    /// Only those whom `toml` names.
-    pub fn only(seed: u64, toml: &str) -> Self {
-        Self::of(seed, &format!("{COMMON}{toml}"))
-    }
-
-    /// A scene file of the repository.
-    pub fn file(seed: u64, path: &str) -> Self {
-        let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join(path);
-        Self::of(seed, &std::fs::read_to_string(path).unwrap())
-    }
-
-    pub fn change(&mut self, change: impl FnOnce(&mut Scene)) {
-        change(&mut self.scene);
-    }
-
-    /// The story's pixels alone.
-    pub fn frames(&self) -> Vec<ndarray::Array2<f64>> {
-        let plan = Plan::compile(&self.scene, self.seed).unwrap();
-        let frames = 0..(self.seconds * RATE_HZ) as u64;
-        frames.map(|k| plan.frame(k).frame.pixels).collect()
-    }
-
-    fn of(seed: u64, toml: &str) -> Self {
-        Self {
-            scene: toml::from_str(toml).expect("a scene"),
-            seed,
-            seconds: 20.0,
-            config: Config::default(),
-            tamper: Box::new(|_, _| {}),
-        }
-    }
-}
-
-pub fn start() -> Timestamp {
-    "2026-11-21T08:00:00Z".parse().unwrap()
-}
-
-/// What the program said of a story.
-pub struct Reviewed {
-    pub events: Vec<AlertEvent>,
-    pub reports: Vec<Report>,
-    pub truths: Vec<Truth>,
-}
-
-/// Every frame of the story through the daemon's pipeline.
-pub fn review(story: &Story) -> Reviewed {
-    let plan = Plan::compile(&story.scene, story.seed).unwrap().starting_at(start());
-    let mut config = story.config.clone();
-    config.source.rate_hz = Some(RATE_HZ);
-    let mut pipeline = Pipeline::new(&config, plan.camera()).unwrap();
-    let mut told = Reviewed {
-        events: Vec::new(),
-        reports: Vec::new(),
-        truths: Vec::new(),
-    };
-    let mut maker = plan.maker();
-    for k in 0..(story.seconds * RATE_HZ) as u64 {
-        let mut made = maker.frame(k);
-        if made.fate == Fate::Dropped {
-            pipeline.claim(made.claims, made.frame.time);
-            continue;
-        }
-        (story.tamper)(k as f64 / RATE_HZ, &mut made);
-        pipeline.claim(made.claims, made.frame.time);
-        let step = pipeline.step(&made.frame);
-        told.events.extend(step.report.events.iter().cloned());
-        told.reports.push(step.report);
-        told.truths.push(made.truth);
-    }
-    told
-}
-
-impl Reviewed {
-    /// (kind, user, seconds) of every alert raised.
-    pub fn raised(&self) -> Vec<(AlertKind, Option<String>, f64)> {
-        self.events
-            .iter()
-            .filter(|e| e.event == AlertEventKind::Raised)
-            .map(|e| {
-                let at = e.alert.raised_at.duration_since(start()).as_secs_f64();
-                (e.alert.kind, e.alert.user.clone(), at)
-            })
-            .collect()
-    }
-
-    /// When alerts were cleared, s.
-    pub fn cleared(&self) -> Vec<f64> {
-        self.events
-            .iter()
-            .filter(|e| e.event == AlertEventKind::Cleared)
-            .filter_map(|e| e.alert.cleared_at)
-            .map(|t| t.duration_since(start()).as_secs_f64())
-            .collect()
-    }
-
+pub trait Expect {
     /// Exactly these were raised, each within its interval, s, and nothing else.
+    fn expect(&self, expected: &[(AlertKind, Option<&str>, f64, f64)]);
+}
+
+impl Expect for Reviewed {
     #[track_caller]
-    pub fn expect(&self, expected: &[(AlertKind, Option<&str>, f64, f64)]) {
-        let log: String = self
-            .events
-            .iter()
-            .map(|e| serde_json::to_string(e).unwrap() + "\n")
-            .collect();
-        expected::expect(&self.raised(), expected, &log);
+    fn expect(&self, expected: &[(AlertKind, Option<&str>, f64, f64)]) {
+        let lines = self.events.iter().map(|e| serde_json::to_string(e).unwrap() + "\n");
+        expected::expect(&self.raised(), expected, &lines.collect::<String>());
     }
 }

@@ -126,7 +126,7 @@ proptest! {
         let known = estimate::KnownPower { energies_j: vec![1.0], relative_std: 0.1, share: 0.95, attenuation_per_m: 0.0 };
         for name in ["ml", "map"] {
             let config = estimate::Config { name: Some(name.into()), known_power: Some(known.clone()), ..Default::default() };
-            let mut estimator = estimate::build(&config, &camera).expect("a rung");
+            let mut estimator = estimate::build(&config, &camera).expect("an estimator");
             if let Ok(estimate) = estimator.estimate(&frame) {
                 prop_assert_eq!(trial::faults(&estimate), Vec::<String>::new());
             }

@@ -37,6 +37,7 @@ export class Alerts {
       this.render();
     });
     this.clear = $("clear");
+    $("table").addEventListener("click", (e) => this.table(e.target));
     this.together.button.addEventListener("click", () => this.acknowledgeAll(this.shown().filter((a) => a.state === "open")));
   }
 
@@ -302,10 +303,33 @@ export class Alerts {
     rows.push(["raised", fullStamp(Date.parse(alert.raised_at))], ["from frame", `${alert.source.frame} (${alert.source.kind})`], ["id", alert.id]);
     if (alert.source.file) rows.push(["file", shown(alert.source.file)]);
     const table = el("table", {}, el("tbody", {}, ...rows.map(([k, v]) => el("tr", {}, el("td", {}, shown(k)), el("td", {}, el("bdi", {}, v))))));
-    return el("details", { open: isOpen, className: "numbers" }, el("summary", {}, "Evidence in full"), more.length ? el("ul", { className: "evidence" }, ...more) : "", table, this.downloads(alert));
+    const details = el("details", { open: isOpen, className: "numbers" }, el("summary", {}, "Evidence in full"), more.length ? el("ul", { className: "evidence" }, ...more) : "");
+    if (alert.source.file) details.append(this.fit(alert, details));
+    details.append(table, this.downloads(alert));
+    return details;
   }
 
-  // A link would not carry the token.
+  // The frame, the model and the residual, drawn when the reader opens the details.
+  fit(alert, details) {
+    const image = el("img", { alt: "The frame, the model that explains it, and the residual" });
+    const box = el("figure", { className: "fit", hidden: true }, image, el("figcaption", {}, "Frame, model, residual (blue −5 σ, black 0, orange +5 σ)"));
+    let tries = 3;
+    const load = async () => {
+      if (!details.open || image.src) return;
+      try {
+        const answer = await this.link.request(`/v1/alerts/${encodeURIComponent(alert.id)}/evidence.png?panels=all`);
+        image.src = URL.createObjectURL(await answer.blob());
+        image.onload = () => URL.revokeObjectURL(image.src);
+        box.hidden = false;
+      } catch {
+        // A new alert's recording takes a moment; an old one's may have made way for newer ones.
+        if (--tries > 0) setTimeout(load, 1500);
+      }
+    };
+    details.addEventListener("toggle", load);
+    return box;
+  }
+
   downloads(alert) {
     const box = el("p", { className: "downloads" });
     if (!alert.source.file) return box;
@@ -313,10 +337,7 @@ export class Alerts {
       const button = el("button", { type: "button" }, words);
       button.addEventListener("click", async () => {
         try {
-          const answer = await this.link.request(`/v1/alerts/${encodeURIComponent(alert.id)}/evidence.${ending}`);
-          const url = URL.createObjectURL(await answer.blob());
-          el("a", { href: url, download: `${alert.id}.${ending}` }).click();
-          setTimeout(() => URL.revokeObjectURL(url), 10_000);
+          await this.link.save(`/v1/alerts/${encodeURIComponent(alert.id)}/evidence.${ending}`, `${alert.id}.${ending}`);
         } catch (e) {
           button.replaceWith(el("span", { className: "quiet" }, e.message));
         }
@@ -324,6 +345,15 @@ export class Alerts {
       box.append(button);
     }
     return box;
+  }
+
+  async table(button) {
+    const kind = this.tools.kind.value;
+    try {
+      await this.link.save(`/v1/alerts.csv${kind ? `?kind=${kind}` : ""}`, "alerts.csv");
+    } catch (e) {
+      button.textContent = `Not saved: ${e.message}`;
+    }
   }
 
   async send(id, note) {

@@ -14,12 +14,31 @@ export class Bell {
     this.sound.addEventListener("click", () => {
       this.set(this.sound, "oapwatch-sound", !this.isOn(this.sound));
       if (this.isOn(this.sound)) this.tone(1);
+      this.say();
     });
     this.notify.addEventListener("click", () => this.ask());
     this.set(this.sound, "oapwatch-sound", localStorage.getItem("oapwatch-sound") === "on");
     this.notify.hidden = !("Notification" in window);
     const granted = "Notification" in window && Notification.permission === "granted";
     this.set(this.notify, "oapwatch-notify", granted && localStorage.getItem("oapwatch-notify") === "on");
+    // Browsers allow sound only after the reader has touched the page once, also where it was asked for before.
+    if (this.isOn(this.sound)) this.wake();
+    for (const touch of ["pointerdown", "keydown"]) addEventListener(touch, () => this.isOn(this.sound) && this.wake());
+  }
+
+  wake() {
+    if (!this.context) {
+      this.context = new AudioContext();
+      this.context.addEventListener("statechange", () => this.say());
+    }
+    this.context.resume();
+    this.say();
+  }
+
+  // A silent browser is not to look like one that will ring.
+  say() {
+    const isMute = this.isOn(this.sound) && this.context?.state !== "running";
+    this.sound.textContent = isMute ? "Sound: touch the page" : "Sound";
   }
 
   isOn(button) {
@@ -48,10 +67,8 @@ export class Bell {
     }
   }
 
-  // Browsers allow sound only after the reader has touched the page once.
   tone(times) {
-    this.context ??= new AudioContext();
-    this.context.resume();
+    this.wake();
     for (let k = 0; k < times; k++) {
       const at = this.context.currentTime + 0.28 * k;
       const oscillator = new OscillatorNode(this.context, { frequency: 880 });

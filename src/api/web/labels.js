@@ -4,15 +4,16 @@
 const HEIGHT = 16;
 const GAP = 16;
 
-// `wanted`: { x, y, width, rank, must, left } in pixels, smaller ranks first, `left` where the left side is the better one. Gives for each { dx, dy, anchor }, or null.
+// `wanted`: { x, y, widths, rank, must, left } in pixels, smaller ranks first, `widths` of the whole text and of shorter ones, `left` where the left side is
+// the better one. Gives for each { dx, dy, anchor, text }, `text` the index of the width that fits, or null.
 export function place(wanted, { width, height }) {
   const taken = wanted.map(({ x, y }) => [x - 9, y - 9, x + 9, y + 9]);
   const found = new Array(wanted.length).fill(null);
   const order = wanted.map((_, k) => k).sort((a, b) => wanted[a].rank - wanted[b].rank);
   for (const k of order) {
-    const { x, y, width: w, must, left } = wanted[k];
+    const { x, y, widths, must, left } = wanted[k];
     const sides = [{ dx: GAP, dy: 4.5, anchor: "start" }, { dx: -GAP, dy: 4.5, anchor: "end" }];
-    const places = [
+    const around = [
       ...(left ? sides.reverse() : sides),
       { dx: 0, dy: -GAP + 2, anchor: "middle" },
       { dx: 0, dy: GAP + 9, anchor: "middle" },
@@ -21,7 +22,9 @@ export function place(wanted, { width, height }) {
       { dx: GAP - 4, dy: GAP + 5, anchor: "start" },
       { dx: -GAP + 4, dy: GAP + 5, anchor: "end" },
     ];
-    const box = ({ dx, dy, anchor }) => {
+    const places = widths.flatMap((_, text) => around.map((p) => ({ ...p, text })));
+    const box = ({ dx, dy, anchor, text }) => {
+      const w = widths[text];
       const left = x + dx - (anchor === "end" ? w : anchor === "middle" ? w / 2 : 0);
       return [left, y + dy - HEIGHT + 4, left + w, y + dy + 4];
     };
@@ -30,7 +33,7 @@ export function place(wanted, { width, height }) {
     let at = places.find((p) => inside(box(p)) && free(box(p), k));
     if (!at && must) {
       const shared = (b) => taken.reduce((sum, o) => sum + Math.max(0, Math.min(b[2], o[2]) - Math.max(b[0], o[0])) * Math.max(0, Math.min(b[3], o[3]) - Math.max(b[1], o[1])), inside(b) ? 0 : 1e4);
-      at = places.map((p) => [shared(box(p)), p]).sort((a, b) => a[0] - b[0])[0][1];
+      at = places.slice(-around.length).map((p) => [shared(box(p)), p]).sort((a, b) => a[0] - b[0])[0][1];
     }
     if (!at) continue;
     found[k] = at;

@@ -260,8 +260,9 @@ export class GroundMap {
         pending: [e.user, e.user ? "" : `beam ${e.track}`],
         verified: [e.user, ""],
       }[e.status];
+      const short = { unclaimed: [null, `beam ${e.track}`], mismatch: [e.user, ""] }[e.status];
       const found = this.isFound(`${e.user ?? ""} ${e.track}`);
-      this.labels.push({ x, y, key: `b${e.track}`, rank: { unclaimed: 0, mismatch: 1, pending: 3, verified: 4 }[e.status], parts, className: `beam-name ${e.status}`, found, left: Boolean(claim) && claim.x_m > e.x_m });
+      this.labels.push({ short, x, y, key: `b${e.track}`, rank: { unclaimed: 0, mismatch: 1, pending: 3, verified: 4 }[e.status], parts, className: `beam-name ${e.status}`, found, left: Boolean(claim) && claim.x_m > e.x_m });
       g.node.classList.toggle("found", found);
     }
     for (const track of gone) {
@@ -280,16 +281,18 @@ export class GroundMap {
   // Names beside the marks: those that matter, are sought or are pointed at always, the others where there is room.
   drawLabels() {
     const wanted = this.labels.map((label) => {
-      const text = label.parts.map((p) => (p === null ? "" : shown(p))).join("");
+      const texts = [label.parts, label.short].filter(Boolean);
+      // Wide enough for the bold names too.
+      const widths = texts.map((parts) => 8 * parts.map((p) => (p === null ? "" : shown(p))).join("").length + 4);
       const isChosen = label.key !== null && (label.key === this.pointed || label.key === this.pickedKey);
       const must = isChosen || label.found || label.rank <= 1;
-      return { ...label, text, rank: isChosen || label.found ? -1 : label.rank, must, width: 7.4 * text.length + 4 };
+      return { ...label, rank: isChosen || label.found ? -1 : label.rank, must, texts, widths };
     });
     const places = place(wanted, { width: this.width, height: this.height });
     const nodes = wanted.flatMap((label, k) => {
-      if (!places[k] || !label.text) return [];
-      const { dx, dy, anchor } = places[k];
-      const [name, rest] = label.parts;
+      if (!places[k]) return [];
+      const { dx, dy, anchor, text } = places[k];
+      const [name, rest] = label.texts[text];
       const node = svg("text", { class: label.className, x: label.x + dx, y: label.y + dy, "text-anchor": anchor });
       if (name !== null) node.append(svg("tspan", { class: "name" }, shown(name)));
       if (rest) node.append(rest);

@@ -31,7 +31,7 @@ export class Thumbnails {
     const id = image.dataset.alert;
     if (!this.urls.has(id)) {
       try {
-        const answer = await this.link.request(`/v1/alerts/${encodeURIComponent(id)}/evidence.png?scale=4`);
+        const answer = await this.link.request(`/v1/alerts/${encodeURIComponent(id)}/evidence.png?panels=data&scale=4`);
         this.keep(id, URL.createObjectURL(await answer.blob()));
       } catch (e) {
         if (e.status !== 404) return;

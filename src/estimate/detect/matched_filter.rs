@@ -1,9 +1,9 @@
 //! The matched filter on a fine grid and its maxima: non-maximum suppression, sub-grid peaks.
 
-use crate::estimate::dense_linalg::{axpy, dot};
+use crate::estimate::dense_linalg::{axpy, dispatch, dot};
 use crate::estimate::model::svd_basis::Basis;
 
-/// Grid spacing, σ: a spot half-way between grid points loses 3 % of its response.
+/// Grid spacing, σ: a spot half-way between grid points loses 3 % of its response. Half the spacing has four times the points.
 const SPACING: f64 = 0.5;
 
 /// Half-width of a template, σ: the rest holds 1e-5 of a spot's square.
@@ -14,8 +14,6 @@ const REACH: f64 = 3.0;
 pub(crate) struct Peak {
     /// Sub-pixel position, σ.
     pub u: [f64; 2],
-    /// The grid point it stands on.
-    pub grid: [f64; 2],
     /// Matched-filter response over its standard deviation.
     pub significance: f64,
     /// Energy a lone spot would have there, in units of the noise.
@@ -85,12 +83,12 @@ impl MatchedFilter {
 
     /// Fills the map with the response to `residual`.
     pub fn respond(&mut self, residual: &[f64], mx: usize, my: usize) {
-        pulp::Arch::new().dispatch(Filter {
-            matched_filter: self,
-            residual,
-            mx,
-            my,
-        });
+        dispatch!(<'a>
+            matched_filter: &'a mut MatchedFilter = self,
+            residual: &'a [f64] = residual,
+            mx: usize = mx,
+            my: usize = my
+            => (): matched_filter.filter(residual, mx, my));
     }
 
     #[inline(always)]
@@ -147,7 +145,6 @@ impl MatchedFilter {
                         self.grid[0][i] + dx * step(&self.grid[0]),
                         self.grid[1][j] + dy * step(&self.grid[1]),
                     ],
-                    grid: [self.grid[0][i], self.grid[1][j]],
                     significance: value,
                     a: value / (self.norms[0][i] * self.norms[1][j]),
                 });
@@ -167,21 +164,5 @@ impl MatchedFilter {
         }
         self.peaks.truncate(kept);
         &self.peaks
-    }
-}
-
-struct Filter<'a> {
-    matched_filter: &'a mut MatchedFilter,
-    residual: &'a [f64],
-    mx: usize,
-    my: usize,
-}
-
-impl pulp::NullaryFnOnce for Filter<'_> {
-    type Output = ();
-
-    #[inline(always)]
-    fn call(self) {
-        self.matched_filter.filter(self.residual, self.mx, self.my);
     }
 }

@@ -147,8 +147,8 @@ impl AnalyticEstimator {
     fn find(&mut self, budgets: &mut Budgets) -> Found {
         let mut search = self.space.search(&self.compressed, &self.frame, &mut budgets.search);
         let hypothesis = match self.spec.method {
-            Method::Peak { is_subpixel, steps } => {
-                let mut hypothesis = peaks(&mut search, is_subpixel);
+            Method::Peak { steps } => {
+                let mut hypothesis = peaks(&mut search);
                 fit(&mut search.context, &mut hypothesis, steps);
                 hypothesis
             }
@@ -338,7 +338,7 @@ impl Estimator for AnalyticEstimator {
 }
 
 /// The matched filter's maxima as sources.
-fn peaks(search: &mut Search, is_subpixel: bool) -> Hypothesis {
+fn peaks(search: &mut Search) -> Hypothesis {
     let compressed = search.compressed();
     let peaks = search.matched_filter.peaks(
         &compressed.coefficients,
@@ -348,9 +348,8 @@ fn peaks(search: &mut Search, is_subpixel: bool) -> Hypothesis {
         1.0,
     );
     let mut hypothesis = Hypothesis::empty(Nuisances::default());
-    let sources = peaks
-        .iter()
-        .map(|p| PointSource::new(if is_subpixel { p.u } else { p.grid }, p.a));
-    hypothesis.sources.extend(sources);
+    hypothesis
+        .sources
+        .extend(peaks.iter().map(|p| PointSource::new(p.u, p.a)));
     hypothesis
 }

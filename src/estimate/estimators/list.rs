@@ -13,7 +13,7 @@ pub struct EstimatorSpec {
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Method {
-    Peak { is_subpixel: bool, steps: usize },
+    Peak { steps: usize },
     Greedy,
     Pencil { steps: usize },
     MaximumLikelihood,
@@ -30,28 +30,14 @@ impl EstimatorSpec {
 /// Every estimator without a learned part, cheapest first.
 pub const ESTIMATORS: &[EstimatorSpec] = &[
     EstimatorSpec {
-        name: "peak",
-        summary: "maxima of the matched filter on its grid, after non-maximum suppression",
-        method: Method::Peak {
-            is_subpixel: false,
-            steps: 0,
-        },
-    },
-    EstimatorSpec {
         name: "subpixel-peak",
-        summary: "the same with a parabola through each maximum",
-        method: Method::Peak {
-            is_subpixel: true,
-            steps: 0,
-        },
+        summary: "maxima of the matched filter after non-maximum suppression, with a parabola through each",
+        method: Method::Peak { steps: 0 },
     },
     EstimatorSpec {
         name: "peak-fit",
         summary: "the same, and five steps of the joint fit",
-        method: Method::Peak {
-            is_subpixel: true,
-            steps: 5,
-        },
+        method: Method::Peak { steps: 5 },
     },
     EstimatorSpec {
         name: "greedy-fit",

@@ -10,7 +10,7 @@ use crate::estimate::model::separable_model::SeparableModel;
 /// |acceleration|² over |velocity|² above which the acceleration is dropped (Transtrum and Sethna, 2012, eq. 15).
 const MAX_ACCELERATION: f64 = 0.56 / 4.0;
 
-/// Largest correlation between the axes: an ellipse with an axis ratio of 1.7.
+/// Largest correlation between the axes: an ellipse with an axis ratio of 1.7. Beyond, a source would take the place of a pair.
 const MAX_CORRELATION: f64 = 0.5;
 
 /// Damping of the predicted decrease, only against rounding.

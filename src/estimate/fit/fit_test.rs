@@ -9,9 +9,7 @@ use rand_distr::{Distribution, StandardNormal};
 use crate::estimate::dense_linalg::dot;
 use crate::estimate::fit::context::FitContext;
 use crate::estimate::fit::evaluation::Evaluation;
-use crate::estimate::fit::levenberg_marquardt::{
-    JOINT_STEPS, MAX_STEP_FACTOR, Termination, evaluate, fit, fit_below, linearise,
-};
+use crate::estimate::fit::levenberg_marquardt::{JOINT_STEPS, Termination, evaluate, fit, fit_below, linearise};
 use crate::estimate::fit::problem::Problem;
 use crate::estimate::fit::work_budget::WorkBudget;
 use crate::estimate::fit::workspace::Workspace;
@@ -81,7 +79,7 @@ proptest! {
         // The reported deviance is that of the reported parameters.
         evaluate(&mut context, &mut hypothesis);
         prop_assert!((hypothesis.deviance - after).abs() <= 1e-9 * (1.0 + before.abs()), "{} is said to be {after}", hypothesis.deviance);
-        prop_assert!(budget.steps <= (MAX_STEP_FACTOR * (steps + JOINT_STEPS)) as u64);
+        prop_assert!(budget.steps <= (steps + JOINT_STEPS) as u64);
     }
 }
 
@@ -263,20 +261,8 @@ fn a_fit_says_why_it_ended() {
         (at.sources[0].u[0] - 0.3).abs() < 0.02 && (at.sources[0].a - 1e3).abs() < 20.0,
         "{at:?}"
     );
-    let (end, at, steps) = end_of(
-        &one,
-        &[[2.0, 1.0]],
-        1,
-        open,
-        0.0,
-        Rules::without("extend_fast_fits").expect("a rule"),
-    );
+    let (end, at, steps) = end_of(&one, &[[2.0, 1.0]], 1, open, 0.0, all);
     assert_eq!((end, at.converged, steps), (Termination::StepLimit, false, 1));
-    let (end, _, steps) = end_of(&one, &[[2.0, 1.0]], 1, open, 0.0, all);
-    assert!(
-        end != Termination::StepLimit || steps > 1,
-        "each step is large: {end:?} after {steps}"
-    );
     let (end, at, _) = end_of(&one, &[[1.0, 0.0]], 20, -1e9, 0.0, all);
     assert_eq!((end, at.converged), (Termination::OutOfReach, false));
     let (end, at, steps) = end_of(&one, &[[1.0, 0.0]], 20, open, 1e12, all);
@@ -299,4 +285,29 @@ fn a_poor_fit_ends_when_it_stalls_and_rounding_ends_one_by_small_decreases() {
     let huge = [([0.3, -0.2], 1e12), ([0.5, 0.1], 1e12)];
     let (end, ..) = end_of(&huge, &[[0.2, -0.2], [0.6, 0.0]], 200, f64::INFINITY, 0.0, patient);
     assert_eq!(end, Termination::SmallDecreases);
+}
+
+#[test]
+fn steps_that_fail_at_any_damping_end_at_its_ceiling() {
+    // A source that starts on darkness walks along a curved valley to a noise peak beyond the edge: the damping is high when it gets
+    // there, and near a minimum no step decreases the deviance by more than rounding.
+    let ends = [3.5, 5.5].map(|v| {
+        end_of(
+            &[([v, 0.3], -1e3)],
+            &[[6.0, 0.0]],
+            300,
+            f64::INFINITY,
+            0.0,
+            Rules::default(),
+        )
+    });
+    let at_ceiling = ends.iter().filter(|(end, ..)| *end == Termination::DampingCeiling);
+    let places: Vec<_> = at_ceiling
+        .map(|(_, at, steps)| (at.converged, at.sources[0].u, *steps))
+        .collect();
+    assert!(!places.is_empty(), "{ends:?}");
+    assert!(
+        places.iter().all(|(converged, _, steps)| *converged && *steps < 300),
+        "{places:?}"
+    );
 }

@@ -7,7 +7,7 @@
 //!
 //! In the pixel bases every component is evaluated only within its reach, and pixels may have weights of their own.
 
-use crate::estimate::dense_linalg::dot;
+use crate::estimate::dense_linalg::{dispatch, dot};
 use crate::estimate::fit::context::FitContext;
 use crate::estimate::fit::damped_step::{predicted_decrease, step};
 use crate::estimate::fit::evaluation::Evaluation;
@@ -20,27 +20,30 @@ use crate::estimate::fit::workspace::Workspace;
 use crate::estimate::model::hypothesis::{Hypothesis, PointSource};
 use crate::estimate::rules::Rules;
 
-/// Damping λ: first value, and range.
+/// Damping λ: first value, and range. The first trusts the start (undamped steps may leap out of its basin), the floor is rounding's, and
+/// at the ceiling a step is below the last digit of a position.
 const LAMBDA_START: f64 = 1e-3;
 const LAMBDA_FLOOR: f64 = 1e-14;
 const LAMBDA_CEILING: f64 = 1e10;
-/// Converged after two successive decreases of the deviance below this.
+/// Converged after two successive decreases of the deviance below this, which moves a position by 3 % of its standard deviation.
 const CONVERGED_DECREASE: f64 = 1e-3;
-/// Converged when the predicted decrease of the next step is below this.
+/// Converged when the predicted decrease of the next step is below this: 1 % of a standard deviation.
 const NEGLIGIBLE_DECREASE: f64 = 1e-4;
-/// Sources farther apart than this, σ, along either axis need no geodesic acceleration.
+/// Sources farther apart than this, σ, along either axis need no geodesic acceleration: their profiles overlap by exp(−9/4) and the
+/// deviance is no curved valley.
 const ACCELERATION_DISTANCE: f64 = 3.0;
-/// Aborts when this many times the predicted decrease misses the acceptance threshold.
+/// Aborts when this many times the predicted decrease misses the acceptance threshold: larger loses time on hopeless fits, smaller gives up
+/// those that a first step underestimates.
 const ABORT_FACTOR: f64 = 5.0;
-/// From this many times the expected deviance on, sources are missing and the others need no more digits: stalled steps end the fit.
+/// From this many times the expected deviance on, sources are missing and the others need no more digits: stalled steps end the fit. Well
+/// above what a wrong width or a background leave.
 const POOR_FIT_FACTOR: f64 = 100.0;
-/// A poor fit ends after `STALLED_STEPS` successive steps that each decrease the deviance by less than this share.
+/// A poor fit ends after `STALLED_STEPS` successive steps that each decrease the deviance by less than this share; one such step may be the
+/// bend of a valley.
 const STALLED_SHARE: f64 = 1e-2;
 const STALLED_STEPS: usize = 3;
-/// A fit exceeds its number of steps, up to `MAX_STEP_FACTOR` times, while each decreases the deviance by more than this share.
-const FAST_SHARE: f64 = 0.2;
-pub(crate) const MAX_STEP_FACTOR: usize = 8;
-/// Steps of all sources together before only the groups that still move are fitted, and how often that is tried.
+/// Steps of all sources together before only the groups that still move are fitted, and how often that is tried: after the first step every
+/// group moves, after many there is nothing left to save.
 pub(crate) const JOINT_STEPS: usize = 2;
 const MAX_REGROUPINGS: usize = 2;
 
@@ -83,7 +86,6 @@ impl Termination {
 /// How far a fit may go.
 #[derive(Clone, Copy)]
 struct Limits {
-    /// Most steps, and up to [`MAX_STEP_FACTOR`] times as many while each is large.
     steps: usize,
     /// The fit is aborted as soon as a deviance below this is out of reach.
     acceptance_threshold: f64,
@@ -96,7 +98,7 @@ pub(crate) struct Linearisation<'w> {
     pub scratch: &'w mut Scratch,
 }
 
-/// Fits `hypothesis` from where it stands, at most `steps` steps, and up to [`MAX_STEP_FACTOR`] times as many while each is large.
+/// Fits `hypothesis` from where it stands, at most `steps` steps.
 pub(crate) fn fit(context: &mut FitContext, hypothesis: &mut Hypothesis, steps: usize) -> Termination {
     fit_below(context, hypothesis, steps, f64::INFINITY)
 }
@@ -184,12 +186,12 @@ pub(crate) fn linearise<'w>(
     budget: &mut WorkBudget,
     workspace: &'w mut Workspace,
 ) -> Linearisation<'w> {
-    pulp::Arch::new().dispatch(Linearise {
-        problem,
-        hypothesis,
-        budget,
-        workspace,
-    });
+    dispatch!(<'w, 'a, 'b>
+        problem: Problem<'a> = problem,
+        hypothesis: &'w mut Hypothesis = hypothesis,
+        budget: &'w mut WorkBudget<'b> = budget,
+        workspace: &'w mut Workspace = workspace
+        => (): evaluate_with_equations(problem, hypothesis, budget, workspace));
     let Workspace {
         current,
         equations,
@@ -204,14 +206,14 @@ pub(crate) fn linearise<'w>(
 }
 
 fn run(context: &mut FitContext, problem: Problem, hypothesis: &mut Hypothesis, limits: Limits) -> Run {
-    pulp::Arch::new().dispatch(Iterate {
-        problem,
-        hypothesis,
-        limits,
-        rules: context.rules,
-        budget: context.budget,
-        workspace: context.workspace,
-    })
+    dispatch!(<'w, 'a, 'b>
+        problem: Problem<'a> = problem,
+        hypothesis: &'w mut Hypothesis = hypothesis,
+        limits: Limits = limits,
+        rules: Rules = context.rules,
+        budget: &'w mut WorkBudget<'b> = context.budget,
+        workspace: &'w mut Workspace = context.workspace
+        => Run: iterate(problem, hypothesis, limits, rules, budget, workspace))
 }
 
 /// How a run of steps ended, and whether the workspace holds its last step.
@@ -220,127 +222,106 @@ struct Run {
     has_step: bool,
 }
 
-struct Iterate<'w, 'a, 'b> {
-    problem: Problem<'a>,
-    hypothesis: &'w mut Hypothesis,
+/// Levenberg–Marquardt steps within the limits.
+#[inline(always)]
+fn iterate(
+    problem: Problem,
+    hypothesis: &mut Hypothesis,
     limits: Limits,
     rules: Rules,
-    budget: &'w mut WorkBudget<'b>,
-    workspace: &'w mut Workspace,
-}
-
-impl pulp::NullaryFnOnce for Iterate<'_, '_, '_> {
-    type Output = Run;
-
-    #[inline(always)]
-    fn call(self) -> Run {
-        let Self {
-            problem,
-            hypothesis,
-            limits: Limits {
-                steps,
-                acceptance_threshold,
-            },
-            rules,
-            budget,
-            workspace,
-        } = self;
-        let Workspace {
-            current,
-            trial,
-            equations,
-            step: last_step,
-            scratch,
-        } = workspace;
-        let nuisances = hypothesis.nuisances;
-        current.load(problem, hypothesis);
-        let mut deviance = current.evaluate(problem, nuisances, scratch);
-        let has_overlap = has_overlap(&current.model.sources);
-        let mut lambda = LAMBDA_START;
-        let mut small_decreases = 0;
-        let mut is_linearised = false;
-        let mut is_fast = false;
-        let mut stalled = 0;
-        let mut has_step = false;
-        let mut steps_taken = 0;
-        let mut end = (hypothesis.parameters() == nuisances.background_terms()).then_some(Termination::NoParameter);
-        let termination = loop {
-            if let Some(reason) = end {
-                break reason;
+    budget: &mut WorkBudget,
+    workspace: &mut Workspace,
+) -> Run {
+    let Workspace {
+        current,
+        trial,
+        equations,
+        step: last_step,
+        scratch,
+    } = workspace;
+    let nuisances = hypothesis.nuisances;
+    current.load(problem, hypothesis);
+    let mut deviance = current.evaluate(problem, nuisances, scratch);
+    let has_overlap = has_overlap(&current.model.sources);
+    let mut lambda = LAMBDA_START;
+    let mut small_decreases = 0;
+    let mut is_linearised = false;
+    let mut stalled = 0;
+    let mut has_step = false;
+    let mut steps_taken = 0;
+    let mut end = (hypothesis.parameters() == nuisances.background_terms()).then_some(Termination::NoParameter);
+    let termination = loop {
+        if let Some(reason) = end {
+            break reason;
+        }
+        if steps_taken >= limits.steps {
+            break Termination::StepLimit;
+        }
+        if stalled >= STALLED_STEPS {
+            break Termination::Stalled;
+        }
+        if budget.is_overrun() {
+            break Termination::OutOfWork;
+        }
+        steps_taken += 1;
+        budget.charge_step(
+            current.model.components(),
+            step_cost(problem.bases, problem.compressed, &current.model),
+        );
+        if !is_linearised {
+            equations.compute(problem, nuisances, current, scratch);
+            is_linearised = true;
+        }
+        has_step = step(equations, lambda, &mut scratch.factor, last_step);
+        if has_step && has_overlap {
+            last_step.accelerate(problem, current, equations, scratch);
+        }
+        if has_step && lambda <= LAMBDA_START {
+            let expected = dot(&last_step.velocity, &equations.gradient);
+            if expected < NEGLIGIBLE_DECREASE {
+                break Termination::NegligibleDecrease;
             }
-            if steps_taken >= steps && (!is_fast || steps_taken >= MAX_STEP_FACTOR * steps) {
-                break Termination::StepLimit;
+            let is_unreachable = |decrease: f64| deviance - ABORT_FACTOR * decrease > limits.acceptance_threshold;
+            // Damping hides the decrease along ill-determined directions.
+            if rules.abort_fits && is_unreachable(expected) && is_unreachable(predicted_decrease(equations, scratch)) {
+                break Termination::OutOfReach;
             }
-            if stalled >= STALLED_STEPS {
-                break Termination::Stalled;
-            }
-            if budget.is_overrun() {
-                break Termination::OutOfWork;
-            }
-            steps_taken += 1;
-            budget.charge_step(
-                current.model.components(),
-                step_cost(problem.bases, problem.compressed, &current.model),
-            );
-            if !is_linearised {
-                equations.compute(problem, nuisances, current, scratch);
-                is_linearised = true;
-            }
-            has_step = step(equations, lambda, &mut scratch.factor, last_step);
-            if has_step && has_overlap {
-                last_step.accelerate(problem, current, equations, scratch);
-            }
-            if has_step && lambda <= LAMBDA_START {
-                let expected = dot(&last_step.velocity, &equations.gradient);
-                if expected < NEGLIGIBLE_DECREASE {
-                    break Termination::NegligibleDecrease;
-                }
-                let is_unreachable = |decrease: f64| deviance - ABORT_FACTOR * decrease > acceptance_threshold;
-                // Damping hides the decrease along ill-determined directions.
-                if rules.abort_fits
-                    && is_unreachable(expected)
-                    && is_unreachable(predicted_decrease(equations, scratch))
-                {
-                    break Termination::OutOfReach;
-                }
-            }
-            let mut is_accepted = false;
-            if has_step {
-                last_step.take(problem, nuisances.widths(), &current.model, &mut trial.model);
-                let next = trial.evaluate(problem, nuisances, scratch);
-                let decrease = deviance - next;
-                is_accepted = decrease >= 0.0;
-                if is_accepted {
-                    small_decreases = if decrease < CONVERGED_DECREASE && lambda < 1e-3 {
-                        small_decreases + 1
-                    } else {
-                        0
-                    };
-                    let is_poor_fit = rules.stop_stalled_fits && next > POOR_FIT_FACTOR * problem.compressed.data_count;
-                    is_fast = rules.extend_fast_fits && decrease > FAST_SHARE * deviance;
-                    stalled = if is_poor_fit && decrease < STALLED_SHARE * deviance {
-                        stalled + 1
-                    } else {
-                        0
-                    };
-                    deviance = next;
-                }
-            }
+        }
+        let mut is_accepted = false;
+        if has_step {
+            last_step.take(problem, nuisances.widths(), &current.model, &mut trial.model);
+            let next = trial.evaluate(problem, nuisances, scratch);
+            let decrease = deviance - next;
+            is_accepted = decrease >= 0.0;
             if is_accepted {
-                std::mem::swap(current, trial);
-                lambda = (lambda * 0.15).max(LAMBDA_FLOOR);
-                is_linearised = false;
-                end = (small_decreases >= 2).then_some(Termination::SmallDecreases);
-            } else {
-                lambda *= 4.0;
-                end = (lambda > LAMBDA_CEILING).then_some(Termination::DampingCeiling);
+                small_decreases = if decrease < CONVERGED_DECREASE && lambda < 1e-3 {
+                    small_decreases + 1
+                } else {
+                    0
+                };
+                let is_poor_fit = rules.stop_stalled_fits && next > POOR_FIT_FACTOR * problem.compressed.data_count;
+                stalled = if is_poor_fit && decrease < STALLED_SHARE * deviance {
+                    stalled + 1
+                } else {
+                    0
+                };
+                deviance = next;
             }
-        };
-        current.store(problem, deviance, hypothesis);
-        // A fit of no steps only evaluates the deviance.
-        hypothesis.converged = termination.is_converged() || steps == 0 && hypothesis.converged;
-        Run { termination, has_step }
-    }
+        }
+        if is_accepted {
+            std::mem::swap(current, trial);
+            lambda = (lambda * 0.15).max(LAMBDA_FLOOR);
+            is_linearised = false;
+            end = (small_decreases >= 2).then_some(Termination::SmallDecreases);
+        } else {
+            lambda *= 4.0;
+            end = (lambda > LAMBDA_CEILING).then_some(Termination::DampingCeiling);
+        }
+    };
+    current.store(problem, deviance, hypothesis);
+    // A fit of no steps only evaluates the deviance.
+    hypothesis.converged = termination.is_converged() || limits.steps == 0 && hypothesis.converged;
+    Run { termination, has_step }
 }
 
 /// Whether two sources are so near that a step needs acceleration.
@@ -352,36 +333,24 @@ fn has_overlap(sources: &[PointSource]) -> bool {
     })
 }
 
-struct Linearise<'w, 'a, 'b> {
-    problem: Problem<'a>,
-    hypothesis: &'w mut Hypothesis,
-    budget: &'w mut WorkBudget<'b>,
-    workspace: &'w mut Workspace,
-}
-
-impl pulp::NullaryFnOnce for Linearise<'_, '_, '_> {
-    type Output = ();
-
-    #[inline(always)]
-    fn call(self) {
-        let Self {
-            problem,
-            hypothesis,
-            budget,
-            workspace,
-        } = self;
-        let Workspace {
-            current,
-            equations,
-            scratch,
-            ..
-        } = workspace;
-        let nuisances = hypothesis.nuisances;
-        current.load(problem, hypothesis);
-        let deviance = current.evaluate(problem, nuisances, scratch);
-        current.store(problem, deviance, hypothesis);
-        hypothesis.converged |= hypothesis.parameters() == nuisances.background_terms();
-        budget.charge(step_cost(problem.bases, problem.compressed, &current.model));
-        equations.compute(problem, nuisances, current, scratch);
-    }
+#[inline(always)]
+fn evaluate_with_equations(
+    problem: Problem,
+    hypothesis: &mut Hypothesis,
+    budget: &mut WorkBudget,
+    workspace: &mut Workspace,
+) {
+    let Workspace {
+        current,
+        equations,
+        scratch,
+        ..
+    } = workspace;
+    let nuisances = hypothesis.nuisances;
+    current.load(problem, hypothesis);
+    let deviance = current.evaluate(problem, nuisances, scratch);
+    current.store(problem, deviance, hypothesis);
+    hypothesis.converged |= hypothesis.parameters() == nuisances.background_terms();
+    budget.charge(step_cost(problem.bases, problem.compressed, &current.model));
+    equations.compute(problem, nuisances, current, scratch);
 }

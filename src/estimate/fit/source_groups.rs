@@ -4,15 +4,14 @@ use crate::estimate::fit::damped_step::Step;
 use crate::estimate::fit::normal_equations::NormalEquations;
 use crate::estimate::model::bases::Bases;
 use crate::estimate::model::compressed_frame::CompressedFrame;
-use crate::estimate::model::hypothesis::{Hypothesis, Nuisances};
+use crate::estimate::model::hypothesis::{Hypothesis, INDEPENDENT, Nuisances};
 use crate::estimate::model::separable_model::SeparableModel;
 
-/// A source is at rest when its squared step over the step's variance is below this.
+/// A source is at rest when its squared step over the step's variance is below this: a tenth of a standard deviation, which the joint fit
+/// that follows takes up.
 const AT_REST: f64 = 1e-2;
-/// Fewest sources for which grouping pays.
+/// Fewest sources for which grouping pays: below, restricting the frame costs as much as a step.
 const MIN_SOURCES: usize = 4;
-/// Sources within this distance, σ, belong to one group.
-const GROUP_DISTANCE: f64 = 4.0;
 
 /// The sources in groups that can be fitted separately (single linkage); `None` where there is one group, or parameters are shared.
 pub(crate) fn source_groups(hypothesis: &Hypothesis) -> Option<Vec<Vec<usize>>> {
@@ -25,7 +24,7 @@ pub(crate) fn source_groups(hypothesis: &Hypothesis) -> Option<Vec<Vec<usize>>> 
     }
     let is_linked = |i: usize, j: usize| {
         let d = [0, 1].map(|k| sources[i].u[k] - sources[j].u[k]);
-        d[0].hypot(d[1]) < GROUP_DISTANCE
+        d[0].hypot(d[1]) < INDEPENDENT
     };
     let mut groups: Vec<Vec<usize>> = Vec::new();
     for i in 0..sources.len() {

@@ -4,12 +4,14 @@ use crate::estimate::model::bases::Bases;
 use crate::estimate::model::compressed_frame::CompressedFrame;
 use crate::estimate::model::separable_model::SeparableModel;
 
-/// Multiplications allowed a frame of a few sources: reproducible, unlike a clock.
+/// Multiplications allowed a frame of a few sources: reproducible, unlike a clock. More would be spent on frames that no hypothesis
+/// explains, less ends searches in crowded ones; `[estimator] budget_ms` bounds the time as well.
 const MAX_WORK: f64 = 1e8;
-/// From this many sources on the allowance grows with the square of their number, up to `MAX_WORK_FACTOR` times as many.
+/// From this many sources on the allowance grows with the square of their number (a step costs that much), up to `MAX_WORK_FACTOR` times as
+/// many, which bounds the time that an attacker's crowd can take.
 const MANY_SOURCES: f64 = 8.0;
 const MAX_WORK_FACTOR: f64 = 5.0;
-/// A fit in progress is aborted at this multiple of the allowance.
+/// A fit in progress is aborted at this multiple of the allowance; below it the fit ends and its result counts.
 const OVERRUN: f64 = 1.2;
 
 /// What a frame has cost and what it may cost.

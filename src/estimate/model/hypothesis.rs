@@ -1,5 +1,11 @@
 //! A hypothesis about a frame: its point sources and nuisance parameters.
 
+/// Spots nearer than this, σ, overlap: what one explains is explained in part by the other. The inner product of two spots d apart is
+/// exp(−d²/4) of one's square, here a fifth.
+pub(crate) const OVERLAPPING: f64 = 2.5;
+/// Spots farther apart than this, σ, are independent: the same is 2 %.
+pub(crate) const INDEPENDENT: f64 = 4.0;
+
 /// Normal prior of a source's energy where it is assigned to a user, in units of the noise.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct EnergyPrior {

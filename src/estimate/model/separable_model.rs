@@ -22,6 +22,33 @@ const WHOLE: [(f64, f64); 1] = [(0.0, 1.0)];
 /// Orders of the derivatives along x and y that go with a source's energy, x and y.
 pub(crate) const SLOPES: [[usize; 2]; 3] = [[0, 0], [1, 0], [0, 1]];
 
+/// Σ share·f(k) over the terms k of component `i`, f an array. A macro, because a closure is not compiled for the instructions that its
+/// caller was dispatched to.
+macro_rules! sum_terms {
+    ($model:ident, $i:expr, |$k:ident| $f:expr) => {{
+        let (first, shares) = $model.terms($i);
+        let mut sum = Default::default();
+        for ($k, (_, share)) in (first..).zip(shares) {
+            add(&mut sum, *share, $f);
+        }
+        sum
+    }};
+}
+
+/// The same over the pairs of a term k of component `i` and a term l of component `j`.
+macro_rules! sum_pairs {
+    ($model:ident, $i:expr, $j:expr, |$k:ident, $l:ident| $f:expr) => {{
+        let ((first, shares), (other, others)) = ($model.terms($i), $model.terms($j));
+        let mut sum = Default::default();
+        for ($k, (_, share)) in (first..).zip(shares) {
+            for ($l, (_, of)) in (other..).zip(others) {
+                add(&mut sum, share * of, $f);
+            }
+        }
+        sum
+    }};
+}
+
 /// Components in the bases: sources first, then background terms.
 #[derive(Default)]
 pub(crate) struct SeparableModel {
@@ -122,18 +149,7 @@ impl SeparableModel {
     /// [`SeparableModel::gram_block`] over masked pixels alone.
     #[inline(always)]
     pub fn gram_block_over_runs(&self, i: usize, j: usize, runs: &[Run], scratch: &mut Vec<f64>) -> [f64; 9] {
-        let ((first, shares), (other, others)) = (self.terms(i), self.terms(j));
-        let mut sum = [0.0; 9];
-        for (k, (_, share)) in shares.iter().enumerate() {
-            for (l, (_, of)) in others.iter().enumerate() {
-                add(
-                    &mut sum,
-                    share * of,
-                    self.terms.gram_block_over_runs(first + k, other + l, runs, scratch),
-                );
-            }
-        }
-        sum
+        sum_pairs!(self, i, j, |k, l| self.terms.gram_block_over_runs(k, l, runs, scratch))
     }
 
     /// Adds `scale`·f_y⁽ᵇ⁾⊗f_x⁽ᵃ⁾ of component `i` to a matrix (my, mx).
@@ -167,12 +183,7 @@ impl SeparableModel {
     /// Inner products of a matrix (my, mx) with f_y⊗f_x, f_y⊗f′_x and f′_y⊗f_x of component `i`.
     #[inline(always)]
     pub fn project(&self, i: usize, matrix: &[f64], scratch: &mut Vec<f64>) -> [f64; 3] {
-        let (first, shares) = self.terms(i);
-        let mut sum = [0.0; 3];
-        for (k, (_, share)) in shares.iter().enumerate() {
-            add(&mut sum, *share, self.terms.project(first + k, matrix, scratch));
-        }
-        sum
+        sum_terms!(self, i, |k| self.terms.project(k, matrix, scratch))
     }
 
     /// Jᵀ times a matrix (my, mx): J's columns are every source's x, y and energy, then the background's amplitudes.
@@ -205,27 +216,14 @@ impl SeparableModel {
     /// The first value of [`Self::project`] alone.
     #[inline(always)]
     pub fn project_value(&self, i: usize, matrix: &[f64], scratch: &mut Vec<f64>) -> f64 {
-        let (first, shares) = self.terms(i);
-        let mut sum = 0.0;
-        for (k, (_, share)) in shares.iter().enumerate() {
-            sum += share * self.terms.project_value(first + k, matrix, scratch);
-        }
-        sum
+        let [value] = sum_terms!(self, i, |k| [self.terms.project_value(k, matrix, scratch)]);
+        value
     }
 
     /// Inner products with the second derivatives: xx, xy, yy.
     #[inline(always)]
     pub fn project_second_derivatives(&self, i: usize, matrix: &[f64], scratch: &mut Vec<f64>) -> [f64; 3] {
-        let (first, shares) = self.terms(i);
-        let mut sum = [0.0; 3];
-        for (k, (_, share)) in shares.iter().enumerate() {
-            add(
-                &mut sum,
-                *share,
-                self.terms.project_second_derivatives(first + k, matrix, scratch),
-            );
-        }
-        sum
+        sum_terms!(self, i, |k| self.terms.project_second_derivatives(k, matrix, scratch))
     }
 
     /// Inner product of component `i`'s derivative, `a[0]` times along x and `a[1]` times along y, with component `j`'s under `weights`
@@ -240,13 +238,9 @@ impl SeparableModel {
         weights: &[f64],
         scratch: &mut Vec<f64>,
     ) -> f64 {
-        let ((first, shares), (other, others)) = (self.terms(i), self.terms(j));
-        let mut sum = 0.0;
-        for (k, (_, share)) in shares.iter().enumerate() {
-            for (l, (_, of)) in others.iter().enumerate() {
-                sum += share * of * self.terms.inner_product(first + k, a, other + l, b, weights, scratch);
-            }
-        }
+        let [sum] = sum_pairs!(self, i, j, |k, l| [self
+            .terms
+            .inner_product(k, a, l, b, weights, scratch)]);
         sum
     }
 
@@ -260,18 +254,7 @@ impl SeparableModel {
     /// Inner products of (f′_x f_y, f_x f′_y, f_x f_y) of component `i` with those of component `j`, 3 × 3 row-major.
     #[inline(always)]
     pub fn gram_block(&self, i: usize, j: usize, weights: &[f64], scratch: &mut Vec<f64>) -> [f64; 9] {
-        let ((first, shares), (other, others)) = (self.terms(i), self.terms(j));
-        let mut sum = [0.0; 9];
-        for (k, (_, share)) in shares.iter().enumerate() {
-            for (l, (_, of)) in others.iter().enumerate() {
-                add(
-                    &mut sum,
-                    share * of,
-                    self.terms.gram_block(first + k, other + l, weights, scratch),
-                );
-            }
-        }
-        sum
+        sum_pairs!(self, i, j, |k, l| self.terms.gram_block(k, l, weights, scratch))
     }
 }
 

@@ -11,10 +11,12 @@ use faer::Mat;
 use crate::estimate::model::psf_table;
 use crate::optics::Axis;
 
-/// How far outside the sensor a centre may lie, σ. With less, an emitter just outside biases the others.
+/// How far outside the sensor a centre may lie, σ. With less, an emitter just outside biases the others; farther out 2 % of its light is
+/// left on the sensor, and any faint tail would be explained by an emitter there.
 const MARGIN: f64 = 2.0;
 const KNOTS_PER_SIGMA: f64 = 16.0;
-/// Axes wider than this many σ are fitted in pixels: spots are small against them and the basis would be too large.
+/// Axes wider than this many σ are fitted in pixels: spots are small against them and the basis would be too large (the SVD grows with the
+/// third power).
 const WIDEST: f64 = 120.0;
 /// Relative widths that the basis must span too, so that a wrong σ can be fitted.
 const WIDTHS: [f64; 5] = [0.85, 0.93, 1.0, 1.08, 1.18];

@@ -1,7 +1,7 @@
 //! Maximum a posteriori: number and positions of the emitters by the evidence of the frame and of known powers.
 
 use crate::estimate::fit::levenberg_marquardt::fit;
-use crate::estimate::model::hypothesis::{Hypothesis, PointSource};
+use crate::estimate::model::hypothesis::{Hypothesis, INDEPENDENT, PointSource};
 use crate::estimate::model_order::candidate::Candidate;
 use crate::estimate::model_order::evidence::fit_with_prior;
 use crate::estimate::model_order::power_prior::PowerPrior;
@@ -19,12 +19,11 @@ const SPACING: [f64; 2] = [0.1, 0.8];
 const MAX_PARTS: usize = 4;
 /// Second moment, σ², of a divided source's parts where the frame says nothing of it.
 const TYPICAL_MOMENT: f64 = 1.0;
-/// The total light may differ from that of one user per source by this many users before divisions or unions are proposed.
+/// The total light may differ from that of one user per source by this many users before any source is proposed to be divided.
 const MAX_SURPLUS: f64 = 0.4;
-/// Brightest sources divided in a round, pairs tried in a round, and the largest distance of a pair, σ.
+/// Brightest sources divided in a round, and pairs tried in a round.
 const MAX_DIVISIONS: usize = 6;
 const MAX_PAIRS: usize = 6;
-const PAIR_DISTANCE: f64 = 4.0;
 /// Factors on the energy priors' precision, one fit each.
 const TIGHTNESS: [f64; 2] = [100.0, 10.0];
 /// Sources within this distance, σ, are first fitted with a tight prior.
@@ -53,9 +52,6 @@ pub(crate) fn maximum_posterior(search: &mut Search, prior: &PowerPrior, hypothe
         if rules.balance_pairs {
             balance_pair(search, prior, &mut candidate);
         }
-        if rules.unite {
-            unite(search, prior, &mut candidate);
-        }
         shrink(search, &mut candidate);
         grow(search, &mut candidate);
         if before - search.score(&candidate) < LEAST_GAIN || search.is_exhausted() {
@@ -68,7 +64,7 @@ pub(crate) fn maximum_posterior(search: &mut Search, prior: &PowerPrior, hypothe
 
 /// Searches for a more probable optimum: with tight energy priors where sources overlap, and from positions displaced along the
 /// ill-determined directions.
-fn explore_ill_determined(search: &mut Search, prior: &PowerPrior, candidate: &mut Candidate) {
+pub(crate) fn explore_ill_determined(search: &mut Search, prior: &PowerPrior, candidate: &mut Candidate) {
     if !close_pairs(candidate, OVERLAP_DISTANCE).is_empty() {
         fit_with_tight_prior(search, prior, candidate);
     }
@@ -147,7 +143,7 @@ pub(crate) fn divide(search: &mut Search, prior: &PowerPrior, candidate: &mut Ca
 /// The light of a pair divided evenly among as many users as it is of, where one of the pair matches no known power.
 pub(crate) fn balance_pair(search: &mut Search, prior: &PowerPrior, candidate: &mut Candidate) -> bool {
     let is_unassigned = |i: usize| candidate.sources[i].power.is_none();
-    let pairs: Vec<(f64, usize, usize)> = close_pairs(candidate, PAIR_DISTANCE)
+    let pairs: Vec<(f64, usize, usize)> = close_pairs(candidate, INDEPENDENT)
         .into_iter()
         .filter(|&(_, i, j)| is_unassigned(i) || is_unassigned(j))
         .take(MAX_PAIRS)
@@ -165,18 +161,6 @@ pub(crate) fn balance_pair(search: &mut Search, prior: &PowerPrior, candidate: &
             next.sources.extend(divide_source(united, parts, direction, moment));
             search.try_accept(candidate, next)
         })
-    })
-}
-
-/// One source in the place of a pair, where there are more sources than users' light.
-pub(crate) fn unite(search: &mut Search, prior: &PowerPrior, candidate: &mut Candidate) -> bool {
-    if source_surplus(prior, candidate) > -MAX_SURPLUS {
-        return false;
-    }
-    let pairs = close_pairs(candidate, PAIR_DISTANCE);
-    pairs.into_iter().take(MAX_PAIRS).any(|(_, i, j)| {
-        let next = merge_pairs(candidate, &[(i, j)]);
-        search.try_accept(candidate, next)
     })
 }
 

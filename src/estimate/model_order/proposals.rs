@@ -1,23 +1,17 @@
-//! Proposals that change the number of sources: birth, split, relocation, merge, death. Each tries its hypotheses in turn and returns
+//! Proposals that change the number of sources: birth, split, merge, death, relocation inside. Each tries its hypotheses in turn and returns
 //! whether one was accepted.
 
 use crate::estimate::detect::matched_filter::Peak;
-use crate::estimate::model::hypothesis::{Hypothesis, PointSource};
+use crate::estimate::model::hypothesis::{Hypothesis, OVERLAPPING, PointSource};
 use crate::estimate::model_order::candidate::Candidate;
 use crate::estimate::model_order::search::Search;
-use crate::estimate::uncertainty::pixel_posterior::WIDE_PIXEL;
 use crate::estimate::uncertainty::split_score_test::SplitProposal;
 
-/// Peaks, splits and faintest sources that a birth, a split and a relocation try.
+/// Peaks and splits that a birth and a split try.
 const MAX_BIRTHS: usize = 2;
 const MAX_SPLITS: usize = 3;
-const MAX_RELOCATIONS: usize = 3;
-/// Sources within this distance, σ, are proposed to be merged.
-const MERGE_DISTANCE: f64 = 2.5;
-/// The same in pixels, where pixels are wide; the quadratic prediction of the merge is then ignored.
-const MERGE_PIXELS: f64 = 1.6;
-/// Merges proposed in a round: with narrow pixels, with wide ones.
-const MAX_MERGES: [usize; 2] = [3, 8];
+/// Merges proposed in a round.
+const MAX_MERGES: usize = 3;
 /// Within this distance, σ, the quadratic prediction of a merge is unreliable and ignored.
 const UNRELIABLE_DISTANCE: f64 = 0.15;
 /// Predicted rise of the deviance, in source penalties, beyond which a merge is not tried.
@@ -60,35 +54,14 @@ pub(crate) fn split(search: &mut Search, candidate: &mut Candidate) -> bool {
     })
 }
 
-/// A faint source moves to the highest residual peak of a frame that is not explained.
-pub(crate) fn relocate(search: &mut Search, candidate: &mut Candidate, peaks: &[Peak]) -> bool {
-    if !search.rules().relocate || search.is_explained_by(candidate) {
-        return false;
-    }
-    let Some(peak) = peaks.first() else { return false };
-    faintest(candidate).into_iter().take(MAX_RELOCATIONS).any(|index| {
-        let mut next = Hypothesis::clone(candidate);
-        next.sources[index] = PointSource::new(peak.u, peak.a);
-        search.try_accept(candidate, next)
-    })
-}
-
 /// One source in the place of a close pair, where the quadratic prediction leaves hope.
 pub(crate) fn merge(search: &mut Search, candidate: &mut Candidate) -> bool {
     if !search.rules().merge {
         return false;
     }
-    let pitch = search.context.bases.pitch();
-    let is_wide = search.rules().merge_wide_pixels && pitch > WIDE_PIXEL;
-    let limit = if is_wide {
-        MERGE_DISTANCE.max(MERGE_PIXELS * pitch)
-    } else {
-        MERGE_DISTANCE
-    };
-    let most = MAX_MERGES[usize::from(is_wide)];
-    close_pairs(candidate, limit).into_iter().take(most).any(|(d, i, j)| {
-        let is_predicted = !is_wide && d > UNRELIABLE_DISTANCE;
-        if is_predicted
+    let pairs = close_pairs(candidate, OVERLAPPING);
+    pairs.into_iter().take(MAX_MERGES).any(|(d, i, j)| {
+        if d > UNRELIABLE_DISTANCE
             && candidate.merge_deviance_rise(&mut search.context, i, j) > HOPELESS_MERGE * search.criterion.threshold()
         {
             return false;
@@ -104,7 +77,7 @@ pub(crate) fn merge_all(search: &mut Search, candidate: &mut Candidate) -> bool 
         return false;
     }
     let mut chosen: Vec<(usize, usize)> = Vec::new();
-    for (_, i, j) in close_pairs(candidate, MERGE_DISTANCE) {
+    for (_, i, j) in close_pairs(candidate, OVERLAPPING) {
         if is_disjoint(&chosen, i, j)
             && candidate.merge_deviance_rise(&mut search.context, i, j) < search.criterion.threshold()
         {

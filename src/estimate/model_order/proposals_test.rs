@@ -5,9 +5,9 @@ use crate::estimate::fit::levenberg_marquardt::fit;
 use crate::estimate::fit::work_budget::WorkBudget;
 use crate::estimate::model::hypothesis::{Hypothesis, Nuisances};
 use crate::estimate::model_order::candidate::Candidate;
-use crate::estimate::model_order::map_search::{divide, unite};
+use crate::estimate::model_order::map_search::{balance_pair, divide, explore_ill_determined};
 use crate::estimate::model_order::power_prior::PowerPrior;
-use crate::estimate::model_order::proposals::{birth, death, merge_pairs, relocate_inside, split};
+use crate::estimate::model_order::proposals::{birth, death, merge, merge_all, merge_pairs, relocate_inside, split};
 use crate::estimate::model_order::search::Search;
 use crate::estimate::rules::Rules;
 use crate::estimate::test_frame::{Shown, hypothesis};
@@ -25,12 +25,22 @@ fn propose(
     places: &[[f64; 2]],
     proposal: impl Fn(&mut Search, &mut Candidate) -> bool,
 ) -> (bool, Hypothesis) {
+    propose_from(rule, shown, places, STEPS, proposal)
+}
+
+fn propose_from(
+    rule: &str,
+    shown: &Shown,
+    places: &[[f64; 2]],
+    steps: usize,
+    proposal: impl Fn(&mut Search, &mut Candidate) -> bool,
+) -> (bool, Hypothesis) {
     let mut results = [Rules::without(rule).expect("a rule"), Rules::default()].map(|rules| {
         let mut frame = Shown { rules, ..shown.clone() }.frame();
         let mut budget = WorkBudget::new(&|| false);
         let mut search = frame.space.search(&frame.compressed, &frame.frame, &mut budget);
         let mut candidate = Candidate::from(hypothesis(Nuisances::default(), places));
-        fit(&mut search.context, &mut candidate, STEPS);
+        fit(&mut search.context, &mut candidate, steps);
         let before = search.score(&candidate);
         let is_accepted = proposal(&mut search, &mut candidate);
         assert_eq!(is_accepted, search.score(&candidate) < before);
@@ -83,6 +93,30 @@ fn split_puts_two_halves_in_the_place_of_a_pair() {
 }
 
 #[test]
+fn merge_puts_one_source_in_the_place_of_two_that_share_its_light() {
+    let lone = [([1.0, 0.5], ENERGY)];
+    let (is_accepted, found) = propose_from("merge", &showing(&lone), &[[0.7, 0.5], [1.3, 0.5]], 0, merge);
+    assert!(is_accepted);
+    assert_near(&found, &[lone[0].0], NEAR);
+    // 2 σ apart, a merged source leaves far more than a source's penalty.
+    let pair = [([-1.0, 0.5], ENERGY), ([1.0, 0.5], ENERGY)];
+    let (is_accepted, found) = propose("merge", &showing(&pair), &pair.map(|(u, _)| u), merge);
+    assert!(!is_accepted);
+    assert_near(&found, &pair.map(|(u, _)| u), NEAR);
+}
+
+#[test]
+fn merge_all_merges_two_unresolved_pairs_at_once_and_leaves_one_to_merge() {
+    let sources = [([-2.5, 0.0], ENERGY), ([2.5, 0.0], ENERGY)];
+    let halves = [[-2.5, -0.2], [-2.5, 0.2], [2.3, 0.0], [2.7, 0.0]];
+    let (is_accepted, found) = propose_from("merge_all", &showing(&sources), &halves, 0, merge_all);
+    assert!(is_accepted);
+    assert_near(&found, &sources.map(|(u, _)| u), NEAR);
+    let (is_accepted, found) = propose_from("merge_all", &showing(&sources), &halves[1..], 0, merge_all);
+    assert!(!is_accepted && found.sources.len() == 3, "one pair alone");
+}
+
+#[test]
 fn death_removes_a_source_of_no_light() {
     let lone = [([-2.0, 1.0], ENERGY)];
     let (is_accepted, found) = propose("death", &showing(&lone), &[[-2.0, 1.0], [3.0, -2.0]], death);
@@ -106,11 +140,11 @@ fn relocate_inside_replaces_a_pair_at_the_edge_by_the_source_that_the_edge_cuts(
 
 /// A user's beam brings `ENERGY` on average, wherever it comes from.
 fn with_known_power(
-    sources: &[([f64; 2], f64)],
+    shown: &Shown,
     places: &[[f64; 2]],
     proposal: impl Fn(&mut Search, &PowerPrior, &mut Candidate) -> bool,
 ) -> (bool, Hypothesis) {
-    let mut frame = showing(sources).frame();
+    let mut frame = shown.frame();
     let known = KnownPower {
         energies_j: vec![ENERGY * frame.camera.noise_std_j],
         relative_std: 0.05,
@@ -148,18 +182,42 @@ fn users(places: &[[f64; 2]]) -> Vec<([f64; 2], f64)> {
 #[test]
 fn divide_finds_two_users_in_a_spot_of_twice_the_light() {
     let sources = users(&[[-0.15, 0.0], [0.15, 0.0]]);
-    let (is_accepted, found) = with_known_power(&sources, &[[0.0, 0.0]], divide);
+    let (is_accepted, found) = with_known_power(&showing(&sources), &[[0.0, 0.0]], divide);
     assert!(is_accepted && found.sources.len() == 2, "{:?}", found.sources);
     assert!(found.sources.iter().all(|s| s.power.is_some()), "both are users");
-    assert!(!with_known_power(&users(&[[0.0, 0.0]]), &[[0.0, 0.0]], divide).0);
+    assert!(!with_known_power(&showing(&users(&[[0.0, 0.0]])), &[[0.0, 0.0]], divide).0);
 }
 
 #[test]
-fn unite_leaves_one_source_where_there_is_the_light_of_one_user() {
-    let sources = users(&[[0.3, 0.0]]);
-    let (is_accepted, found) = with_known_power(&sources, &[[-0.2, 0.0], [0.8, 0.0]], unite);
+fn balance_pair_makes_three_users_of_a_pair_with_the_light_of_three() {
+    let sources = users(&[[-0.6, 0.0], [0.0, 0.0], [0.6, 0.0]]);
+    let (is_accepted, found) = with_known_power(&showing(&sources), &[[-0.4, 0.0], [0.4, 0.0]], balance_pair);
+    assert!(is_accepted && found.sources.len() == 3, "{:?}", found.sources);
+    assert!(found.sources.iter().all(|s| s.power.is_some()), "all are users");
+    let pair = users(&[[-0.6, 0.0], [0.6, 0.0]]);
+    let (is_accepted, _) = with_known_power(&showing(&pair), &[[-0.6, 0.0], [0.6, 0.0]], balance_pair);
+    assert!(!is_accepted, "both of the pair are users");
+}
+
+#[test]
+fn explore_ill_determined_leaves_a_saddle_that_the_symmetry_of_a_frame_holds_a_fit_on() {
+    // Without noise a pair along x and a hypothesis along y are symmetric in both axes: no step has a component along x.
+    let sources = users(&[[-0.4, 0.0], [0.4, 0.0]]);
+    let shown = Shown {
+        noise: None,
+        ..showing(&sources)
+    };
+    let start = [[0.0, -0.4], [0.0, 0.4]];
+    let (_, held) = with_known_power(&shown, &start, |_, _, _| false);
+    assert!(held.sources.iter().all(|s| s.u[0].abs() < 1e-3), "{:?}", held.sources);
+    let explore = |search: &mut Search, prior: &PowerPrior, candidate: &mut Candidate| {
+        let before = search.score(candidate);
+        explore_ill_determined(search, prior, candidate);
+        search.score(candidate) < before
+    };
+    let (is_accepted, found) = with_known_power(&shown, &start, explore);
     assert!(is_accepted);
-    assert_near(&found, &[sources[0].0], 0.05);
+    assert_near(&found, &sources.iter().map(|s| s.0).collect::<Vec<_>>(), 0.05);
 }
 
 #[test]

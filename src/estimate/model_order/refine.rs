@@ -1,7 +1,7 @@
 //! The loop over the proposals: each round grows the hypothesis, then shrinks it, until neither improves the score.
 
 use crate::estimate::model_order::candidate::Candidate;
-use crate::estimate::model_order::proposals::{birth, death, merge, merge_all, relocate, relocate_inside, split};
+use crate::estimate::model_order::proposals::{birth, death, merge, merge_all, relocate_inside, split};
 use crate::estimate::model_order::search::Search;
 
 /// Rounds go on while they improve the score by this much.
@@ -23,13 +23,11 @@ pub(crate) fn refine(search: &mut Search, candidate: &mut Candidate, rounds: usi
     search.converge(candidate);
 }
 
-/// Proposes births, splits and relocations, each once.
+/// Proposes births and splits, each once.
 pub(crate) fn grow(search: &mut Search, candidate: &mut Candidate) {
     let peaks = search.residual_peaks(candidate);
     birth(search, candidate, &peaks);
-    if !split(search, candidate) {
-        relocate(search, candidate, &peaks);
-    }
+    split(search, candidate);
 }
 
 /// Proposes merges, deaths and relocations inside while one is accepted.

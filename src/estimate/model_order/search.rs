@@ -9,7 +9,7 @@ use crate::estimate::fit::work_budget::WorkBudget;
 use crate::estimate::fit::workspace::Workspace;
 use crate::estimate::model::bases::Bases;
 use crate::estimate::model::compressed_frame::CompressedFrame;
-use crate::estimate::model::hypothesis::Hypothesis;
+use crate::estimate::model::hypothesis::{Hypothesis, OVERLAPPING};
 use crate::estimate::model::svd_basis::Basis;
 use crate::estimate::model_order::candidate::Candidate;
 use crate::estimate::model_order::criterion::{Criterion, source_penalty};
@@ -23,8 +23,6 @@ use crate::estimate::rules::Rules;
 pub(crate) const TRIAL_STEPS: usize = 30;
 /// Steps of the last fit before a hypothesis is reported.
 const CONVERGE_STEPS: usize = 200;
-/// Least distance of two residual peaks of one round, σ.
-const PEAK_DISTANCE: f64 = 2.5;
 /// A source is first assigned to a user unless −2 ln probability rises by more than this.
 pub(crate) const ASSIGNMENT_SLACK: f64 = 60.0;
 /// Largest masked fraction for which the matrix pencil and rotated ellipses are used: the pencil sees the fill values.
@@ -189,7 +187,7 @@ impl<'a> Search<'a, '_> {
         let threshold = 0.7 * self.criterion.threshold().sqrt();
         let residual = &candidate.evaluation(&mut self.context).residual;
         self.matched_filter
-            .peaks(residual, mx, my, threshold, PEAK_DISTANCE)
+            .peaks(residual, mx, my, threshold, OVERLAPPING)
             .to_vec()
     }
 }

@@ -10,7 +10,8 @@ use crate::estimate::model::svd_basis::Basis;
 const LONG: usize = 4;
 /// Fewer masked pixels than this are downdated one by one.
 const MANY: usize = 64;
-/// Conjugate gradients stop when an iteration changes the deviance by less than this, or after so many iterations.
+/// Conjugate gradients stop when an iteration changes the deviance by less than this, far below a source's penalty, or after so many
+/// iterations, which bounds the time of a frame that is nearly all masked.
 const SMALL: f64 = 1e-3;
 const ROUNDS: usize = 500;
 

@@ -2,7 +2,8 @@
 
 use crate::estimate::preprocess::screening::PreprocessedFrame;
 
-/// Largest share of a pixel's noise that a fit is taken to have absorbed, and Fisher scoring steps of the fit.
+/// Largest share of a pixel's noise that a fit is taken to have absorbed (a bright spot of one pixel would divide by zero), and Fisher
+/// scoring steps of the fit, which converges quadratically.
 const LEVERAGE: f64 = 0.6;
 const SCORING: usize = 8;
 

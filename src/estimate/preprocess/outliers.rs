@@ -8,19 +8,19 @@ use crate::estimate::model::svd_basis::Basis;
 use crate::estimate::preprocess::noise_variance::VarianceFunction;
 use crate::estimate::preprocess::screening::PreprocessedFrame;
 
-/// Fewest numbers outside the basis from which the noise is measured.
+/// Fewest numbers outside the basis from which the noise is measured: with them its standard deviation is known to 7 %.
 const FEWEST: f64 = 100.0;
-/// Standard deviations by which the measured noise must differ from the configured noise to replace it.
+/// Standard deviations by which the measured noise must differ from the configured noise to replace it: one frame in 16,000 by chance.
 const DIFFERENT: f64 = 4.0;
-/// Standard deviations from which a single pixel is hot or dead.
+/// Standard deviations from which a single pixel is hot or dead: one pixel in 5·10⁸ by chance.
 const OUTLIER: f64 = 6.0;
-/// Passes of rejection; each reloads the frame without the pixels found.
+/// Passes of rejection; each reloads the frame without the pixels found. With [`SHARE`] they reach from 2¹⁴ times the threshold down to it.
 const PASSES: usize = 14;
 /// One pass rejects pixels of at least this share of the worst one's deviation: the worst hide the rest.
 const SHARE: f64 = 0.5;
 /// Pixels wider than this, σ, can be lit alone by a spot and are not tested for isolation.
 const WIDEST_PIXEL: f64 = 0.5;
-/// Signal levels at which the noise is measured.
+/// Signal levels at which the noise is measured: each holds half the pixels of the one before, the brightest 1/128.
 const LEVELS: usize = 8;
 
 /// The inspection's scratch memory and its last verdict.

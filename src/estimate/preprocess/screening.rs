@@ -44,7 +44,7 @@ impl PreprocessedFrame {
         self.saturated = 0;
         let (mut nan, mut masked) = (0, 0);
         let scale = 1.0 / camera.noise_std_j;
-        let ceiling = camera.saturation_j.unwrap_or(f64::INFINITY);
+        let ceiling = camera.saturation_limit_j();
         self.pixels.extend(frame.pixels.iter().map(|value| value * scale));
         self.is_masked.resize(self.pixels.len(), false);
         let is_sound = |value: f64| (value * scale).abs() < OVERFLOWS && value < ceiling;

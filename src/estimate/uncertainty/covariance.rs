@@ -1,6 +1,6 @@
 //! The covariance, condition number and determinant of normal equations.
 
-use crate::estimate::dense_linalg::{cholesky, invert};
+use crate::estimate::dense_linalg::{cholesky, dispatch, invert};
 use crate::estimate::fit::normal_equations::NormalEquations;
 
 /// Relative increase of the diagonal of an information matrix before it is factorised: singular ones are regularised.
@@ -26,12 +26,14 @@ impl Covariance {
             factor[i * n + i] *= 1.0 + RIDGE;
         }
         let mut matrix = vec![0.0; n * n];
-        let inverse = Inverse {
-            factor: &mut factor,
-            n,
-            out: &mut matrix,
-        };
-        let is_regular = pulp::Arch::new().dispatch(inverse);
+        let is_regular = dispatch!(<'a>
+        factor: &'a mut [f64] = &mut factor,
+        n: usize = n,
+        out: &'a mut [f64] = &mut matrix
+        => bool: cholesky(factor, n) && {
+            invert(factor, n, out);
+            true
+        });
         is_regular.then_some(Self { parameters: n, matrix })
     }
 
@@ -78,25 +80,6 @@ pub(crate) fn log_det(equations: &NormalEquations, floor: &[[f64; 3]]) -> Option
     }
     let is_regular = cholesky(&mut factor, size);
     is_regular.then(|| (0..size).map(|i| 2.0 * factor[i * size + i].ln()).sum())
-}
-
-struct Inverse<'a> {
-    factor: &'a mut [f64],
-    n: usize,
-    out: &'a mut [f64],
-}
-
-impl pulp::NullaryFnOnce for Inverse<'_> {
-    type Output = bool;
-
-    #[inline(always)]
-    fn call(self) -> bool {
-        let is_regular = cholesky(self.factor, self.n);
-        if is_regular {
-            invert(self.factor, self.n, self.out);
-        }
-        is_regular
-    }
 }
 
 #[cfg(test)]

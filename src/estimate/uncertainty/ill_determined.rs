@@ -5,9 +5,9 @@ use crate::estimate::fit::levenberg_marquardt::linearise;
 use crate::estimate::model::hypothesis::Hypothesis;
 use crate::estimate::uncertainty::covariance::Covariance;
 
-/// A direction is ill-determined from this standard deviation on, σ.
+/// A direction is ill-determined from this standard deviation on, σ: below it the deviance is a parabola and has one minimum.
 const MIN_DEVIATION: f64 = 0.02;
-/// Rounds of the power iteration.
+/// Rounds of the power iteration: the direction need not be exact, only ill-determined.
 const ITERATIONS: usize = 20;
 /// Precision added to each position, 1/σ², so that a singular information has directions too.
 const POSITION_PRIOR: f64 = 1.0;

@@ -3,7 +3,7 @@
 use crate::estimate::emitter::{Emitter, Flags, SecondMomentScore};
 use crate::estimate::fit::context::FitContext;
 use crate::estimate::fit::levenberg_marquardt::linearise;
-use crate::estimate::model::hypothesis::Hypothesis;
+use crate::estimate::model::hypothesis::{Hypothesis, OVERLAPPING};
 use crate::estimate::preprocess::screening::PreprocessedFrame;
 use crate::estimate::uncertainty::covariance::{Covariance, RIDGE, condition_number};
 use crate::estimate::uncertainty::pixel_posterior;
@@ -12,18 +12,17 @@ use crate::estimate::uncertainty::profile_nonlinearity::is_likelihood_quadratic;
 use crate::estimate::uncertainty::split_score_test::{second_moment_scores, split_proposal};
 use crate::optics::Camera;
 
-/// A masked pixel within this distance, σ, sets a flag.
+/// A masked pixel within this distance, σ, sets a flag: 99 % of a spot's light lies within.
 const MASKED_DISTANCE: f64 = 3.0;
-/// A source within this distance of the edge, σ, is flagged.
+/// A source within this distance of the edge, σ, is flagged: nearer, the edge cuts more than 2 % of its light.
 const EDGE_DISTANCE: f64 = 2.0;
 /// Condition number beyond which the ridge under the information matrix is no longer small against its least eigenvalue.
 const MAX_CONDITION: f64 = 0.01 / RIDGE;
 /// Sources this many standard deviations of their difference apart are resolved.
 const RESOLVED: f64 = 3.0;
-/// A source may be two where a split is predicted to decrease the deviance by this much, which is less than a source's penalty.
+/// A source may be two where a split is predicted to decrease the deviance by this much: less than a source's penalty, so that a pair which
+/// the search leaves as one is flagged. Less would flag lone sources by chance.
 const DOUBTFUL: f64 = 10.0;
-/// Sources within this distance, σ, of an unresolved one may be displaced by it.
-const INFLUENCE_DISTANCE: f64 = 2.5;
 
 /// The emitters of a hypothesis, and how well it explains the frame.
 pub(crate) struct Localised {
@@ -94,7 +93,7 @@ pub(crate) fn localise(
     let is_doubtful: Vec<bool> = (0..n).map(|i| !is_regular || is_merged(i) || may_be_two(i)).collect();
     let is_near = |i: usize, j: usize| {
         let d = [0, 1].map(|k| hypothesis.sources[i].u[k] - hypothesis.sources[j].u[k]);
-        d[0].hypot(d[1]) < INFLUENCE_DISTANCE
+        d[0].hypot(d[1]) < OVERLAPPING
     };
     let is_crowded = |i: usize| (0..n).any(|j| j != i && is_near(i, j));
     let is_quadratic: Vec<bool> = (0..n)

@@ -11,7 +11,7 @@ use crate::estimate::model::svd_basis::Basis;
 
 /// With pixels wider than this, σ, the deviance is no parabola at any signal-to-noise ratio of interest.
 pub(crate) const WIDE_PIXEL: f64 = 2.0;
-/// Step of the quadrature, and its range on either side of a pixel's edge, σ.
+/// Step of the quadrature, and its range on either side of a pixel's edge, σ: beyond six no light crosses the edge.
 const STEP: f64 = 0.1;
 const AROUND: f64 = 6.0;
 

@@ -10,7 +10,7 @@ use crate::estimate::uncertainty::covariance::Covariance;
 const OUT: f64 = 2.0;
 /// Largest factor between the rise of the deviance and the covariance's prediction, either way.
 const FACTOR: f64 = 2.0;
-/// Below this standard deviation, σ, nonlinearity does not matter.
+/// Below this standard deviation, σ, nonlinearity does not matter: the profile is a parabola over so short a way.
 const SHORT: f64 = 0.01;
 
 /// Whether the deviance rises as the covariance predicts along the least determined direction of source `i`, with all other

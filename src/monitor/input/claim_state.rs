@@ -3,7 +3,7 @@
 use jiff::{SignedDuration, Timestamp};
 use nalgebra::{Matrix2, Vector2};
 
-use crate::claims::{Beam, Claim, ClaimState, Standing, Store, seconds};
+use crate::claims::{Beam, Bearing, Claim, ClaimState, Standing, Store, seconds};
 use crate::monitor::config::Config;
 use crate::monitor::track::detection::{OVERLAP, spot_m};
 use crate::monitor::track::user_track::UserTrack;
@@ -17,9 +17,11 @@ const MAX_SPEED_M_S: f64 = 20.0;
 /// Age past which a claim is associated only with a beam that is already known to be its user's, s. Longer lets an old claim cover
 /// for a stranger, shorter makes strangers of users who seldom claim. Not measured.
 pub const CLAIM_LIFE_S: f64 = 60.0;
-/// Smallest standard deviation of a claim that is believed, m.
+/// Smallest standard deviation of a claim that is believed, m. A fifth of what is systematic in positions: a claim without any
+/// error changes nothing more.
 const MIN_SIGMA_M: f64 = 0.01;
-/// Largest movement since a claim, m, that widens the association: beyond it every beam would do.
+/// Largest movement since a claim, m, that widens the association: beyond it every beam would do. Half of it is a standard
+/// deviation: 30 m. Not measured.
 const MAX_SLACK_M: f64 = 60.0;
 
 /// A user's newest claim as it bears on the frame at hand.
@@ -71,7 +73,7 @@ pub fn active_claims(
     is_followed: impl Fn(u64) -> bool,
 ) -> Vec<ActiveClaim> {
     store.choose(beams, |standing| {
-        scope.is_in_reach(standing, &Reach::of(standing, now, &scope))
+        scope.bearing(standing, &Reach::of(standing, now, &scope))
     });
     let mut claims: Vec<ActiveClaim> = store
         .chosen()
@@ -81,7 +83,8 @@ pub fn active_claims(
                 user(&standing.claim.user).unwrap_or_default(),
             );
             let is_active = standing.claim.state == ClaimState::Active;
-            let bears = (is_active && user.track.is_some_and(&is_followed)) || scope.is_in_reach(&standing, &reach);
+            let bears =
+                (is_active && user.track.is_some_and(&is_followed)) || scope.bearing(&standing, &reach).is_some();
             bears.then(|| ActiveClaim::new(&standing, reach, user))
         })
         .collect();
@@ -129,14 +132,19 @@ impl Reach {
 }
 
 impl Scope<'_> {
-    fn is_in_reach(&self, standing: &Standing, reach: &Reach) -> bool {
+    /// How a claim bears on the view, if it does. A beam in view agrees only with a claim that is in view but for what is tolerated
+    /// and the claim's own error; how far the user may have gone since widens only what the claim may be associated with.
+    fn bearing(&self, standing: &Standing, reach: &Reach) -> Option<Bearing> {
         let claim = standing.claim;
-        if claim.state == ClaimState::Ended {
-            return reach.age_s <= self.config.ended_grace_s;
-        }
-        let reach_m = self.config.tolerated_distance_m + reach.slack_m + 5.0 * reach.variance.sqrt();
-        let place = Vector2::new(claim.x_m, claim.y_m);
-        reach.age_s <= CLAIM_LIFE_S && is_near_view(self.camera, place, reach_m + spot_m(self.camera) * OVERLAP)
+        let is_near = |margin_m: f64| is_near_view(self.camera, Vector2::new(claim.x_m, claim.y_m), margin_m);
+        let sigmas_m = 5.0 * reach.variance.sqrt();
+        let reach_m = self.config.tolerated_distance_m + reach.slack_m + sigmas_m;
+        let bears = match claim.state {
+            ClaimState::Ended => reach.age_s <= self.config.ended_grace_s,
+            ClaimState::Active => reach.age_s <= CLAIM_LIFE_S && is_near(reach_m + spot_m(self.camera) * OVERLAP),
+        };
+        let is_in_view = is_near(self.config.tolerated_distance_m + sigmas_m);
+        bears.then_some(if is_in_view { Bearing::InView } else { Bearing::Beyond })
     }
 
     /// Whether even a user as far off as is tolerated would show at least part of a spot.
@@ -289,6 +297,39 @@ mod tests {
         assert!(!of(130.0, false)[0].expected);
         assert!(of(400.0, false).is_empty());
         assert_eq!(of(400.0, true).len(), 1);
+    }
+
+    #[test]
+    fn a_claim_is_in_view_within_what_is_tolerated_and_beyond_it_by_its_age() {
+        let scope = Scope {
+            config: &Config::default(),
+            camera: &optics::Config::default().camera().unwrap(),
+            default_sigma_m: 0.2,
+            clock_offset_s: 0.0,
+        };
+        let bearing = |x_m: f64, age_s: i64| {
+            let claim = Claim {
+                x_m,
+                sigma_m: None,
+                ..fixture::active_claim("a", 0.0, 0.0).claim
+            };
+            let standing = Standing {
+                claim: &claim,
+                came: at(0),
+                pace_m_s: 0.0,
+                period_s: None,
+            };
+            scope.bearing(&standing, &Reach::of(&standing, at(age_s), &scope))
+        };
+        // The default view reaches 125 m; 5 m are tolerated, and five times 0.2 m.
+        assert_eq!(bearing(130.9, 0), Some(Bearing::InView));
+        assert_eq!(bearing(131.1, 0), Some(Bearing::Beyond));
+        // In 50 s a user walks 150 m.
+        assert_eq!(
+            [0, 50].map(|age_s| bearing(270.0, age_s)),
+            [None, Some(Bearing::Beyond)]
+        );
+        assert_eq!(bearing(0.0, 61), None);
     }
 
     #[test]

@@ -1,6 +1,7 @@
 //! Whether a claim near a beam is evidence: where many names are claimed without a beam, one of them is near any beam.
 
 use super::claim_state::ActiveClaim;
+use crate::monitor::track::detection::view_m2;
 use crate::optics::Camera;
 
 /// Names claimed in view without a beam from which on a claim nearby is no evidence by itself. Smaller delays honest newcomers,
@@ -31,8 +32,7 @@ impl Crowding {
     /// Of a frame's claims, and of `elsewhere` names that the frame had no time or the store no room for.
     pub fn of_claims(claims: &[ActiveClaim], elsewhere: f64, camera: &Camera) -> Self {
         let here = claims.iter().filter(|a| a.expected && !a.before.was_seen()).count();
-        let [width, height] = [camera.x.half_width(), camera.y.half_width()].map(|h| 2.0 * h * camera.ground_scale());
-        Self::of(here as f64 + elsewhere, width * height)
+        Self::of(here as f64 + elsewhere, view_m2(camera))
     }
 
     /// Of `names` anywhere in a view of `area_m2`: the mean number of them within the reach is [`BY_CHANCE`].

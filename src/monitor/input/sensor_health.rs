@@ -15,7 +15,8 @@ pub const BLINDING_SHARE: f64 = 0.25;
 /// Frames among which exact repeats are looked for. No two noisy frames agree in every pixel, so that more would cost nothing but
 /// comparisons. Not tuned.
 const REMEMBERED_FRAMES: usize = 8;
-/// Users who were seen a moment ago, from which on a frame without any beam is blind and not empty.
+/// Users who were seen a moment ago, from which on a frame without any beam is blind and not empty. With one, a user who switches
+/// off would be a lost sensor; with more, a capped lens would be users unseen.
 const MIN_VISIBLE_USERS: usize = 2;
 
 /// The newest usable frame, and why those after it were not.

@@ -10,13 +10,15 @@ use crate::monitor::stats::robust::median_vector;
 
 /// Share of the users in view that must agree: with fewer than a third of them lying no false displacement finds its quorum.
 const QUORUM: f64 = 2.0 / 3.0;
-/// Users that must agree on a shift, and on a shift with a turn, at least.
+/// Users that must agree on a shift, and on a shift with a turn, at least. A shift needs one user and a turn two: two and three
+/// more must agree. More ask for larger crowds before anything is corrected.
 const MIN_AGREEING: usize = 3;
 const MIN_AGREEING_TURNED: usize = 5;
 /// Time over which claims' errors are averaged, s. Longer is more exact, shorter follows a pose that wanders. Not measured; the
 /// soaks' pose wanders by 0.5 m within seconds to minutes.
 const SMOOTHING_S: f64 = 20.0;
-/// Standard deviations from which a turn is applied, and down to which it stays so.
+/// Standard deviations from which a turn is applied, and down to which it stays so. Lower turns positions by noise, higher leaves
+/// more of a turn uncorrected; the gap keeps it from going to and fro. Not measured.
 const APPLY_TURN: f64 = 5.0;
 const KEEP_TURN: f64 = 3.0;
 

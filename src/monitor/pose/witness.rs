@@ -5,7 +5,8 @@ use nalgebra::Vector2;
 use crate::monitor::input::claim_state::ActiveClaim;
 use crate::monitor::track::tracker::Tracker;
 
-/// Users that have been seen, from which on only such ones count: claims that no beam ever answered say nothing of our pose.
+/// Users that have been seen, from which on only such ones count: claims that no beam ever answered say nothing of our pose. As
+/// many as must agree on a shift.
 const MIN_KNOWN: usize = 3;
 /// Reach of a witness, m: a margin for the beam's own error, standard deviations of the claim, and a share of what the user may
 /// have gone, up to a bound. Larger lets a beam nearby count, smaller loses honest users. Not measured.

@@ -1,27 +1,27 @@
 //! `unclaimed_emitter` within a user's spot: a second beam too near to the user's to be a detection of its own.
 
-use std::collections::{BTreeMap, BTreeSet};
-
 use jiff::Timestamp;
 use nalgebra::Vector2;
 use serde_json::json;
 
 use crate::claims::seconds;
-use crate::estimate::Flags;
 use crate::monitor::alert::{Alert, AlertKind, SHARED_SPOT, Severity};
+use crate::monitor::by_user::ByUser;
 use crate::monitor::evidence::power_against_reported;
-use crate::monitor::finding::{Cause, Content, Finding};
+use crate::monitor::finding::{Cause, Content, Finding, is_renamed};
 use crate::monitor::frame_context::FrameContext;
+use crate::monitor::rules::watched_spot::{WatchedSpot, watched_spots};
 use crate::monitor::stats::co_location::{CoLocationEvidence, CoLocationTest, OtherBeams};
 use crate::monitor::stats::error_budget::TestFamily;
 use crate::monitor::stats::gaussian::largest_eigenvalue;
 use crate::monitor::stats::jitter::SecondDifference;
-use crate::monitor::stats::robust::median_high;
+use crate::monitor::stats::robust::{common_displacement, median_high};
 use crate::monitor::stats::second_moment::CommonMode;
 use crate::monitor::stats::step_change::{CandidateSteps, TRIED};
-use crate::monitor::track::tracker::Track;
+use crate::monitor::track::beam_track::Track;
 
-/// Users besides the one at hand from which their median is taken for what all beams share.
+/// Users besides the one at hand from which their median is taken for what all beams share. With one, a single other beam would
+/// decide; more leave small groups without a common mode.
 const MIN_OTHERS: usize = 2;
 /// Share of the threshold from which a beam's present is no longer added to its past: smaller starves the past of an unsteady
 /// beam, larger lets a second beam become a habit. Not measured.
@@ -30,11 +30,10 @@ const SUSPECT_SHARE: f64 = 0.2;
 const BESIDE_RESOLUTIONS: f64 = 3.0;
 
 /// What is remembered of each user's spot.
-#[derive(Debug, Default)]
-pub struct Memory(BTreeMap<String, Spot>);
+pub type Memory = ByUser<Spot>;
 
 #[derive(Debug, Default)]
-struct Spot {
+pub struct Spot {
     test: CoLocationTest,
     /// Since when there is evidence of a second beam: the present is not added to the past.
     suspected_since: Option<Timestamp>,
@@ -42,17 +41,10 @@ struct Spot {
     accompanied_at: Option<Timestamp>,
 }
 
-/// A user's beam that stands alone in this frame, with all the light of its spot.
-struct Watched {
-    /// Index of the claim.
-    claim: usize,
-    track: Track,
-}
-
 impl Memory {
     /// The user's usual energy, J, once their beam has a past.
     pub fn usual_energy_j(&self, user: &str) -> Option<f64> {
-        let (mean, _) = self.0.get(user)?.test.brightness.past()?;
+        let (mean, _) = self.get(user)?.test.brightness.past()?;
         Some(mean.exp())
     }
 
@@ -65,70 +57,55 @@ impl Memory {
         };
         let past = &alert.evidence["energy_over_the_past"];
         if let (Some(mean), Some(std)) = (past["past_ln_j"].as_f64(), past["past_ln_std"].as_f64()) {
-            self.0.entry(user.to_owned()).or_default().test = CoLocationTest::remembered(mean, std);
+            self.entry(user).test = CoLocationTest::remembered(mean, std);
         }
-    }
-
-    pub fn retain(&mut self, is_kept: impl Fn(&str) -> bool) {
-        self.0.retain(|user, _| is_kept(user));
     }
 
     /// Takes the frame's light and positions, less what all beams have in common.
-    fn update(&mut self, frame: &FrameContext, watched: &[Watched]) {
-        let users: BTreeSet<&str> = watched.iter().map(|w| w.user(frame)).collect();
-        for (user, spot) in &mut self.0 {
-            if !users.contains(user.as_str()) {
-                spot.test.jitter.interrupt();
-            }
+    fn update(&mut self, watched: &[WatchedSpot]) {
+        for (_, spot) in self.iter_mut().filter(|(user, _)| find(watched, user).is_none()) {
+            spot.test.jitter.interrupt();
         }
-        let jumps: Vec<Option<SecondDifference>> = watched
+        let displacements: Vec<(Option<SecondDifference>, CandidateSteps)> = watched
             .iter()
             .map(|w| {
-                let detection = &w.track.detection;
-                let jitter = &mut self.spot(w.user(frame)).test.jitter;
-                jitter.second_difference(w.track.last_hit, detection.position, detection.cov)
-            })
-            .collect();
-        let steps: Vec<CandidateSteps> = watched
-            .iter()
-            .map(|w| {
-                let detection = &w.track.detection;
+                let (time, detection) = (w.track.last_hit, &w.detection);
+                let test = &mut self.entry(w.user).test;
                 let variance = largest_eigenvalue(&detection.cov);
-                let steps = &mut self.spot(w.user(frame)).test.steps;
-                steps.candidates(w.track.last_hit, detection.position, variance)
+                (
+                    test.jitter.second_difference(time, detection.position, detection.cov),
+                    test.steps.candidates(time, detection.position, variance),
+                )
             })
             .collect();
-        let common_jump = common(jumps.iter().flatten().map(|jump| jump.by));
-        let common_steps =
-            std::array::from_fn::<_, { TRIED }, _>(|k| common(steps.iter().filter_map(|s| Some(s[k]?.aside))));
-        for ((w, jump), steps) in watched.iter().zip(jumps).zip(steps) {
-            let spot = self.spot(w.user(frame));
+        let common_jump = common_displacement(
+            MIN_OTHERS,
+            displacements.iter().filter_map(|(jump, _)| Some(jump.as_ref()?.by)),
+        );
+        let common_steps: [_; TRIED] = std::array::from_fn(|k| {
+            common_displacement(
+                MIN_OTHERS,
+                displacements.iter().filter_map(|(_, steps)| Some(steps[k]?.aside)),
+            )
+        });
+        for (w, (jump, steps)) in watched.iter().zip(displacements) {
+            let spot = self.entry(w.user);
             let learn = spot.suspected_since.is_none();
-            if let Some(ln_energy) = ln_energy(&w.track) {
-                spot.test
-                    .push_light(w.track.last_hit, ln_energy, &w.track.detection.moments, learn);
+            if let Some(ln_energy) = w.ln_energy() {
+                spot.test.second_moment.push(&w.detection.moments, learn);
+                spot.test.brightness.push(w.track.last_hit, ln_energy, learn);
             }
             if let Some(jump) = jump {
-                spot.test.push_jitter(jump.less(common_jump), learn);
+                spot.test.jitter.push(jump.less(common_jump), learn);
             }
             spot.test.steps.push(&steps, &common_steps, learn);
         }
     }
 
-    fn spot(&mut self, user: &str) -> &mut Spot {
-        if !self.0.contains_key(user) {
-            self.0.insert(user.to_owned(), Spot::default());
-        }
-        self.0.get_mut(user).expect("inserted if it was absent")
-    }
-
     /// What the watched beams besides `user`'s show.
-    fn others(&self, user: &str, frame: &FrameContext, watched: &[Watched]) -> OtherBeams {
-        let tests: Vec<(bool, &CoLocationTest)> = watched
-            .iter()
-            .filter_map(|w| Some((w.user(frame) != user, &self.0.get(w.user(frame))?.test)))
-            .collect();
-        let others = || tests.iter().filter(|(is_other, _)| *is_other).map(|(_, test)| test);
+    fn others(&self, user: &str, watched: &[WatchedSpot]) -> OtherBeams {
+        let tests = || watched.iter().filter_map(|w| Some((w.user, &self.get(w.user)?.test)));
+        let others = || tests().filter(|(name, _)| *name != user).map(|(_, test)| test);
         let enough = |values: Vec<f64>| match values.len() >= MIN_OTHERS {
             true => median_high(values.into_iter()),
             false => None,
@@ -137,13 +114,8 @@ impl Memory {
             second_moment: CommonMode::of(others().map(|test| &test.second_moment)),
             rise: enough(others().filter_map(|test| test.brightness.recent_rise()).collect()),
             jitter: enough(others().filter_map(|test| test.jitter.recent_mean()).collect()),
-            scatter: tests.iter().map(|(_, test)| test.brightness.scatter()).sum(),
+            scatter: tests().map(|(_, test)| test.brightness.scatter()).sum(),
         }
-    }
-
-    /// Whether enough frames have been seen to say that the user's spot holds no second beam.
-    fn has_verdict(&self, user: &str) -> bool {
-        self.0.get(user).is_some_and(|spot| spot.test.has_verdict())
     }
 }
 
@@ -151,52 +123,54 @@ impl Memory {
 /// does not.
 pub fn evaluate(frame: &FrameContext, memory: &mut Memory) -> Vec<Finding> {
     let threshold = frame.budget.threshold(TestFamily::CoLocated, frame.claims.len() as f64);
-    let watched: Vec<Watched> = (0..frame.claims.len()).filter_map(|i| watched(frame, i)).collect();
-    memory.update(frame, &watched);
+    let watched = watched_spots(frame);
+    memory.update(&watched);
     let mut findings = Vec::new();
-    let mut present: BTreeSet<&str> = BTreeSet::new();
-    let mut moved: BTreeSet<Cause> = BTreeSet::new();
     for w in &watched {
-        let user = w.user(frame);
-        let cause = Cause::CoLocated(user.to_owned());
-        let others = memory.others(user, frame, &watched);
-        let is_accompanied = is_beside_unclaimed(frame, &w.track, &moved);
+        let cause = Cause::CoLocated(w.user.to_owned());
+        let others = memory.others(w.user, &watched);
         let is_open = frame.alerts.is_open(&cause);
-        let spot = memory.spot(user);
-        if is_accompanied {
+        let spot = memory.entry(w.user);
+        if is_beside_unclaimed(frame, w.track, &findings) {
             spot.accompanied_at = Some(frame.now);
         }
         let evidence = spot.test.evaluate(frame.config.tolerated_brightening, &others);
         if !spot.is_present(&evidence, threshold, is_open, frame) {
             continue;
         }
-        present.insert(user);
         let mut raised_at = frame.alerts.raised_at(&cause);
-        if !is_open && let Some(old) = alert_merged_into(frame, &w.track, &moved) {
-            raised_at = frame.alerts.raised_at(&old);
-            findings.push(Finding::Renamed {
-                from: old.clone(),
-                to: cause.clone(),
-            });
-            moved.insert(old);
+        if !is_open && let Some(from) = alert_merged_into(frame, w.track, &findings) {
+            raised_at = frame.alerts.raised_at(&from);
+            let to = cause.clone();
+            findings.push(Finding::Renamed { from, to });
         }
         let lasted_s = seconds(raised_at.unwrap_or(frame.now), frame.now);
         let past = spot.test.brightness.past();
         let content = content(frame, w, &evidence, past, threshold, Severity::of_duration(lasted_s));
         findings.push(Finding::present(cause, content));
     }
-    let is_watched: BTreeSet<&str> = watched.iter().map(|w| w.user(frame)).collect();
-    let is_undecided = |user: &str| {
-        let claim = frame.claims.iter().position(|a| a.claim.user == user);
-        let is_associated = claim.is_some_and(|i| frame.association.track_id(i).is_some());
-        is_associated && !(is_watched.contains(user) && memory.has_verdict(user))
-    };
-    let over = frame.alerts.open().filter_map(|(cause, _)| match cause {
-        Cause::CoLocated(user) if !present.contains(user.as_str()) && !is_undecided(user) => Some(cause),
-        _ => None,
-    });
-    findings.extend(over.cloned().map(Finding::Absent));
+    for (cause, _) in frame.alerts.open() {
+        let Cause::CoLocated(user) = cause else {
+            continue;
+        };
+        let is_present = findings.iter().any(|finding| finding.cause() == cause);
+        let is_tested = find(&watched, user).is_some() && memory.get(user).is_some_and(|spot| spot.test.has_verdict());
+        if !is_present && (is_tested || !has_beam(frame, user)) {
+            findings.push(Finding::Absent(cause.clone()));
+        }
+    }
     findings
+}
+
+fn find<'a>(watched: &'a [WatchedSpot], user: &str) -> Option<&'a WatchedSpot<'a>> {
+    let found = watched.binary_search_by(|w| w.user.cmp(user));
+    found.ok().map(|k| &watched[k])
+}
+
+/// Whether a track is associated with the user's claim.
+fn has_beam(frame: &FrameContext, user: &str) -> bool {
+    let claim = frame.claims.iter().position(|a| a.claim.user == user);
+    claim.is_some_and(|i| frame.association.track_id(i).is_some())
 }
 
 impl Spot {
@@ -209,8 +183,7 @@ impl Spot {
         is_open: bool,
         frame: &FrameContext,
     ) -> bool {
-        let now = frame.now;
-        let claim_wait_s = frame.claim_wait_s();
+        let (now, claim_wait_s) = (frame.now, frame.claim_wait_s());
         let is_suspect = evidence.neg_log_p() > SUSPECT_SHARE * threshold;
         let began = match evidence.step.neg_log_p > SUSPECT_SHARE * threshold {
             true => evidence.step.since.unwrap_or(now),
@@ -220,71 +193,20 @@ impl Spot {
         let Some(suspected) = self.suspected_since else {
             return false;
         };
-        if is_open {
-            return true;
-        }
         // A second beam may be a user's whose claim has yet to come.
         let is_due = evidence.neg_log_p() > threshold && seconds(suspected, now) >= claim_wait_s;
         // One detection that goes astray does not part a user and a stranger who has an alert.
         let is_explained = self.accompanied_at.is_some_and(|t| seconds(t, now) < claim_wait_s);
-        is_due && !is_explained
+        is_open || (is_due && !is_explained)
     }
 }
 
-impl Watched {
-    fn user<'a>(&self, frame: &FrameContext<'a>) -> &'a str {
-        &frame.claims[self.claim].claim.user
-    }
-}
-
-/// The beam of claim `i`, if it is detected, confirmed and nobody else's may be in its spot.
-fn watched(frame: &FrameContext, i: usize) -> Option<Watched> {
-    let track = frame.track(i)?;
-    (track.hit && track.confirmed && !is_shared(frame, i, track)).then(|| Watched {
-        claim: i,
-        track: with_whole_spot(frame, track),
-    })
-}
-
-/// `track` with all the light of its spot that is associated with nobody else's claim.
-fn with_whole_spot(frame: &FrameContext, track: &Track) -> Track {
-    let detection = &track.detection;
-    let others = frame.tracker.tracks.iter().filter(|t| {
-        let near = &t.detection;
-        let reach = detection.resolution_m + 2.0 * largest_eigenvalue(&near.cov).sqrt().min(detection.resolution_m);
-        let is_near = (near.position - detection.position).norm() < reach;
-        t.hit && t.id != track.id && is_near && !frame.association.contains(t.id)
-    });
-    track.with_detection(detection.united(others.map(|t| &t.detection), frame.camera))
-}
-
-/// Whether another user's beam may be in this spot, by tracks or by claims.
-fn is_shared(frame: &FrameContext, i: usize, track: &Track) -> bool {
-    let (here, reach) = (track.filter.position(), track.detection.resolution_m);
-    frame.confusion_m(track) > 0.0
-        || (0..frame.claims.len())
-            .filter(|&j| j != i && frame.association.track_id(j).is_none())
-            .filter(|&j| frame.crowding.is_evidence(&frame.claims[j]))
-            .any(|j| {
-                let a = &frame.claims[j];
-                let away = (a.position - here).norm() - a.slack_m - 2.0 * a.variance.sqrt();
-                away < reach + frame.config.tolerated_distance_m || (a.is_unresolvable && away < frame.overlap_m())
-            })
-}
-
-/// ln of the spot's energy, where the frame shows all of its light.
-fn ln_energy(track: &Track) -> Option<f64> {
-    let incomplete = Flags::SATURATED | Flags::MASKED | Flags::NEAR_EDGE | Flags::OUT_OF_TIME;
-    let detection = &track.detection;
-    (detection.energy_j > 0.0 && !detection.flags.intersects(incomplete)).then(|| detection.energy_j.ln())
-}
-
-/// Whether an emitter that has an alert (not `moved`) stands so near that its light explains what is odd about this beam.
-fn is_beside_unclaimed(frame: &FrameContext, track: &Track, moved: &BTreeSet<Cause>) -> bool {
+/// Whether an emitter that has an alert, not renamed by `findings`, stands so near that its light explains what is odd about this beam.
+fn is_beside_unclaimed(frame: &FrameContext, track: &Track, findings: &[Finding]) -> bool {
     let here = track.filter.position();
     let reach = BESIDE_RESOLUTIONS * track.detection.resolution_m;
     frame.alerts.open().any(|(cause, _)| match cause {
-        Cause::Track(id) if !moved.contains(cause) => frame
+        Cause::Track(id) if !is_renamed(findings, cause) => frame
             .tracker
             .get(*id)
             .is_some_and(|t| t.is_seen() && (t.filter.position() - here).norm() < reach),
@@ -292,8 +214,8 @@ fn is_beside_unclaimed(frame: &FrameContext, track: &Track, moved: &BTreeSet<Cau
     })
 }
 
-/// The alert (not `moved`) of an emitter that can no longer be resolved from this beam: the same cause.
-fn alert_merged_into(frame: &FrameContext, track: &Track, moved: &BTreeSet<Cause>) -> Option<Cause> {
+/// The alert, not renamed by `findings`, of an emitter that can no longer be resolved from this beam: the same cause.
+fn alert_merged_into(frame: &FrameContext, track: &Track, findings: &[Finding]) -> Option<Cause> {
     let here = track.filter.position();
     let reach = BESIDE_RESOLUTIONS * track.detection.resolution_m;
     frame.alerts.open().find_map(|(cause, alert)| {
@@ -302,55 +224,45 @@ fn alert_merged_into(frame: &FrameContext, track: &Track, moved: &BTreeSet<Cause
         };
         let away = (Vector2::new(alert.x_m?, alert.y_m?) - here).norm();
         let is_lost = frame.tracker.get(*id).is_none_or(|t| !t.hit);
-        (is_lost && away < reach && !moved.contains(cause)).then(|| cause.clone())
+        (is_lost && away < reach && !is_renamed(findings, cause)).then(|| cause.clone())
     })
 }
 
 fn content(
     frame: &FrameContext,
-    w: &Watched,
+    w: &WatchedSpot,
     evidence: &CoLocationEvidence,
     past: Option<(f64, f64)>,
     threshold: f64,
     severity: Severity,
 ) -> Content {
-    let track = &w.track;
+    let (track, detection) = (w.track, &w.detection);
     let evidence = json!({
         "track": track.id,
-        SHARED_SPOT: w.user(frame),
-        "resolution_m": track.detection.resolution_m,
-        "energy_j": track.detection.energy_j,
+        SHARED_SPOT: w.user,
+        "resolution_m": detection.resolution_m,
+        "energy_j": detection.energy_j,
         "energy_over_the_past": {
-            "ratio": evidence.energy_ratio,
-            "surprise": evidence.energy_neg_log_p,
+            "ratio": evidence.energy.ratio,
+            "surprise": evidence.energy.neg_log_p,
             "past_ln_j": past.map(|p| p.0),
             "past_ln_std": past.map(|p| p.1),
         },
         "power_against_reported": power_against_reported(frame, w.claim),
-        "unrest_over_the_expected": { "ratio": evidence.jitter_ratio, "surprise": evidence.jitter_neg_log_p },
+        "unrest_over_the_expected": { "ratio": evidence.jitter.ratio, "surprise": evidence.jitter.neg_log_p },
         "step_aside": {
             "length_m": evidence.step.length_m,
             "surprise": evidence.step.neg_log_p,
             "since": evidence.step.since,
-            "energy_surprise": evidence.energy_neg_log_p_since,
-            "unrest_surprise": evidence.jitter_neg_log_p_since,
+            "energy_surprise": evidence.energy_since.neg_log_p,
+            "unrest_surprise": evidence.jitter_since.neg_log_p,
         },
-        "width_over_the_expected": { "moment_in_sigma2": evidence.widening, "surprise": evidence.width_neg_log_p },
+        "width_over_the_expected": { "moment_in_sigma2": evidence.width.trace, "surprise": evidence.width.neg_log_p },
         "surprise": evidence.neg_log_p(),
         "threshold": threshold,
-        "flags": track.detection.flags,
+        "flags": detection.flags,
     });
     Content::new(severity, evidence).at(track.filter.position(), track.filter.position_cov())
-}
-
-/// What displacements have in common: nothing, where too few are known.
-fn common(displacements: impl Iterator<Item = Vector2<f64>>) -> Vector2<f64> {
-    let known: Vec<_> = displacements.collect();
-    let axis = |k: usize| median_high(known.iter().map(|d| d[k])).unwrap_or(0.0);
-    match known.len() > MIN_OTHERS {
-        true => Vector2::new(axis(0), axis(1)),
-        false => Vector2::zeros(),
-    }
 }
 
 #[cfg(test)]
@@ -375,14 +287,12 @@ mod tests {
     impl Watch {
         /// Four users whose ln energies are known to have been 0 ± 0.3.
         fn new() -> Self {
-            let spot = || Spot {
-                test: CoLocationTest::remembered(0.0, 0.3),
-                ..Spot::default()
-            };
-            Self {
-                scene: Scene::of_users(&USERS),
-                memory: Memory((0..4).map(|k| (format!("u-{k}"), spot())).collect()),
+            let mut memory = Memory::default();
+            for k in 0..4 {
+                memory.entry(&format!("u-{k}")).test = CoLocationTest::remembered(0.0, 0.3);
             }
+            let scene = Scene::of_users(&USERS);
+            Self { scene, memory }
         }
 
         fn beams(energies: [f64; 4]) -> Vec<Detection> {
@@ -395,7 +305,7 @@ mod tests {
 
         fn detect(&mut self, beams: &[Detection]) -> Vec<Finding> {
             self.scene.detect(beams);
-            let findings = evaluate(&self.scene.context(), &mut self.memory);
+            let findings = evaluate(self.scene.context(), &mut self.memory);
             self.scene.apply(findings.clone());
             findings
         }
@@ -437,12 +347,9 @@ mod tests {
         // The association of a beam that was just missed is held, but it cannot be tested: neither present nor absent.
         watch.scene.detect(&beams[1..]);
         watch.scene.association.assign(0, 1);
-        assert!(evaluate(&watch.scene.context(), &mut watch.memory).is_empty());
+        assert!(evaluate(watch.scene.context(), &mut watch.memory).is_empty());
         watch.scene.association = Association::none(4);
-        assert_eq!(
-            absent(&evaluate(&watch.scene.context(), &mut watch.memory)),
-            [&cause(0)]
-        );
+        assert_eq!(absent(&evaluate(watch.scene.context(), &mut watch.memory)), [&cause(0)]);
     }
 
     #[test]
@@ -479,18 +386,6 @@ mod tests {
     }
 
     #[test]
-    fn a_spot_that_may_be_shared_is_not_tested() {
-        let mut watch = Watch::new();
-        // A second user claims to be 4 m away, and has no beam.
-        watch.scene.claim(1, 4.0, 0.0);
-        watch.scene.association = Association::none(4);
-        watch.scene.association.assign(0, 1);
-        assert!(watched(&watch.scene.context(), 0).is_none());
-        watch.scene.claim(1, 40.0, 0.0);
-        assert!(watched(&watch.scene.context(), 0).is_some());
-    }
-
-    #[test]
     fn the_past_outlasts_a_restart() {
         let mut watch = Watch::new();
         watch.until_found([3.0, 1.0, 1.0, 1.0]).expect("found");
@@ -500,11 +395,5 @@ mod tests {
         assert!((energy - 1.0).abs() < 1e-9, "{energy}");
         restarted.retain(|user| user != "u-0");
         assert!(restarted.usual_energy_j("u-0").is_none());
-    }
-
-    #[test]
-    fn the_common_mode_needs_three() {
-        let of = |xs: &[f64]| common(xs.iter().map(|x| Vector2::new(*x, 0.0))).x;
-        assert_eq!((of(&[1.0, 1.0]), of(&[1.0, 5.0, 2.0])), (0.0, 2.0));
     }
 }

@@ -16,9 +16,11 @@ const QUIET_PERIODS: f64 = 5.0;
 const SILENT_PERIODS: f64 = 20.0;
 /// How much longer one user may be silent than the whole log, in `claims_stale_s`.
 const USER_PATIENCE: f64 = 4.0;
-/// A user whose beam was seen within this is still on, s.
+/// A user whose beam was seen within this is still on, s. Longer calls users silent who have left, shorter interrupts the alert
+/// where frames miss the beam. Not measured.
 const LIT_S: f64 = 1.0;
-/// Silence of the log in units of its limit from which it is critical.
+/// Silence of the log in units of its limit from which it is critical. At the defaults 30 s: larger delays the escalation. Not
+/// tuned.
 const CRITICAL_RATIO: f64 = 6.0;
 
 const SENSOR: Cause = Cause::System(AlertKind::SensorLost);
@@ -78,23 +80,21 @@ pub fn claims_stale(frame: &FrameContext) -> Vec<Finding> {
     let quiet = frame.claims_quiet_s.filter(|(came, made)| came.max(*made) > limit_s);
     let is_log_stale = frame.alerts.is_open(&LOG) || quiet.is_some();
     let mut findings = of_users(frame, period_s, is_log_stale);
-    findings.push(match quiet.filter(|_| expects_claims(frame)) {
-        Some((came, made)) => {
-            let severity = if came.max(made) > CRITICAL_RATIO * limit_s {
-                Severity::Critical
-            } else {
-                Severity::Warning
-            };
-            let evidence = json!({
-                "newest_came_s_ago": came,
-                "newest_made_s_ago": made,
-                "limit_s": limit_s,
-                "typical_period_s": period_s,
-            });
-            Finding::present(LOG, Content::new(severity, evidence))
-        }
-        None => Finding::Absent(LOG),
+    let content = quiet.filter(|_| expects_claims(frame)).map(|(came, made)| {
+        let severity = if came.max(made) > CRITICAL_RATIO * limit_s {
+            Severity::Critical
+        } else {
+            Severity::Warning
+        };
+        let evidence = json!({
+            "newest_came_s_ago": came,
+            "newest_made_s_ago": made,
+            "limit_s": limit_s,
+            "typical_period_s": period_s,
+        });
+        Content::new(severity, evidence)
     });
+    findings.push(Finding::of(LOG, content));
     findings
 }
 
@@ -103,7 +103,7 @@ pub fn claims_stale(frame: &FrameContext) -> Vec<Finding> {
 fn of_users(frame: &FrameContext, period_s: f64, is_log_stale: bool) -> Vec<Finding> {
     let open = frame.alerts.users_with(AlertKind::ClaimsStale);
     let mut findings = Vec::new();
-    for claim in frame.claims {
+    for claim in &frame.claims {
         let user = claim.claim.user.as_str();
         let is_open = open.contains(user);
         let own_period_s = claim.period_s.unwrap_or(0.0);
@@ -111,20 +111,17 @@ fn of_users(frame: &FrameContext, period_s: f64, is_log_stale: bool) -> Vec<Find
         let limit_s = periods_s.max(USER_PATIENCE * frame.config.claims_stale_s);
         let last_seen = frame.users.get(user).and_then(|u| u.last_seen);
         let is_lit = last_seen.is_some_and(|t| seconds(t, frame.now) < LIT_S);
-        let cause = || Cause::User(AlertKind::ClaimsStale, user.to_owned());
-        if claim.ended || claim.age_s <= limit_s || !is_lit || (is_log_stale && !is_open) {
-            if is_open {
-                findings.push(Finding::Absent(cause()));
-            }
-            continue;
+        let is_silent = !claim.ended && claim.age_s > limit_s && is_lit && (is_open || !is_log_stale);
+        if is_silent || is_open {
+            let evidence = json!({
+                "newest_made_s_ago": claim.age_s,
+                "limit_s": limit_s,
+                "typical_period_s": period_s,
+            });
+            let content = Content::new(Severity::Warning, evidence).with_claim(claimed(claim));
+            let cause = Cause::User(AlertKind::ClaimsStale, user.to_owned());
+            findings.push(Finding::of(cause, is_silent.then_some(content)));
         }
-        let evidence = json!({
-            "newest_made_s_ago": claim.age_s,
-            "limit_s": limit_s,
-            "typical_period_s": period_s,
-        });
-        let content = Content::new(Severity::Warning, evidence).with_claim(claimed(claim));
-        findings.push(Finding::present(cause(), content));
     }
     findings
 }
@@ -144,13 +141,13 @@ mod tests {
     #[test]
     fn a_second_without_a_usable_frame_is_a_lost_sensor() {
         let mut scene = Scene::of_users(&[[0.0, 0.0]]);
-        scene.sensor.no_frame(scene.now);
+        scene.frame.sensor.no_frame(scene.frame.now);
         scene.now += SignedDuration::from_millis(900);
-        assert!(sensor_lost(&scene.context()).is_empty(), "neither lost nor there");
+        assert!(sensor_lost(scene.context()).is_empty(), "neither lost nor there");
         scene.now += SignedDuration::from_millis(100);
-        assert_eq!(present(&sensor_lost(&scene.context())), [&SENSOR]);
+        assert_eq!(present(&sensor_lost(scene.context())), [&SENSOR]);
         scene.sensor = Default::default();
-        assert_eq!(absent(&sensor_lost(&scene.context())), [&SENSOR]);
+        assert_eq!(absent(&sensor_lost(scene.context())), [&SENSOR]);
     }
 
     #[test]
@@ -159,11 +156,11 @@ mod tests {
         // Five seconds, by arrival or by the claims' own times.
         for (came, made, is_stale) in [(5.0, 5.0, false), (5.1, 0.0, true), (0.0, 5.1, true)] {
             scene.claims_quiet_s = Some((came, made));
-            let findings = claims_stale(&scene.context());
+            let findings = claims_stale(scene.context());
             assert_eq!(present(&findings).len(), usize::from(is_stale), "{came} {made}");
         }
         scene.claims_quiet_s = Some((31.0, 31.0));
-        let findings = claims_stale(&scene.context());
+        let findings = claims_stale(scene.context());
         scene.apply(findings);
         assert_eq!(scene.alerts.open().next().unwrap().1.severity, Severity::Critical);
         let mut empty = Scene::of_users(&[]);
@@ -174,21 +171,21 @@ mod tests {
     #[test]
     fn refused_shed_and_unconsidered_claims_are_a_flood() {
         let mut scene = Scene::of_users(&[[0.0, 0.0]]);
-        assert_eq!(absent(&claims_flooded(&scene.context())), [&FLOOD]);
+        assert_eq!(absent(&claims_flooded(scene.context())), [&FLOOD]);
         scene.overload.left_out = 1;
-        let findings = claims_flooded(&scene.context());
+        let findings = claims_flooded(scene.context());
         assert_eq!(present(&findings), [&FLOOD]);
         scene.apply(findings);
         scene.overload = Overload::default();
         scene.overload.squeezed.refused = 50;
-        let findings = claims_flooded(&scene.context());
+        let findings = claims_flooded(scene.context());
         scene.apply(findings);
         let alert = |scene: &Scene| scene.alerts.open().next().unwrap().1.clone();
         assert_eq!(alert(&scene).severity, Severity::Warning);
         // In the newest ten seconds.
         assert_eq!(alert(&scene).evidence["claims_lost_per_s"], 5.0);
         scene.overload.squeezed.shed_known = 1;
-        let findings = claims_flooded(&scene.context());
+        let findings = claims_flooded(scene.context());
         scene.apply(findings);
         assert_eq!(
             alert(&scene).severity,
@@ -203,18 +200,18 @@ mod tests {
         let silent = Cause::User(AlertKind::ClaimsStale, "u-1".into());
         // Twenty periods of a second.
         scene.claims[1].age_s = 20.0;
-        assert!(present(&claims_stale(&scene.context())).is_empty());
+        assert!(present(&claims_stale(scene.context())).is_empty());
         scene.claims[1].age_s = 20.1;
-        assert_eq!(present(&claims_stale(&scene.context())), [&silent]);
+        assert_eq!(present(&claims_stale(scene.context())), [&silent]);
         // The whole log's silence is one cause.
         scene.claims_quiet_s = Some((20.0, 20.0));
-        assert_eq!(present(&claims_stale(&scene.context())), [&LOG]);
+        assert_eq!(present(&claims_stale(scene.context())), [&LOG]);
         scene.claims_quiet_s = Some((0.0, 0.0));
-        let findings = claims_stale(&scene.context());
+        let findings = claims_stale(scene.context());
         scene.apply(findings);
         // The beam has been off for a second: that user is unseen, and not silent.
         scene.now += SignedDuration::from_secs(1);
-        assert!(absent(&claims_stale(&scene.context())).contains(&&silent));
+        assert!(absent(&claims_stale(scene.context())).contains(&&silent));
     }
 
     #[test]
@@ -222,8 +219,8 @@ mod tests {
         let mut scene = Scene::of_users(&[[0.0, 0.0], [50.0, 0.0]]);
         scene.claims[1].period_s = Some(3.0);
         scene.claims[1].age_s = 59.0;
-        assert!(present(&claims_stale(&scene.context())).is_empty());
+        assert!(present(&claims_stale(scene.context())).is_empty());
         scene.claims[1].age_s = 61.0;
-        assert_eq!(present(&claims_stale(&scene.context())).len(), 1);
+        assert_eq!(present(&claims_stale(scene.context())).len(), 1);
     }
 }

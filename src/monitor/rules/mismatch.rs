@@ -1,11 +1,10 @@
 //! `position_mismatch`: a user's beam is farther from the claim than is tolerated.
 
-use std::collections::BTreeMap;
-
 use nalgebra::{Matrix2, Vector2};
 use serde_json::json;
 
 use crate::monitor::alert::{Alert, AlertKind, Severity};
+use crate::monitor::by_user::ByUser;
 use crate::monitor::evidence::{claimed, power_against_reported};
 use crate::monitor::finding::{Cause, Content, Finding};
 use crate::monitor::frame_context::FrameContext;
@@ -16,17 +15,18 @@ use crate::monitor::stats::gaussian::neg_log_p_outside;
 /// Frames in a row that must show a beam outside before a single claim's evidence stands. More delay the alert of a jump, fewer let
 /// one odd frame raise it.
 const OUTSIDE_FRAMES: u32 = 3;
-/// Claims in a row that must agree before a mismatch ends.
+/// Claims in a row that must agree before a mismatch ends. With one, a claim in error would end it; more hold the alert of a user
+/// who is back.
 const AGREEING_CLAIMS: usize = 2;
-/// Distance in units of the tolerated one from which a mismatch is critical.
+/// Distance in units of the tolerated one from which a mismatch is critical. Larger delays the escalation, smaller escalates
+/// borderline cases. Not tuned.
 const CRITICAL_RATIO: f64 = 2.0;
 
 /// What is remembered of each user.
-#[derive(Debug, Default)]
-pub struct Memory(BTreeMap<String, User>);
+pub type Memory = ByUser<User>;
 
 #[derive(Debug, Default)]
-struct User {
+pub struct User {
     consistency: ClaimConsistency,
     /// Frames in a row with the beam outside what is tolerated.
     outside: u32,
@@ -37,13 +37,13 @@ struct User {
 
 impl Memory {
     pub fn is_mismatched(&self, user: &str) -> bool {
-        self.0.get(user).is_some_and(|u| u.is_mismatched)
+        self.get(user).is_some_and(|u| u.is_mismatched)
     }
 
     /// Takes up a mismatch from before a restart.
     pub fn restore(&mut self, alert: &Alert) {
         if let (AlertKind::PositionMismatch, Some(user)) = (alert.kind, &alert.user) {
-            let known = self.0.entry(user.clone()).or_default();
+            let known = self.entry(user);
             known.is_mismatched = true;
             known.is_displaced = alert.evidence["answered_from_elsewhere"].as_bool().unwrap_or(false);
         }
@@ -51,18 +51,14 @@ impl Memory {
 
     /// The user's beam has been found elsewhere.
     pub fn displace(&mut self, user: &str) {
-        self.0.entry(user.to_owned()).or_default().is_displaced = true;
+        self.entry(user).is_displaced = true;
     }
 
     /// Residuals so far were taken by another clock.
     pub fn forget_residuals(&mut self) {
-        for user in self.0.values_mut().filter(|u| !u.is_mismatched) {
+        for (_, user) in self.iter_mut().filter(|(_, u)| !u.is_mismatched) {
             user.consistency.forget();
         }
-    }
-
-    pub fn retain(&mut self, is_kept: impl Fn(&str) -> bool) {
-        self.0.retain(|user, _| is_kept(user));
     }
 
     /// Adds the residuals of new claims, and counts the frames that show a beam outside.
@@ -73,12 +69,12 @@ impl Memory {
         let is_settled = frame.is_settled();
         for (i, claim) in frame.claims.iter().enumerate() {
             let Some(track) = frame.track(i) else {
-                if let Some(user) = self.0.get_mut(&claim.claim.user) {
+                if let Some(user) = self.get_mut(&claim.claim.user) {
                     user.outside = 0;
                 }
                 continue;
             };
-            let user = self.0.entry(claim.claim.user.clone()).or_default();
+            let user = self.entry(&claim.claim.user);
             if claim.ended {
                 continue;
             }
@@ -121,14 +117,11 @@ pub fn evaluate(frame: &FrameContext, memory: &mut Memory) -> Vec<Finding> {
     for i in 0..frame.claims.len() {
         let user = frame.claims[i].claim.user.as_str();
         let content = memory
-            .0
             .get_mut(user)
             .and_then(|known| known.mismatch(frame, i, threshold));
-        let cause = || Cause::User(AlertKind::PositionMismatch, user.to_owned());
-        match content {
-            Some(content) => findings.push(Finding::present(cause(), content)),
-            None if open.contains(user) => findings.push(Finding::Absent(cause())),
-            None => {}
+        if content.is_some() || open.contains(user) {
+            let cause = Cause::User(AlertKind::PositionMismatch, user.to_owned());
+            findings.push(Finding::of(cause, content));
         }
     }
     findings
@@ -201,8 +194,8 @@ mod tests {
         /// A frame.
         fn show(&mut self) -> Vec<Finding> {
             self.scene.show(&[[0.0, 0.0]]);
-            self.memory.update(&self.scene.context());
-            let findings = evaluate(&self.scene.context(), &mut self.memory);
+            self.memory.update(self.scene.context());
+            let findings = evaluate(self.scene.context(), &mut self.memory);
             self.scene.apply(findings.clone());
             findings
         }
@@ -330,7 +323,7 @@ mod tests {
         let mut restarted = Memory::default();
         restarted.restore(&alert);
         assert!(restarted.is_mismatched("u-0"));
-        assert_eq!(present(&evaluate(&watch.scene.context(), &mut restarted)).len(), 1);
+        assert_eq!(present(&evaluate(watch.scene.context(), &mut restarted)).len(), 1);
         restarted.retain(|user| user != "u-0");
         assert!(!restarted.is_mismatched("u-0"));
     }

@@ -7,3 +7,4 @@ pub(super) mod mismatch;
 pub(super) mod pose;
 pub(super) mod unclaimed;
 pub(super) mod unseen;
+pub(super) mod watched_spot;

@@ -9,11 +9,14 @@ use crate::monitor::frame_context::FrameContext;
 use crate::monitor::stats::error_budget::TestFamily;
 use crate::monitor::stats::gaussian::neg_log_p_outside;
 
-/// Share of the tolerated distance that is corrected without an alert, where `pose_limit_m` is left out.
+/// Share of the tolerated distance that is corrected without an alert, where `pose_limit_m` is left out. A half leaves the other
+/// half of the tolerated distance to the users. Not tuned.
 const DEFAULT_LIMIT: f64 = 0.5;
-/// Share of the limit below which the displacement must fall before its alert ends.
+/// Share of the limit below which the displacement must fall before its alert ends. Larger lets the alert come and go, smaller
+/// holds it after the pose is back. Not tuned.
 const ENDS_BELOW: f64 = 0.9;
-/// Displacement in units of the limit from which the alert is critical.
+/// Displacement in units of the limit from which the alert is critical. At the defaults 10 m: larger delays the escalation. Not
+/// tuned.
 const CRITICAL_RATIO: f64 = 4.0;
 
 const CAUSE: Cause = Cause::System(AlertKind::PoseInconsistent);
@@ -55,7 +58,7 @@ pub fn evaluate(frame: &FrameContext) -> Vec<Finding> {
 /// Where in view our pose error displaces positions most, of the middle and the four edges, and by how much, m.
 fn worst_displacement(frame: &FrameContext) -> (Vector2<f64>, Vector2<f64>) {
     let pose = frame.pose.displacement();
-    let camera = frame.camera;
+    let camera = &frame.camera;
     let [w, h] = [&camera.x, &camera.y].map(|axis| axis.half_width() * camera.ground_scale());
     [[0.0, 0.0], [w, 0.0], [-w, 0.0], [0.0, h], [0.0, -h]]
         .map(|[x, y]| Vector2::new(x, y))
@@ -92,7 +95,7 @@ mod tests {
         });
         scene.pose = PoseConsensus::default();
         scene.pose.update(&beams, &witnesses, 0.1, 1.0);
-        let findings = evaluate(&scene.context());
+        let findings = evaluate(scene.context());
         scene.apply(findings.clone());
         findings
     }

@@ -10,14 +10,15 @@ use crate::claims::seconds;
 use crate::monitor::alert::{SAME_PLACE_M, Severity};
 use crate::monitor::alert_lifecycle::AlertLifecycle;
 use crate::monitor::evidence::stranger_likelihood_ratio;
-use crate::monitor::finding::{Cause, Content, Finding};
+use crate::monitor::finding::{Cause, Content, Finding, is_renamed};
 use crate::monitor::frame_context::FrameContext;
-use crate::monitor::stats::error_budget::{ErrorBudget, TestFamily};
+use crate::monitor::stats::error_budget::TestFamily;
 use crate::monitor::stats::robust::median_high;
-use crate::monitor::track::association::Association;
-use crate::monitor::track::tracker::{Track, Tracker};
+use crate::monitor::track::beam_track::Track;
+use crate::monitor::track::detection::view_m2;
 
-/// Resolutions of a spot within which the beam that an alert was about and the one that now has no claim are the same two.
+/// Resolutions of a spot within which the beam that an alert was about and the one that now has no claim are the same two. Larger
+/// moves an alert to a beam that has nothing to do with it, smaller raises a second one for the same two beams. Not measured.
 const SWAP_RESOLUTIONS: f64 = 2.0;
 /// Absences of an honest user, one an hour: what a user's absence at the same moment is by chance. Assumed; evidence only.
 const ABSENCE_PERIOD_S: f64 = 3600.0;
@@ -26,21 +27,16 @@ const ABSENCE_PERIOD_S: f64 = 3600.0;
 #[derive(Debug, Default)]
 pub struct Memory(BTreeMap<u64, Timestamp>);
 
-/// Threshold on a track's score.
-pub fn threshold(budget: &ErrorBudget) -> f64 {
-    budget.threshold(TestFamily::Unclaimed, 1.0)
-}
-
 impl Memory {
     /// Takes a frame's association. A track whose measurement merged into another's starts to be without a claim when the two
     /// are resolved.
-    pub fn update(&mut self, tracker: &Tracker, association: &Association, now: Timestamp) {
-        self.0.retain(|id, _| tracker.get(*id).is_some());
-        for track in &tracker.tracks {
-            if association.contains(track.id) {
+    pub fn update(&mut self, frame: &FrameContext) {
+        self.0.retain(|id, _| frame.tracker.get(*id).is_some());
+        for track in &frame.tracker.tracks {
+            if frame.association.contains(track.id) {
                 self.0.remove(&track.id);
             } else if track.hit && track.unresolved_from.is_none() {
-                self.0.entry(track.id).or_insert(now);
+                self.0.entry(track.id).or_insert(frame.now);
             }
         }
     }
@@ -85,7 +81,6 @@ pub fn evaluate(frame: &FrameContext, memory: &mut Memory) -> Vec<Finding> {
         })
         .collect();
     let before = alerted.clone();
-    let mut moved: BTreeSet<Cause> = BTreeSet::new();
     for track in &frame.tracker.tracks {
         let Some(since) = memory.0.get(&track.id).copied() else {
             continue;
@@ -94,15 +89,12 @@ pub fn evaluate(frame: &FrameContext, memory: &mut Memory) -> Vec<Finding> {
             if !is_due(frame, track, since) {
                 continue;
             }
-            if let Some(old) = lost_alert_near(frame, memory, track, &moved) {
-                if let Cause::Track(id) = old {
+            if let Some(from) = lost_alert_near(frame, memory, track, &findings) {
+                if let Cause::Track(id) = from {
                     alerted.remove(&id);
                 }
-                findings.push(Finding::Renamed {
-                    from: old.clone(),
-                    to: Cause::Track(track.id),
-                });
-                moved.insert(old);
+                let to = Cause::Track(track.id);
+                findings.push(Finding::Renamed { from, to });
             }
             alerted.insert(track.id);
         }
@@ -111,25 +103,27 @@ pub fn evaluate(frame: &FrameContext, memory: &mut Memory) -> Vec<Finding> {
         }
     }
     for id in before {
-        let is_moved = moved.contains(&Cause::Track(id));
+        let from = Cause::Track(id);
         let is_there = frame.tracker.get(id).is_some_and(Track::is_seen) && memory.0.contains_key(&id);
-        if is_moved || is_there {
+        if is_there || is_renamed(&findings, &from) {
             continue;
         }
-        match swapped_with(frame, id, &alerted) {
-            Some(other) => {
-                memory.0.insert(other, frame.now);
-                alerted.remove(&id);
-                alerted.insert(other);
-                findings.push(Finding::Renamed {
-                    from: Cause::Track(id),
-                    to: Cause::Track(other),
-                });
-            }
-            None => findings.push(Finding::Absent(Cause::Track(id))),
-        }
+        let Some(other) = swapped_with(frame, id, &alerted) else {
+            findings.push(Finding::Absent(from));
+            continue;
+        };
+        memory.0.insert(other, frame.now);
+        alerted.remove(&id);
+        alerted.insert(other);
+        let to = Cause::Track(other);
+        findings.push(Finding::Renamed { from, to });
     }
     findings
+}
+
+/// Threshold on a track's score.
+fn threshold(frame: &FrameContext) -> f64 {
+    frame.budget.threshold(TestFamily::Unclaimed, 1.0)
 }
 
 /// Whether a beam that has had no claim since then is an emitter, and claims have had time to come.
@@ -138,7 +132,7 @@ fn is_due(frame: &FrameContext, track: &Track, since: Timestamp) -> bool {
         && track.hit
         && track.unresolved_from.is_none()
         && track.confirmed
-        && track.score >= threshold(frame.budget)
+        && track.score >= threshold(frame)
         && seconds(since, frame.now) >= frame.claim_wait_s()
 }
 
@@ -156,10 +150,10 @@ fn swapped_with(frame: &FrameContext, id: u64, alerted: &BTreeSet<u64>) -> Optio
         .map(|t| t.id)
 }
 
-/// An open alert near here, not `moved` yet, whose own track was lost or is associated with a claim by now: the same cause.
-fn lost_alert_near(frame: &FrameContext, memory: &Memory, track: &Track, moved: &BTreeSet<Cause>) -> Option<Cause> {
+/// An open alert near here, not renamed by `findings` yet, whose own track was lost or is associated with a claim by now: the same cause.
+fn lost_alert_near(frame: &FrameContext, memory: &Memory, track: &Track, findings: &[Finding]) -> Option<Cause> {
     let here = track.filter.position();
-    let mut open = frame.alerts.open().filter(|(cause, _)| !moved.contains(cause));
+    let mut open = frame.alerts.open().filter(|(cause, _)| !is_renamed(findings, cause));
     open.find_map(|(cause, alert)| {
         let is_lost = match cause {
             Cause::Track(id) => !memory.0.contains_key(id) || frame.tracker.get(*id).is_none_or(|t| !t.hit),
@@ -179,7 +173,7 @@ fn content(frame: &FrameContext, track: &Track, since: Timestamp) -> Content {
         "seen_since": track.since,
         "unclaimed_s": lasted_s,
         "log_likelihood_ratio": track.score,
-        "threshold": threshold(frame.budget),
+        "threshold": threshold(frame),
         "energy_j": track.detection.energy_j,
         "energy_against_users": energy_against_users(frame, track),
         "nearest_user": nearest_user(frame, track),
@@ -198,10 +192,9 @@ fn nearest_user(frame: &FrameContext, track: &Track) -> Option<Value> {
         .filter(|a| !a.ended)
         .map(|a| (a, (a.position - here).norm()))
         .min_by(|a, b| a.1.total_cmp(&b.1))?;
-    let camera = frame.camera;
-    let [width, height] = [camera.x.half_width(), camera.y.half_width()].map(|h| 2.0 * h * camera.ground_scale());
     let spot = frame.overlap_m();
-    let by_chance = (std::f64::consts::PI * spot * spot * frame.claims.len() as f64 / (width * height)).min(1.0);
+    let by_chance = std::f64::consts::PI * spot * spot * frame.claims.len() as f64 / view_m2(&frame.camera);
+    let by_chance = by_chance.min(1.0);
     Some(json!({
         "user": claim.claim.user,
         "distance_m": distance,
@@ -238,6 +231,7 @@ fn energy_against_users(frame: &FrameContext, track: &Track) -> Option<Value> {
 mod tests {
     use super::*;
     use crate::monitor::fixture::{Scene, absent, present};
+    use crate::monitor::track::association::Association;
 
     const USER: [f64; 2] = [0.0, 0.0];
 
@@ -257,14 +251,8 @@ mod tests {
 
         fn show(&mut self, places: &[[f64; 2]]) -> Vec<Finding> {
             self.scene.show(places);
-            let Scene {
-                tracker,
-                association,
-                now,
-                ..
-            } = &self.scene;
-            self.memory.update(tracker, association, *now);
-            let findings = evaluate(&self.scene.context(), &mut self.memory);
+            self.memory.update(self.scene.context());
+            let findings = evaluate(self.scene.context(), &mut self.memory);
             self.scene.apply(findings.clone());
             findings
         }
@@ -331,14 +319,8 @@ mod tests {
         watch.intrude(3.0);
         watch.scene.association = Association::none(1);
         watch.scene.association.assign(0, 2);
-        let Scene {
-            tracker,
-            association,
-            now,
-            ..
-        } = &watch.scene;
-        watch.memory.update(tracker, association, *now);
-        let findings = evaluate(&watch.scene.context(), &mut watch.memory);
+        watch.memory.update(watch.scene.context());
+        let findings = evaluate(watch.scene.context(), &mut watch.memory);
         let [Finding::Renamed { from, to }] = &findings[..] else {
             panic!("{findings:?}");
         };
@@ -351,19 +333,13 @@ mod tests {
         let since = watch.scene.now + jiff::SignedDuration::from_millis(100);
         for k in 0..8 {
             watch.scene.show(&[USER, [40.0, 0.0]]);
-            let Scene {
-                tracker,
-                association,
-                now,
-                ..
-            } = &watch.scene;
-            watch.memory.update(tracker, association, *now);
-            let due = watch.memory.due(&watch.scene.context());
+            watch.memory.update(watch.scene.context());
+            let due = watch.memory.due(watch.scene.context());
             assert_eq!(due, if k < 7 { vec![] } else { vec![(2, since)] });
         }
         assert_eq!(watch.memory.undecided(&watch.scene.alerts), [since]);
         watch.memory.remove(2);
-        assert!(evaluate(&watch.scene.context(), &mut watch.memory).is_empty());
+        assert!(evaluate(watch.scene.context(), &mut watch.memory).is_empty());
         assert!(watch.memory.undecided(&watch.scene.alerts).is_empty());
     }
 }

@@ -10,8 +10,8 @@ use crate::monitor::finding::{Cause, Content, Finding};
 use crate::monitor::frame_context::FrameContext;
 use crate::monitor::input::claim_state::ActiveClaim;
 use crate::monitor::stats::error_budget::TestFamily;
-use crate::monitor::track::association::COINCIDENCE_S;
 use crate::monitor::track::user_track::UserTrack;
+use crate::monitor::track::user_tracks::COINCIDENCE_S;
 
 /// Users never seen at all who have an alert each; more of them within a cool-down share one, since they have one cause. More bury
 /// other alerts under a flood of invented users, fewer deny a new user's absence an alert of its own.
@@ -42,7 +42,7 @@ pub fn evaluate(frame: &FrameContext, memory: &mut Memory, undecided: &[Timestam
     let mut findings = Vec::new();
     let mut never_seen = NeverSeen::default();
     let mut raised: Vec<&str> = Vec::new();
-    for claim in frame.claims {
+    for claim in &frame.claims {
         let user = claim.claim.user.as_str();
         let is_open = open.contains(user);
         let Some((known, gone_s)) = absence(frame, claim, threshold, is_open, undecided) else {
@@ -83,7 +83,7 @@ pub fn evaluate(frame: &FrameContext, memory: &mut Memory, undecided: &[Timestam
 
 /// The user's track and for how long it has been gone, if they are unseen.
 fn absence<'a>(
-    frame: &FrameContext<'a>,
+    frame: &'a FrameContext,
     claim: &ActiveClaim,
     threshold: f64,
     is_open: bool,
@@ -153,10 +153,10 @@ mod tests {
     /// A frame 0.1 s later, with claims of its time and beams at these places.
     fn show(scene: &mut Scene, memory: &mut Memory, places: &[[f64; 2]], undecided: &[Timestamp]) -> Vec<Finding> {
         scene.show(places);
-        for claim in &mut scene.claims {
-            claim.claim.time = scene.now;
+        for claim in &mut scene.frame.claims {
+            claim.claim.time = scene.frame.now;
         }
-        let findings = evaluate(&scene.context(), memory, undecided);
+        let findings = evaluate(scene.context(), memory, undecided);
         scene.apply(findings.clone());
         findings
     }
@@ -182,7 +182,7 @@ mod tests {
         let mut scene = Scene::of_users(&[[0.0, 0.0]]);
         for _ in 0..30 {
             scene.show(&[]);
-            assert!(evaluate(&scene.context(), &mut Memory::default(), &[]).is_empty());
+            assert!(evaluate(scene.context(), &mut Memory::default(), &[]).is_empty());
         }
     }
 
@@ -202,7 +202,7 @@ mod tests {
     fn of_many_who_were_never_seen_ten_have_an_alert_and_the_rest_share_one() {
         let mut scene = Scene::of_users(&[]);
         let places: Vec<[f64; 2]> = (0..12).map(|k| [-60.0 + 10.0 * f64::from(k), 0.0]).collect();
-        scene.claims = Scene::of_users(&places).claims;
+        scene.claims = Scene::of_users(&places).frame.claims;
         scene.claims.sort_by(|a, b| a.claim.user.cmp(&b.claim.user));
         let mut memory = Memory::default();
         let mut findings = Vec::new();
@@ -223,7 +223,7 @@ mod tests {
     #[test]
     fn a_user_who_was_seen_has_an_alert_however_many_were_not() {
         let mut scene = Scene::of_users(&[[0.0, 80.0]]);
-        let mut others = Scene::of_users(&[[0.0, 0.0]; 12]).claims;
+        let mut others = Scene::of_users(&[[0.0, 0.0]; 12]).frame.claims;
         for (k, claim) in others.iter_mut().enumerate() {
             claim.claim.user = format!("a-{k:02}");
         }

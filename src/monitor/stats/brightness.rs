@@ -3,10 +3,8 @@
 use jiff::Timestamp;
 
 use super::block_history::{BLOCK_FRAMES, BlockHistory, MIN_DRIFT_BLOCKS, Recent};
+use super::window_excess::{WINDOWS, WindowExcess, most_significant};
 
-/// Windows of newest frames that are tested. Short ones find a strong second beam soon, long ones a weak one late; they share
-/// data, and no correction is made for their number (the soaks of docs/verdicts.md hold the rate of false alerts).
-pub const WINDOWS: [usize; 4] = [10, 20, 40, 80];
 /// Blocks of past before a beam has a history to be compared with: two leave one degree of freedom for its scatter.
 const MIN_BLOCKS: usize = 2;
 /// Variance of a beam's slow drift in units of a block mean's variance, until blocks show it. Larger delays the first verdict
@@ -38,13 +36,6 @@ struct Variance {
 pub struct Scatter {
     pub squares: f64,
     pub freedom: f64,
-}
-
-/// Ratio of the newest mean energy to the past's, and −ln p of it.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Brightening {
-    pub ratio: f64,
-    pub neg_log_p: f64,
 }
 
 impl Variance {
@@ -124,22 +115,14 @@ impl Brightness {
 
     /// The most significant of all windows. A rise of `allowed` in ln energy is no evidence; `all_beams` is the scatter of every
     /// beam's blocks.
-    pub fn most_significant(&self, allowed: f64, all_beams: Scatter) -> Brightening {
-        let mut most = Brightening::default();
-        for n in WINDOWS {
-            if let Some(found) = self.test(n, allowed, all_beams)
-                && found.neg_log_p >= most.neg_log_p
-            {
-                most = found;
-            }
-        }
-        most
+    pub fn most_significant(&self, allowed: f64, all_beams: Scatter) -> WindowExcess {
+        most_significant(|n| self.test(n, allowed, all_beams))
     }
 
     /// Student's test of the mean ln energy of the newest `n` frames against the past. The past's blocks scatter by more than
     /// its frames explain where light drifts slowly: a random effect of variance τ², which no window averages out. The tail
     /// of t falls as (1 + t²/ν)^(−(ν+1)/2), with ν from Satterthwaite (1946): a few blocks of history prove little.
-    pub fn test(&self, n: usize, allowed: f64, all_beams: Scatter) -> Option<Brightening> {
+    pub fn test(&self, n: usize, allowed: f64, all_beams: Scatter) -> Option<WindowExcess> {
         if self.recent.len() < n {
             return None;
         }
@@ -164,7 +147,7 @@ impl Brightness {
         let freedom = variance * variance / (slow * slow / drift_freedom + fast * fast / frames_freedom);
         let rise = self.recent.mean_of_newest(n) - past;
         let t = (rise - allowed).max(0.0) / variance.sqrt();
-        Some(Brightening {
+        Some(WindowExcess {
             ratio: rise.exp(),
             neg_log_p: 0.5 * (freedom + 1.0) * (t * t / freedom).ln_1p(),
         })

@@ -1,15 +1,11 @@
 //! Whether one spot is two beams: brightness, jitter, a step aside and width, combined into one −ln p.
 
-use jiff::Timestamp;
-
-use super::brightness::{Brightness, Scatter, WINDOWS};
+use super::brightness::{Brightness, Scatter};
 use super::gaussian::neg_log_p_of_sum;
-use super::jitter::{Jitter, SecondDifference};
-use super::second_moment::{CommonMode, SecondMomentScore, SecondMomentTest};
+use super::jitter::Jitter;
+use super::second_moment::{CommonMode, SecondMomentTest, Widening};
 use super::step_change::{StepDetector, StepEvidence};
-
-/// Frames since a step from which brightness and jitter since then are tested.
-const MIN_FRAMES_AFTER: usize = 3;
+use super::window_excess::{WINDOWS, WindowExcess, of_frames};
 
 /// What is remembered of one spot. Two beams too near to be resolved show one spot at their centre of light; they fade
 /// independently, so that the spot is brighter than before and wanders between the two from frame to frame; and it is
@@ -37,18 +33,15 @@ pub struct OtherBeams {
 #[derive(Clone, Copy, Debug, Default)]
 pub struct CoLocationEvidence {
     /// Mean energy of the newest frames over the past.
-    pub energy_ratio: f64,
-    pub energy_neg_log_p: f64,
+    pub energy: WindowExcess,
     /// Jitter from frame to frame over what is expected.
-    pub jitter_ratio: f64,
-    pub jitter_neg_log_p: f64,
+    pub jitter: WindowExcess,
     pub step: StepEvidence,
-    /// Of brightness and jitter since the step.
-    pub energy_neg_log_p_since: f64,
-    pub jitter_neg_log_p_since: f64,
-    /// Second moment beyond one spot's, σ².
-    pub widening: f64,
-    pub width_neg_log_p: f64,
+    /// Energy and jitter since the step.
+    pub energy_since: WindowExcess,
+    pub jitter_since: WindowExcess,
+    /// Second moments beyond one spot's.
+    pub width: Widening,
 }
 
 impl CoLocationEvidence {
@@ -56,12 +49,9 @@ impl CoLocationEvidence {
     /// chance of a false alert. Two beams on top of each other have the shape of one; one that was there from the start made
     /// no step.
     pub fn neg_log_p(&self) -> f64 {
-        let (energy, jitter, width) = (self.energy_neg_log_p, self.jitter_neg_log_p, self.width_neg_log_p);
-        let (step, energy_since, jitter_since) = (
-            self.step.neg_log_p,
-            self.energy_neg_log_p_since,
-            self.jitter_neg_log_p_since,
-        );
+        let (energy, jitter, width) = (self.energy.neg_log_p, self.jitter.neg_log_p, self.width.neg_log_p);
+        let step = self.step.neg_log_p;
+        let (energy_since, jitter_since) = (self.energy_since.neg_log_p, self.jitter_since.neg_log_p);
         let sums = [
             (0.6, neg_log_p_of_sum(&[energy, jitter])),
             (0.05, neg_log_p_of_sum(&[energy, jitter, width])),
@@ -88,41 +78,22 @@ impl CoLocationTest {
         self.brightness.frames() >= WINDOWS[2]
     }
 
-    /// Takes a frame's ln energy and second moments. With `learn` what grows old is added to the past.
-    pub fn push_light(&mut self, time: Timestamp, ln_energy: f64, moments: &SecondMomentScore, learn: bool) {
-        self.second_moment.push(moments, learn);
-        self.brightness.push(time, ln_energy, learn);
-    }
-
-    /// Takes a frame's second difference, less what all beams have in common.
-    pub fn push_jitter(&mut self, difference: SecondDifference, learn: bool) {
-        self.jitter.push(difference, learn);
-    }
-
     /// A beam may honestly become brighter by the factor `brightening`: it is pointed a little better.
     pub fn evaluate(&self, brightening: f64, others: &OtherBeams) -> CoLocationEvidence {
         let allowed = brightening.ln() + others.rise.unwrap_or(0.0).max(0.0);
-        let brighter = self.brightness.most_significant(allowed, others.scatter);
-        let jitter = self.jitter.most_significant(others.jitter);
         let step = self.steps.most_significant().unwrap_or_default();
-        let wider = self.second_moment.most_significant(&others.second_moment);
         let mut evidence = CoLocationEvidence {
-            energy_ratio: brighter.ratio,
-            energy_neg_log_p: brighter.neg_log_p,
-            jitter_ratio: jitter.ratio,
-            jitter_neg_log_p: jitter.neg_log_p,
+            energy: self.brightness.most_significant(allowed, others.scatter),
+            jitter: self.jitter.most_significant(others.jitter),
             step,
-            widening: wider.trace,
-            width_neg_log_p: wider.neg_log_p,
+            width: self.second_moment.most_significant(&others.second_moment),
             ..CoLocationEvidence::default()
         };
         if let Some(since) = step.since {
-            let enough = |n: usize| (n >= MIN_FRAMES_AFTER).then_some(n);
-            let energy = enough(self.brightness.frames_since(since))
-                .and_then(|n| self.brightness.test(n, allowed, others.scatter));
-            let jitter = enough(self.jitter.frames_since(since)).and_then(|n| self.jitter.test(n, others.jitter));
-            evidence.energy_neg_log_p_since = energy.map_or(0.0, |e| e.neg_log_p);
-            evidence.jitter_neg_log_p_since = jitter.map_or(0.0, |j| j.neg_log_p);
+            evidence.energy_since = of_frames(self.brightness.frames_since(since), |n| {
+                self.brightness.test(n, allowed, others.scatter)
+            });
+            evidence.jitter_since = of_frames(self.jitter.frames_since(since), |n| self.jitter.test(n, others.jitter));
         }
         evidence
     }
@@ -130,7 +101,13 @@ impl CoLocationTest {
 
 #[cfg(test)]
 mod tests {
+    use jiff::Timestamp;
+
     use super::*;
+
+    fn excess(neg_log_p: f64) -> WindowExcess {
+        WindowExcess { ratio: 2.0, neg_log_p }
+    }
 
     #[test]
     fn no_evidence_is_no_second_beam() {
@@ -142,8 +119,8 @@ mod tests {
     #[test]
     fn brightness_and_jitter_have_six_tenths_of_the_budget() {
         let evidence = CoLocationEvidence {
-            energy_neg_log_p: 10.0,
-            jitter_neg_log_p: 10.0,
+            energy: excess(10.0),
+            jitter: excess(10.0),
             ..CoLocationEvidence::default()
         };
         // Erlang of two: 20 − ln 21; and ln 0.6 for the share.
@@ -158,7 +135,7 @@ mod tests {
                 neg_log_p: 15.0,
                 since: Some(Timestamp::UNIX_EPOCH),
             },
-            energy_neg_log_p_since: 8.0,
+            energy_since: excess(8.0),
             ..CoLocationEvidence::default()
         };
         assert!((evidence.neg_log_p() - (23.0 - 24f64.ln() + 0.25f64.ln())).abs() < 1e-12);
@@ -170,17 +147,38 @@ mod tests {
         for k in 0..40 {
             assert!(!test.has_verdict());
             let time = Timestamp::from_millisecond(100 * k).unwrap();
-            test.push_light(time, -5.0 + 2f64.ln(), &SecondMomentScore::default(), false);
+            test.brightness.push(time, -5.0 + 2f64.ln(), false);
         }
         assert!(test.has_verdict());
         let evidence = test.evaluate(1.35, &OtherBeams::default());
-        assert!((evidence.energy_ratio - 2.0).abs() < 1e-9);
-        assert!(evidence.energy_neg_log_p > 15.0, "{evidence:?}");
+        assert!((evidence.energy.ratio - 2.0).abs() < 1e-9);
+        assert!(evidence.energy.neg_log_p > 15.0, "{evidence:?}");
         // Not if the others became as much brighter.
         let others = OtherBeams {
             rise: Some(2f64.ln()),
             ..OtherBeams::default()
         };
-        assert_eq!(test.evaluate(1.35, &others).energy_neg_log_p, 0.0);
+        assert_eq!(test.evaluate(1.35, &others).energy.neg_log_p, 0.0);
+    }
+
+    #[test]
+    fn light_and_jitter_since_a_step_are_tested_from_three_frames_on() {
+        // 30 past frames of noise show how steps scatter; then the centre steps aside by a metre and the spot becomes brighter.
+        let mut test = CoLocationTest::remembered(0.0, 0.3);
+        let at = |k: i64| Timestamp::from_millisecond(100 * k).unwrap();
+        let mut since = Vec::new();
+        for k in 0..70 {
+            let is_joined = k >= 60;
+            let place = nalgebra::Vector2::new(0.01 * f64::from(k as i32 % 3), f64::from(u8::from(is_joined)));
+            let tried = test.steps.candidates(at(k), place, 1e-2);
+            test.steps.push(&tried, &Default::default(), true);
+            test.brightness.push(at(k), if is_joined { 1.0 } else { 0.0 }, true);
+            let evidence = test.evaluate(1.35, &OtherBeams::default());
+            if is_joined && evidence.step.since == Some(at(60)) {
+                since.push((k, evidence.energy_since.neg_log_p > 0.0));
+            }
+        }
+        // Three frames after the step show it, and the light of those three is tested.
+        assert_eq!(since.first(), Some(&(62, true)), "{since:?}");
     }
 }

@@ -51,6 +51,14 @@ impl ErrorBudget {
         }
     }
 
+    /// The same frame rate with other settings.
+    pub fn reconfigured(self, config: &Config) -> Self {
+        Self {
+            allowed_per_month: config.false_alerts_per_month,
+            ..self
+        }
+    }
+
     /// ln(1/α) for each of `tests` like tests in every frame: Bonferroni's share of the family's false alerts.
     pub fn threshold(&self, family: TestFamily, tests: f64) -> f64 {
         self.threshold_at(self.rate_hz, family, tests)

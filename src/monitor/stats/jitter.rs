@@ -6,8 +6,8 @@ use jiff::Timestamp;
 use nalgebra::{Matrix2, Vector2};
 
 use super::block_history::{BLOCK_FRAMES, MAX_BLOCKS, Recent};
-use super::brightness::WINDOWS;
 use super::gaussian::mahalanobis2;
+use super::window_excess::{WINDOWS, WindowExcess, most_significant};
 use crate::claims::seconds;
 
 /// Accelerations of honest users, r.m.s., m/s²: half a g is a hard brake. Larger hides a second beam, smaller takes a brake for
@@ -20,9 +20,11 @@ const MAX_FRAME: f64 = 8.0;
 const OWN_RATIO: f64 = 1.5;
 /// Jitter allowed over the other beams' median where a beam has no past. Not measured.
 const OTHERS_RATIO: f64 = 4.0;
-/// Smallest mean jitter that a ratio is taken to; white noise of the stated covariance has 1.
+/// Smallest mean jitter that a ratio is taken to; white noise of the stated covariance has 1. Smaller lets a beam of exact
+/// positions be alerted for little, larger hides one that shakes. Not measured.
 const MIN_MEAN: f64 = 0.5;
-/// Frames of past from which a beam's own jitter is known.
+/// Frames of past from which a beam's own jitter is known. More delay a beam's own comparison, fewer take it from noise: 60
+/// second differences give a mean to 18 %.
 const MIN_PAST: u32 = 2 * BLOCK_FRAMES;
 /// Squared sums of second differences of white noise scatter as if only this share of them were independent:
 /// 1/(1 + 2(ρ₁² + ρ₂²)), ρ₁ = −2/3, ρ₂ = 1/6.
@@ -48,13 +50,6 @@ pub struct Jitter {
     recent: Recent<(Timestamp, f64)>,
     past_mean: f64,
     past_frames: u32,
-}
-
-/// Mean jitter over what is expected, and −ln p of it.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct JitterExcess {
-    pub ratio: f64,
-    pub neg_log_p: f64,
 }
 
 impl SecondDifference {
@@ -118,20 +113,12 @@ impl Jitter {
     }
 
     /// The most significant of all windows; `others` is the median jitter of the other beams.
-    pub fn most_significant(&self, others: Option<f64>) -> JitterExcess {
-        let mut most = JitterExcess::default();
-        for n in WINDOWS {
-            if let Some(found) = self.test(n, others)
-                && found.neg_log_p >= most.neg_log_p
-            {
-                most = found;
-            }
-        }
-        most
+    pub fn most_significant(&self, others: Option<f64>) -> WindowExcess {
+        most_significant(|n| self.test(n, others))
     }
 
     /// Chernoff's bound on the mean of k independent χ² of two degrees, halved: P(mean ≥ r) ≤ exp(−k(r − 1 − ln r)).
-    pub fn test(&self, n: usize, others: Option<f64>) -> Option<JitterExcess> {
+    pub fn test(&self, n: usize, others: Option<f64>) -> Option<WindowExcess> {
         if self.recent.len() < n {
             return None;
         }
@@ -150,7 +137,7 @@ impl Jitter {
         } else {
             0.0
         };
-        Some(JitterExcess { ratio, neg_log_p })
+        Some(WindowExcess { ratio, neg_log_p })
     }
 }
 

@@ -7,6 +7,8 @@ pub(super) mod co_location;
 pub(super) mod error_budget;
 pub(super) mod gaussian;
 pub(super) mod jitter;
+pub(super) mod moment_score;
 pub(super) mod robust;
 pub(super) mod second_moment;
 pub(super) mod step_change;
+pub(super) mod window_excess;

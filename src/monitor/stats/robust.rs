@@ -2,22 +2,17 @@
 
 use nalgebra::Vector2;
 
-use crate::stats;
-
 /// The median; of an even number of values the mean of the two in the middle. `None` of none.
 pub fn median(values: impl Iterator<Item = f64>) -> Option<f64> {
     let values = sorted(values);
-    let n = values.len();
-    match n {
-        0 => None,
-        _ if n % 2 == 1 => Some(values[n / 2]),
-        _ => Some(0.5 * (values[n / 2 - 1] + values[n / 2])),
-    }
+    let upper = values.get(values.len() / 2)?;
+    Some(0.5 * (values[(values.len() - 1) / 2] + upper))
 }
 
 /// The median; of an even number of values the upper of the two in the middle, so that it is always one of them.
 pub fn median_high(values: impl Iterator<Item = f64>) -> Option<f64> {
-    stats::median(values.collect())
+    let values = sorted(values);
+    values.get(values.len() / 2).copied()
 }
 
 /// The value below which nine tenths of all values lie. `None` of none.
@@ -30,6 +25,16 @@ pub fn ninth_decile(values: impl Iterator<Item = f64>) -> Option<f64> {
 pub fn median_vector(values: impl Iterator<Item = Vector2<f64>> + Clone) -> Vector2<f64> {
     let axis = |k: usize| median(values.clone().map(|v| v[k])).unwrap_or(0.0);
     Vector2::new(axis(0), axis(1))
+}
+
+/// What displacements have in common: their component-wise upper median where there are more than `others`, else nothing.
+pub fn common_displacement(others: usize, displacements: impl Iterator<Item = Vector2<f64>>) -> Vector2<f64> {
+    let known: Vec<_> = displacements.collect();
+    let axis = |k: usize| median_high(known.iter().map(|d| d[k])).unwrap_or(0.0);
+    match known.len() > others {
+        true => Vector2::new(axis(0), axis(1)),
+        false => Vector2::zeros(),
+    }
 }
 
 fn sorted(values: impl Iterator<Item = f64>) -> Vec<f64> {
@@ -70,5 +75,11 @@ mod tests {
         let values = [[0.0, 5.0], [1.0, 3.0], [9.0, 4.0]].map(Vector2::from);
         assert_eq!(median_vector(values.into_iter()), Vector2::new(1.0, 4.0));
         assert_eq!(median_vector(std::iter::empty()), Vector2::zeros());
+    }
+
+    #[test]
+    fn what_is_common_needs_more_than_two() {
+        let of = |xs: &[f64]| common_displacement(2, xs.iter().map(|x| Vector2::new(*x, 0.0))).x;
+        assert_eq!((of(&[1.0, 1.0]), of(&[1.0, 5.0, 2.0])), (0.0, 2.0));
     }
 }

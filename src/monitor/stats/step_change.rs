@@ -16,6 +16,7 @@ const KEPT: usize = BEFORE + AFTER[AFTER.len() - 1];
 /// Frames farther apart than this make no line, s: a user brakes or turns in between.
 const LONGEST_GAP_S: f64 = 0.5;
 /// Past steps that the scatter is estimated from: none is evidence before the first number, none older than the second counts.
+/// More know the scatter better, fewer begin sooner and follow the air. Not measured.
 const SCATTER: [usize; 2] = [30, 120];
 /// Frames for which a step is remembered; the energy and jitter since then add to its evidence. Longer keeps one odd frame
 /// as evidence for longer.

@@ -3,7 +3,7 @@
 use nalgebra::{Matrix2, Vector2};
 
 use crate::estimate::{Emitter, Estimate, Flags};
-use crate::monitor::stats::second_moment::SecondMomentScore;
+use crate::monitor::stats::moment_score::MomentScore;
 use crate::optics::Camera;
 
 /// Standard deviation that a fit's covariance leaves out (calibration, pixel gains), m. Larger loosens every gate, smaller makes
@@ -21,7 +21,7 @@ pub struct Detection {
     pub cov: Matrix2<f64>,
     pub energy_j: f64,
     pub flags: Flags,
-    pub moments: SecondMomentScore,
+    pub moments: MomentScore,
     /// Signal-to-noise ratio, less what the frame's misfit takes from it.
     pub snr: f64,
     /// Distance within which a second emitter of like energy cannot be resolved, m.
@@ -65,7 +65,7 @@ impl Detection {
             cov,
             energy_j: e.energy_j,
             flags: e.flags,
-            moments: SecondMomentScore::of(&e.second_moment, inflation),
+            moments: MomentScore::of(&e.second_moment, inflation),
             snr: snr(camera, e.energy_j) / inflation.sqrt(),
             resolution_m: resolution_m(camera, snr(camera, e.energy_j)),
             clutter_probability: 0.0,
@@ -94,7 +94,7 @@ impl Detection {
             position,
             cov: Matrix2::identity() * variance,
             energy_j,
-            moments: SecondMomentScore::of_spread(spread.sum(), snr),
+            moments: MomentScore::of_spread(spread.sum(), snr),
             snr,
             ..self.clone()
         }
@@ -109,6 +109,12 @@ impl Detection {
 /// σ of a spot on the ground, m.
 pub fn spot_m(camera: &Camera) -> f64 {
     camera.spot_sigma_m * camera.ground_scale()
+}
+
+/// Area of the view on the ground, m².
+pub fn view_m2(camera: &Camera) -> f64 {
+    let [width, height] = [camera.x.half_width(), camera.y.half_width()].map(|h| 2.0 * h * camera.ground_scale());
+    width * height
 }
 
 /// Signal-to-noise ratio of the matched filter for a spot wider than a pixel: A·pitch/(2√π·σ·σ_n).
@@ -165,7 +171,7 @@ pub mod fixture {
             cov: Matrix2::identity() * 0.01,
             energy_j: 1.0,
             flags: Flags::empty(),
-            moments: SecondMomentScore::default(),
+            moments: MomentScore::default(),
             snr: 100.0,
             resolution_m: 2.0,
             clutter_probability: 1e-4,

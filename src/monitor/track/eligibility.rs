@@ -4,31 +4,40 @@
 use jiff::Timestamp;
 use nalgebra::Vector2;
 
-use super::tracker::Track;
+use super::beam_track::Track;
 use crate::claims::{Store, seconds};
+use crate::monitor::alert::AlertKind;
 use crate::monitor::alert_lifecycle::AlertLifecycle;
+use crate::monitor::config::Config;
 use crate::monitor::finding::Cause;
-use crate::monitor::input::claim_state::ActiveClaim;
+use crate::monitor::input::claim_state::{ActiveClaim, CLAIM_LIFE_S};
+use crate::monitor::input::claim_timing::ClaimTiming;
 use crate::monitor::input::crowding::Crowding;
 
 /// Share of the tolerated distance by which a claim that stays where it is may move: half of it is the error of an honest claim.
 const STAYS: f64 = 0.5;
+/// Claim periods for which a claim may be associated with a new beam, where they are longer than `claims_stale_s`: one or two
+/// claims lost are no silence.
+const FRESH_PERIODS: f64 = 5.0;
 
 /// What decides on it.
 #[derive(Clone, Copy)]
 pub struct Eligibility<'a> {
     /// The newest time so far.
     pub now: Option<Timestamp>,
+    pub config: &'a Config,
+    pub timing: &'a ClaimTiming,
     pub crowding: Crowding,
     pub alerts: &'a AlertLifecycle,
     pub store: &'a Store,
-    pub decision_s: f64,
-    pub tolerated_m: f64,
 }
 
 impl Eligibility<'_> {
     /// `owner` is the claim that the track was associated with in the frame before.
     pub fn allows(&self, claim: &ActiveClaim, track: &Track, owner: Option<&ActiveClaim>) -> bool {
+        if claim.before.track != Some(track.id) && claim.age_s > self.freshness_s(claim) {
+            return false;
+        }
         if claim.before.is_established() {
             return true;
         }
@@ -43,6 +52,21 @@ impl Eligibility<'_> {
         !is_alerted && !is_anothers && (beam - claim.position).norm() <= self.crowding.reach_m()
     }
 
+    /// Age up to which a claim may be associated with a beam that was not its user's before, s: the longer a user is silent, the
+    /// wider the ground on which a stranger could appear under their name. While the whole log is silent, old claims are all there
+    /// are.
+    fn freshness_s(&self, claim: &ActiveClaim) -> f64 {
+        if self.alerts.is_open(&Cause::System(AlertKind::ClaimsStale)) {
+            return CLAIM_LIFE_S;
+        }
+        let typical_s = self.timing.period_s().unwrap_or(CLAIM_LIFE_S);
+        let period_s = typical_s.max(claim.period_s.unwrap_or(0.0));
+        self.config
+            .claims_stale_s
+            .max(FRESH_PERIODS * period_s)
+            .min(CLAIM_LIFE_S)
+    }
+
     /// The beam was nobody's, and alerted, while the claim stood where it is now: the beam came to the claim, not the claim to
     /// the beam.
     fn has_walked_onto(&self, claim: &ActiveClaim, track: &Track) -> bool {
@@ -53,7 +77,7 @@ impl Eligibility<'_> {
         let was_heard = self.store.first_heard(user).is_some_and(|t| t <= raised_at);
         let then = self.store.position_at(user, raised_at).map(Vector2::from);
         let here = Vector2::new(claim.claim.x_m, claim.claim.y_m);
-        was_heard && then.is_some_and(|then| (then - here).norm() <= STAYS * self.tolerated_m)
+        was_heard && then.is_some_and(|then| (then - here).norm() <= STAYS * self.config.tolerated_distance_m)
     }
 
     /// The beam is known by another user's claim, which goes on, and this one has been without a beam for so long that it should
@@ -63,7 +87,7 @@ impl Eligibility<'_> {
         let has_waited = claim
             .before
             .unseen_since
-            .is_some_and(|t| waited_s(t) >= self.decision_s);
+            .is_some_and(|t| waited_s(t) >= self.config.decision_s);
         has_waited && owner.is_some_and(|o| !o.ended && o.before.is_established())
     }
 }
@@ -148,5 +172,22 @@ mod tests {
         assert!(!allows(&scene, &claim, true));
         scene.claims[0].ended = true;
         assert!(allows(&scene, &claim, true));
+    }
+
+    #[test]
+    fn an_old_claim_may_be_no_new_beams() {
+        let mut scene = scene();
+        let mut claim = newcomer(&mut scene, 40.0);
+        let mut is_allowed = |age_s: f64, period_s: f64, scene: &Scene| {
+            (claim.age_s, claim.period_s) = (age_s, Some(period_s));
+            allows(scene, &claim, false)
+        };
+        // Five seconds, or five of its user's periods.
+        assert!(is_allowed(5.0, 1.0, &scene) && !is_allowed(5.1, 1.0, &scene));
+        assert!(is_allowed(10.0, 2.0, &scene) && !is_allowed(10.1, 2.0, &scene));
+        // While the whole log is silent, a minute.
+        let silence = Content::new(Severity::Warning, serde_json::json!({}));
+        scene.apply(vec![Finding::present(Cause::System(AlertKind::ClaimsStale), silence)]);
+        assert!(is_allowed(60.0, 1.0, &scene) && !is_allowed(60.1, 1.0, &scene));
     }
 }

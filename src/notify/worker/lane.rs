@@ -30,6 +30,10 @@ pub(super) struct Found {
 
 /// One endpoint's deliveries.
 pub(super) struct Lane {
+    /// Of no other lane, before or after a reload.
+    pub(super) id: u64,
+    /// When an operator last sent a test event.
+    pub(super) tested_at: Option<Duration>,
     pub(super) endpoint: Arc<Endpoint>,
     pub(super) queue: Queue,
     pub(super) cool_down: CoolDown,
@@ -49,8 +53,10 @@ pub(super) struct Lane {
 }
 
 impl Lane {
-    pub(super) fn new(endpoint: Arc<Endpoint>, journal: Journal, clock: Clock, begun_at: u64) -> Self {
+    pub(super) fn new(id: u64, endpoint: Arc<Endpoint>, journal: Journal, clock: Clock, begun_at: u64) -> Self {
         Self {
+            id,
+            tested_at: None,
             status: EndpointStatus::new(&endpoint),
             cool_down: CoolDown::new(endpoint.cool_down),
             endpoint,
@@ -63,6 +69,15 @@ impl Lane {
             is_reading: false,
             ahead: BTreeSet::new(),
         }
+    }
+
+    /// Goes on with another address, secret, selection of kinds or cool-down; what waits stays.
+    pub(super) fn change(&mut self, endpoint: Arc<Endpoint>) {
+        let shown = EndpointStatus::new(&endpoint);
+        self.status.url = shown.url;
+        self.status.kinds = shown.kinds;
+        self.cool_down.set_period(endpoint.cool_down);
+        self.endpoint = endpoint;
     }
 
     fn advance(&mut self, read_to: u64) {

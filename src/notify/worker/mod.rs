@@ -1,5 +1,6 @@
 //! The delivery loop: takes due deliveries from every endpoint's queue, sends them and notes the outcome.
 
+mod command;
 mod lane;
 
 use std::collections::HashMap;
@@ -10,15 +11,16 @@ use std::time::Duration;
 use jiff::{SignedDuration, Timestamp};
 use metrics::{counter, gauge};
 use rand_chacha::ChaCha8Rng;
-use tokio::sync::{mpsc, oneshot};
+use tokio::sync::mpsc;
 use tokio::task::{Id, JoinError, JoinSet};
 
 use super::client::{self, Failure, Verdict};
 use super::queue::Next;
 use super::status::{EndpointState, EndpointStatus};
 use super::{Clock, Endpoint};
-use crate::journal::{self, Attempt, Journal, Outcome};
+use crate::journal::{Attempt, Journal, Outcome};
 use crate::metric;
+pub(super) use command::Command;
 use lane::{Found, Lane};
 
 /// How long requests that are under way may still take when the daemon stops.
@@ -26,19 +28,6 @@ const GRACE: Duration = Duration::from_secs(3);
 
 /// How often the age of the oldest delivery is brought up to date.
 const TICK: Duration = Duration::from_secs(10);
-
-/// What an operator asks of the worker.
-pub(super) enum Command {
-    Enable {
-        endpoint: usize,
-        done: oneshot::Sender<()>,
-    },
-    Replay {
-        endpoint: usize,
-        seq: Option<u64>,
-        done: oneshot::Sender<u64>,
-    },
-}
 
 /// All endpoints, their requests and their reads of the journal.
 pub(super) struct Worker {
@@ -49,25 +38,26 @@ pub(super) struct Worker {
     commands: mpsc::Receiver<Command>,
     shown: Arc<Mutex<Vec<EndpointStatus>>>,
     /// Looks at the disk.
-    reads: JoinSet<(usize, Found)>,
+    reads: JoinSet<(u64, Found)>,
     requests: JoinSet<Verdict>,
     /// Lane and event of each request.
-    under_way: HashMap<Id, (usize, u64)>,
+    under_way: HashMap<Id, (u64, u64)>,
+    /// Lanes so far.
+    begun: u64,
 }
 
 impl Worker {
     pub(super) fn new(
-        endpoints: Vec<Arc<Endpoint>>,
+        endpoints: Vec<Endpoint>,
         journal: Journal,
         clock: Clock,
         rng: ChaCha8Rng,
         commands: mpsc::Receiver<Command>,
         shown: Arc<Mutex<Vec<EndpointStatus>>>,
     ) -> Self {
-        let begun_at = journal.last_seq();
-        let lane = |endpoint| Lane::new(endpoint, journal.clone(), clock, begun_at);
-        Self {
-            lanes: endpoints.into_iter().map(lane).collect(),
+        let mut worker = Self {
+            lanes: Vec::new(),
+            begun: 0,
             journal,
             clock,
             rng,
@@ -76,7 +66,48 @@ impl Worker {
             reads: JoinSet::new(),
             requests: JoinSet::new(),
             under_way: HashMap::new(),
+        };
+        worker.replace(endpoints);
+        worker
+    }
+
+    /// Takes these endpoints in place of those before. What waits for one that is gone stays in the journal.
+    fn replace(&mut self, endpoints: Vec<Endpoint>) {
+        let begun_at = self.journal.last_seq();
+        let mut before = std::mem::take(&mut self.lanes);
+        for endpoint in endpoints.into_iter().map(Arc::new) {
+            let kept = before.iter().position(|lane| lane.endpoint.name() == endpoint.name());
+            let lane = match kept {
+                Some(k) => {
+                    let mut lane = before.swap_remove(k);
+                    lane.change(endpoint);
+                    lane
+                }
+                None => {
+                    self.begun += 1;
+                    Lane::new(self.begun, endpoint, self.journal.clone(), self.clock, begun_at)
+                }
+            };
+            self.lanes.push(lane);
         }
+        for lane in before {
+            let name = lane.endpoint.name().to_owned();
+            for metric in [
+                metric::WEBHOOK_QUEUED,
+                metric::WEBHOOK_OLDEST,
+                metric::WEBHOOK_DEAD_LETTERS,
+            ] {
+                gauge!(metric, "endpoint" => name.clone()).set(0.0);
+            }
+        }
+    }
+
+    fn lane(&mut self, id: u64) -> Option<&mut Lane> {
+        self.lanes.iter_mut().find(|lane| lane.id == id)
+    }
+
+    fn named(&self, name: &str) -> Option<usize> {
+        self.lanes.iter().position(|lane| lane.endpoint.name() == name)
     }
 
     pub(super) async fn run(mut self, shutdown: impl Future<Output = ()>) {
@@ -105,7 +136,11 @@ impl Worker {
             tokio::select! {
                 () = &mut shutdown => break,
                 Some(ended) = self.requests.join_next_with_id(), if !self.requests.is_empty() => self.settle(ended),
-                Some(Ok(found)) = self.reads.join_next(), if !self.reads.is_empty() => self.lanes[found.0].found(found.1),
+                Some(Ok((id, found))) = self.reads.join_next(), if !self.reads.is_empty() => {
+                    if let Some(lane) = self.lane(id) {
+                        lane.found(found);
+                    }
+                }
                 Ok(()) = heard.changed() => {}
                 Some(command) = self.commands.recv() => self.handle_command(command).await,
                 () = self.clock.sleep_until(wake) => {}
@@ -125,30 +160,20 @@ impl Worker {
 
     /// Takes new events into the queues; reads of the disk run beside.
     fn look(&mut self) {
-        for (k, lane) in self.lanes.iter_mut().enumerate() {
+        for lane in &mut self.lanes {
+            let id = lane.id;
             if let Some(read) = lane.look() {
-                self.reads.spawn(async move { (k, read.await) });
+                self.reads.spawn(async move { (id, read.await) });
             }
         }
     }
 
-    async fn ask<T: Send + 'static>(
-        &self,
-        question: impl FnOnce(&Journal) -> Result<T, journal::Error> + Send + 'static,
-    ) -> Result<T, journal::Error> {
-        let journal = self.journal.clone();
-        match tokio::task::spawn_blocking(move || question(&journal)).await {
-            Ok(answer) => answer,
-            Err(error) => std::panic::resume_unwind(error.into_panic()),
-        }
-    }
-
     fn start(&mut self, now: Duration) {
-        for (k, lane) in self.lanes.iter_mut().enumerate() {
+        for lane in &mut self.lanes {
             while let Some(job) = lane.queue.take(now) {
                 let request = attempt(self.journal.clone(), lane.endpoint.clone(), job.seq, self.clock);
                 let id = self.requests.spawn(request).id();
-                self.under_way.insert(id, (k, job.seq));
+                self.under_way.insert(id, (lane.id, job.seq));
             }
         }
     }
@@ -161,11 +186,14 @@ impl Worker {
             };
             (error.id(), verdict)
         });
-        let Some((k, seq)) = self.under_way.remove(&id) else {
+        let Some((of, seq)) = self.under_way.remove(&id) else {
             return;
         };
         let (at, now) = (self.clock.now(), self.clock.uptime());
-        let lane = &mut self.lanes[k];
+        // Where the endpoint is gone the delivery waits in the journal.
+        let Some(lane) = self.lanes.iter_mut().find(|lane| lane.id == of) else {
+            return;
+        };
         let name = lane.endpoint.name();
         let count = |outcome: &'static str| {
             counter!(metric::WEBHOOK_ATTEMPTS, "endpoint" => name.to_owned(), "outcome" => outcome).increment(1);
@@ -240,41 +268,6 @@ impl Worker {
             at,
             outcome,
         });
-    }
-
-    async fn handle_command(&mut self, command: Command) {
-        match command {
-            Command::Enable { endpoint, done } => {
-                self.journal.enable(self.lanes[endpoint].endpoint.name()).await;
-                let now = self.clock.uptime();
-                self.lanes[endpoint].queue.enable(now);
-                self.show(now);
-                // Whoever asked may have gone away meanwhile.
-                let _ = done.send(());
-            }
-            Command::Replay { endpoint, seq, done } => {
-                let name = self.lanes[endpoint].endpoint.name().to_owned();
-                self.journal.replay(&name, seq, self.clock.now()).await;
-                let before = self.lanes[endpoint].queue.len();
-                match self.ask(move |journal| journal.waiting(&name, 0)).await {
-                    Ok(rows) => {
-                        // Later events come in by `read_new`, once.
-                        let read_to = self.lanes[endpoint].read_to;
-                        for row in rows.iter().filter(|row| row.seq <= read_to) {
-                            if !self.lanes[endpoint].cool_down.holds(row.seq) {
-                                self.lanes[endpoint].push(row);
-                            }
-                        }
-                    }
-                    Err(error) => tracing::warn!(%error, "the webhook outbox cannot be read"),
-                }
-                let lane = &mut self.lanes[endpoint];
-                let revived = (lane.queue.len() - before) as u64;
-                lane.status.failed = lane.status.failed.saturating_sub(revived);
-                self.show(self.clock.uptime());
-                let _ = done.send(revived);
-            }
-        }
     }
 
     /// Brings status and metrics up to date.

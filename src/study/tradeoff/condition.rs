@@ -127,7 +127,7 @@ impl Condition {
                 camera.noise_std_j = (camera.noise_std_j.powi(2) + step * step / 12.0).sqrt();
             }
             Some(Self::Saturated) => {
-                let level = truth.saturation_j.unwrap_or(f64::INFINITY);
+                let level = truth.saturation_limit_j();
                 for (pixel, bad) in pixels.iter_mut().zip(&mut unusable) {
                     *bad = *pixel >= level;
                     *pixel = pixel.min(level);

@@ -14,7 +14,7 @@ use std::path::Path;
 use crate::estimate::{ESTIMATORS, Learned};
 pub(in crate::study) use networks::Candidate;
 pub(in crate::study) use scene::Scene;
-pub(in crate::study) use score::CUTOFF_M;
+pub(in crate::study) use score::{Answer, CUTOFF_M, bound_ratio};
 
 pub use condition::Condition;
 pub use error::{Error, PictureError};
@@ -28,7 +28,7 @@ pub use score::{Row, Study};
 pub struct Plan {
     pub cells: Vec<Cell>,
     /// Names of estimators.
-    pub rungs: Vec<&'static str>,
+    pub estimators: Vec<&'static str>,
     /// Networks for the learned estimators besides the embedded one, each in the cell that it was trained for.
     pub networks: Vec<Trained>,
     /// Frames per cell.
@@ -63,7 +63,7 @@ impl Plan {
         }
         Self {
             cells,
-            rungs: rungs(),
+            estimators: names(),
             networks: Vec::new(),
             frames: 250,
             seed: 1,
@@ -81,7 +81,7 @@ impl Plan {
         cells.extend([1, 20].map(|emitters| Cell::new(Noise::Energy, 1.0, 100).holding(emitters)));
         Self {
             cells,
-            rungs: rungs(),
+            estimators: names(),
             networks: Vec::new(),
             frames: 12,
             seed: 1,
@@ -96,8 +96,9 @@ impl Plan {
     /// Every cell with its estimators: a network only in the cell that it was trained for.
     fn pairs(&self) -> impl Iterator<Item = (Cell, Candidate)> {
         let had = |cell: &Cell| -> Vec<(Cell, Candidate)> {
-            let rungs = self.rungs.iter().flat_map(|r| Candidate::of(r, cell, &self.networks));
-            rungs.map(|c| (*cell, c)).collect()
+            let names = self.estimators.iter();
+            let candidates = names.flat_map(|name| Candidate::of(name, cell, &self.networks));
+            candidates.map(|c| (*cell, c)).collect()
         };
         self.cells.iter().flat_map(had)
     }
@@ -107,7 +108,7 @@ impl Plan {
     }
 }
 
-fn rungs() -> Vec<&'static str> {
+fn names() -> Vec<&'static str> {
     let learned = Learned::ALL.into_iter().map(Learned::name);
     ESTIMATORS.iter().map(|r| r.name).chain(learned).collect()
 }
@@ -135,7 +136,7 @@ pub fn run(plan: &Plan, out: &Path, progress: &mut dyn FnMut(&Row)) -> Result<St
         let label = candidate.label();
         let known = study.rows.iter().find(|r| {
             r.cell == cell
-                && r.rung == label
+                && r.estimator == label
                 && r.frames == plan.frames
                 && r.seed == plan.seed
                 && r.training == candidate.training()

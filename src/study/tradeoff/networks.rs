@@ -37,7 +37,7 @@ pub struct Training {
 #[derive(Clone, Debug)]
 pub(in crate::study) struct Candidate {
     /// What `[estimator] name` selects it by.
-    pub rung: &'static str,
+    pub estimator: &'static str,
     /// The network in front of it; the embedded one where a learned estimator has none.
     pub network: Option<Trained>,
 }
@@ -94,16 +94,19 @@ impl Trained {
 
 impl Candidate {
     /// The estimator in `cell`: once, or once for each network trained for it.
-    pub fn of(rung: &'static str, cell: &Cell, networks: &[Trained]) -> Vec<Self> {
-        let alone = Self { rung, network: None };
-        if Learned::ALL.iter().all(|l| l.name() != rung) {
+    pub fn of(estimator: &'static str, cell: &Cell, networks: &[Trained]) -> Vec<Self> {
+        let alone = Self {
+            estimator,
+            network: None,
+        };
+        if Learned::ALL.iter().all(|l| l.name() != estimator) {
             return vec![alone];
         }
         let trained: Vec<Self> = networks
             .iter()
             .filter(|n| n.is_for(cell))
             .map(|n| Self {
-                rung,
+                estimator,
                 network: Some(n.clone()),
             })
             .collect();
@@ -122,8 +125,8 @@ impl Candidate {
     /// The name of the estimator in tables.
     pub fn label(&self) -> String {
         match &self.network {
-            Some(network) => format!("{} {}", self.rung, network.card.network),
-            None => self.rung.to_owned(),
+            Some(network) => format!("{} {}", self.estimator, network.card.network),
+            None => self.estimator.to_owned(),
         }
     }
 }

@@ -102,7 +102,7 @@ fn accuracy_against_time(study: &Study, path: &Path) -> Drawn {
     for row in &rows {
         let Some(error) = row.median_m2 else { continue };
         let at = (row.latency_median_us, error);
-        let label = format!("{} (OSPA {:.2} m)", row.rung, row.ospa_m);
+        let label = format!("{} (OSPA {:.2} m)", row.estimator, row.ospa_m);
         let width = LETTER * label.len() as i32;
         let (x, y) = chart.backend_coord(&at);
         let (side, dx, left) = match at.0 > middle {
@@ -153,10 +153,10 @@ fn accuracy_against_array(study: &Study, path: &Path) -> Drawn {
         .draw()?;
     let mut lines: Vec<(String, Vec<(f64, f64)>)> = ESTIMATORS
         .iter()
-        .map(|rung| {
-            let own = rows.iter().filter(|r| r.rung == rung.name);
+        .map(|spec| {
+            let own = rows.iter().filter(|r| r.estimator == spec.name);
             (
-                rung.name.to_owned(),
+                spec.name.to_owned(),
                 own.filter_map(|r| Some((r.cell.pixels as f64, r.mean_m2?))).collect(),
             )
         })
@@ -165,7 +165,7 @@ fn accuracy_against_array(study: &Study, path: &Path) -> Drawn {
     let unet = PAPER.iter().map(|p| (p.0 as f64, p.2)).collect();
     lines.push(("the paper's hybrid".into(), hybrid));
     lines.push(("the paper's U-Net".into(), unet));
-    let bound = rows.iter().filter(|r| r.rung == ESTIMATORS[0].name);
+    let bound = rows.iter().filter(|r| r.estimator == ESTIMATORS[0].name);
     let bound = bound
         .filter_map(|r| Some((r.cell.pixels as f64, r.bound_median_m2?)))
         .collect();

@@ -31,7 +31,7 @@ pub(super) fn front<'a>(rows: &[&'a Row]) -> Vec<&'a Row> {
 }
 
 /// Whether a row's label belongs to the estimator `name`; the name of a network may follow.
-fn is_rung(label: &str, name: &str) -> bool {
+fn is_of(label: &str, name: &str) -> bool {
     label.split_whitespace().next() == Some(name)
 }
 
@@ -65,17 +65,17 @@ pub(super) fn markdown(study: &Study) -> String {
     );
     let fronts: Vec<Row> = cells(study).iter().flat_map(|rows| front(rows)).cloned().collect();
     let on_front = |name: &str| {
-        let of = |rows: &[Row]| rows.iter().filter(|r| is_rung(&r.rung, name)).count();
+        let of = |rows: &[Row]| rows.iter().filter(|r| is_of(&r.estimator, name)).count();
         format!("on the front in {} of {} cells", of(&fronts), of(&study.rows))
     };
-    for rung in ESTIMATORS {
-        let default = if rung.name == DEFAULT { " (default)" } else { "" };
+    for spec in ESTIMATORS {
+        let default = if spec.name == DEFAULT { " (default)" } else { "" };
         let _ = writeln!(
             text,
             "- `{}`{default}: {}; {}",
-            rung.name,
-            rung.summary,
-            on_front(rung.name)
+            spec.name,
+            spec.summary,
+            on_front(spec.name)
         );
     }
     for learned in Learned::ALL {
@@ -93,7 +93,7 @@ pub(super) fn markdown(study: &Study) -> String {
         let _ = writeln!(
             text,
             "\n## {}\n\nBound: median {} m²; with powers known, mean {} m². {} of emitters can be resolved.\n\n\
-             | rung | mean m² | median m² | trimmed m² | r | OSPA m | N right | where resolvable | missed | invented | µs median | µs 99th |\n\
+             | estimator | mean m² | median m² | trimmed m² | r | OSPA m | N right | where resolvable | missed | invented | µs median | µs 99th |\n\
              |---|---|---|---|---|---|---|---|---|---|---|---|",
             first.cell.name(),
             number(first.bound_median_m2),
@@ -105,7 +105,7 @@ pub(super) fn markdown(study: &Study) -> String {
             let _ = writeln!(
                 text,
                 "| {mark}{}{mark} | {} | {} | {} | {} | {:.3} | {} | {} | {} | {} | {:.0} | {:.0} |",
-                row.rung,
+                row.estimator,
                 number(row.mean_m2),
                 number(row.median_m2),
                 number(row.trimmed_m2),
@@ -138,22 +138,22 @@ pub(super) fn markdown(study: &Study) -> String {
 /// The paper's errors by array size, and those of every estimator that has a row among the cells that `is_wanted` names.
 fn beside(text: &mut String, study: &Study, is_wanted: impl Fn(&Row) -> bool) {
     let rows: Vec<&Row> = study.rows.iter().filter(|r| is_wanted(r)).collect();
-    let mut rungs: Vec<&str> = ESTIMATORS.iter().map(|r| r.name).collect();
+    let mut names: Vec<&str> = ESTIMATORS.iter().map(|r| r.name).collect();
     for row in &rows {
-        if !rungs.contains(&row.rung.as_str()) {
-            rungs.push(&row.rung);
+        if !names.contains(&row.estimator.as_str()) {
+            names.push(&row.estimator);
         }
     }
     let _ = writeln!(
         text,
         "| array | paper's hybrid | paper's U-Net | {} |\n|---|---|---|{}",
-        rungs.join(" | "),
-        "---|".repeat(rungs.len())
+        names.join(" | "),
+        "---|".repeat(names.len())
     );
     for (pixels, hybrid, unet) in PAPER {
         let _ = write!(text, "| {pixels}×{pixels} | {hybrid} | {unet} |");
-        for rung in &rungs {
-            let row = rows.iter().find(|r| r.cell.pixels == pixels && r.rung == *rung);
+        for name in &names {
+            let row = rows.iter().find(|r| r.cell.pixels == pixels && r.estimator == *name);
             let mean = row
                 .and_then(|r| r.mean_m2)
                 .map_or("–".to_owned(), |m| format!("{m:.3}"));
@@ -171,7 +171,7 @@ fn networks(text: &mut String, study: &Study) {
     }
     text.push_str(
         "\n## Networks\n\nMissed and invented are shares of the emitters; seconds are of one processor core.\n\n\
-         | cell | rung | samples | training s | mean m² | median m² | missed | invented | OSPA m |\n\
+         | cell | estimator | samples | training s | mean m² | median m² | missed | invented | OSPA m |\n\
          |---|---|---|---|---|---|---|---|---|\n",
     );
     let number = |v: Option<f64>| v.map_or("–".to_owned(), |v| format!("{v:.3}"));
@@ -182,7 +182,7 @@ fn networks(text: &mut String, study: &Study) {
             text,
             "| {} | {} | {} | {:.0} | {} | {} | {:.1} % | {:.1} % | {:.2} |",
             row.cell.name(),
-            row.rung,
+            row.estimator,
             training.samples,
             training.seconds,
             number(row.mean_m2),

@@ -26,7 +26,8 @@ pub struct Study {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Row {
     pub cell: Cell,
-    pub rung: String,
+    #[serde(alias = "rung")]
+    pub estimator: String,
     pub frames: usize,
     pub seed: u64,
     /// Of the network, where the study was given one.
@@ -66,7 +67,7 @@ const TRIMMED_EXPONENTIAL: f64 = 0.842_329_8;
 pub(super) fn measure(cell: &Cell, candidate: &Candidate, scenes: &[Scene], seed: u64) -> Result<Row, Error> {
     let camera = cell.camera()?;
     let config = estimate::Config {
-        name: Some(candidate.rung.to_owned()),
+        name: Some(candidate.estimator.to_owned()),
         network: candidate.network.as_ref().map(|n| n.path.clone()),
         known_power: Some(cell.known_power(&camera)),
         ..Default::default()
@@ -87,36 +88,29 @@ pub(super) fn measure(cell: &Cell, candidate: &Candidate, scenes: &[Scene], seed
         let positions: Vec<[f64; 2]> = found
             .map(|e| e.emitters.iter().map(|m| [m.x_m, m.y_m]).collect())
             .unwrap_or_default();
-        let score = ospa(&scene.positions, &positions, CUTOFF_M);
-        total_ospa += score.distance_m;
-        missed += score.matching.unmatched_rows.len();
-        invented += score.matching.unmatched_columns.len();
+        let answer = Answer::new(scene, &positions);
+        total_ospa += answer.ospa_m;
+        missed += answer.missed;
+        invented += answer.invented;
         let is_resolvable: Vec<bool> = (0..scene.positions.len()).map(|i| is_resolvable(scene, i)).collect();
         let is_clear = is_resolvable.iter().all(|&r| r);
-        let is_right = positions.len() == scene.positions.len();
-        right += usize::from(is_right);
+        right += usize::from(answer.is_right);
         clear += usize::from(is_clear);
-        clear_right += usize::from(is_clear && is_right);
+        clear_right += usize::from(is_clear && answer.is_right);
         resolvable += is_resolvable.iter().filter(|r| **r).count();
         bounds.extend_from_slice(&scene.bound_m2);
         known_bounds.extend_from_slice(&scene.known_bound_m2);
-        for &(i, j) in &score.matching.pairs {
-            let (t, p) = (scene.positions[i], positions[j]);
-            let error = (t[0] - p[0]).powi(2) + (t[1] - p[1]).powi(2);
-            squared.push(error);
-            if is_resolvable[i] {
-                ratios.push(error / scene.bound_m2[i]);
-            }
-        }
+        squared.extend_from_slice(&answer.squared_m2);
+        ratios.extend_from_slice(&answer.ratios);
     }
     let frames = scenes.len();
-    for values in [&mut squared, &mut ratios, &mut bounds, &mut latencies] {
+    for values in [&mut squared, &mut bounds, &mut latencies] {
         values.sort_by(f64::total_cmp);
     }
     let emitters = bounds.len().max(1);
     Ok(Row {
         cell: *cell,
-        rung: candidate.label(),
+        estimator: candidate.label(),
         training: candidate.training(),
         frames,
         seed,
@@ -125,7 +119,7 @@ pub(super) fn measure(cell: &Cell, candidate: &Candidate, scenes: &[Scene], seed
         trimmed_m2: trimmed(&squared),
         bound_median_m2: quantile(&bounds, 0.5),
         known_bound_mean_m2: mean(&known_bounds),
-        bound_ratio: trimmed(&ratios).map(|r| r / TRIMMED_EXPONENTIAL),
+        bound_ratio: bound_ratio(ratios),
         ospa_m: total_ospa / frames.max(1) as f64,
         emitters,
         missed,
@@ -136,6 +130,49 @@ pub(super) fn measure(cell: &Cell, candidate: &Candidate, scenes: &[Scene], seed
         latency_median_us: quantile(&latencies, 0.5).unwrap_or(0.0),
         latency_p99_us: quantile(&latencies, 0.99).unwrap_or(0.0),
     })
+}
+
+/// How an answer compares with the truth of its frame.
+pub(in crate::study) struct Answer {
+    pub ospa_m: f64,
+    pub missed: usize,
+    pub invented: usize,
+    /// Whether the number of emitters is right.
+    pub is_right: bool,
+    /// Squared error over matched pairs, both axes summed, m².
+    pub squared_m2: Vec<f64>,
+    /// The same over the bound, among resolvable emitters.
+    pub ratios: Vec<f64>,
+}
+
+impl Answer {
+    pub fn new(scene: &Scene, positions: &[[f64; 2]]) -> Self {
+        let score = ospa(&scene.positions, positions, CUTOFF_M);
+        let (mut squared_m2, mut ratios) = (Vec::new(), Vec::new());
+        for &(i, j) in &score.matching.pairs {
+            let (t, p) = (scene.positions[i], positions[j]);
+            let error = (t[0] - p[0]).powi(2) + (t[1] - p[1]).powi(2);
+            squared_m2.push(error);
+            if is_resolvable(scene, i) {
+                ratios.push(error / scene.bound_m2[i]);
+            }
+        }
+        Self {
+            ospa_m: score.distance_m,
+            missed: score.matching.unmatched_rows.len(),
+            invented: score.matching.unmatched_columns.len(),
+            is_right: positions.len() == scene.positions.len(),
+            squared_m2,
+            ratios,
+        }
+    }
+}
+
+/// Mean of squared errors over their bounds, the largest 5 % left out; see [`Row::bound_ratio`].
+pub(in crate::study) fn bound_ratio(ratios: impl IntoIterator<Item = f64>) -> Option<f64> {
+    let mut ratios: Vec<f64> = ratios.into_iter().collect();
+    ratios.sort_by(f64::total_cmp);
+    trimmed(&ratios).map(|r| r / TRIMMED_EXPONENTIAL)
 }
 
 fn is_resolvable(scene: &Scene, i: usize) -> bool {

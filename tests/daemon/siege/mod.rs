@@ -4,6 +4,7 @@
 mod flood;
 pub mod names;
 mod slow;
+mod viewers;
 
 use std::net::SocketAddr;
 use std::path::Path;

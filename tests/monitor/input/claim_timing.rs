@@ -1,6 +1,6 @@
 //! Claims that come late, or at other paces.
 
-use crate::stories::{Story, crowd, tell};
+use crate::stories::{Expect, Story, crowd, tell};
 
 #[test]
 fn late_claims_raise_nothing() {

@@ -1,6 +1,6 @@
 //! A log whose clock is off.
 
-use crate::stories::{Actor, Story, tell};
+use crate::stories::{Actor, Expect, Story, tell};
 
 /// On bicycles, with a log whose clock is off by most of a second: seven metres along the way.
 #[test]

@@ -4,7 +4,7 @@ use oapwatch::monitor::AlertKind::*;
 use oapwatch::monitor::{PositionStatus, TrackedPosition};
 
 use crate::hostile::forged;
-use crate::stories::{Actor, Story, crowd, tell};
+use crate::stories::{Actor, Expect, Story, crowd, tell};
 
 /// A grid of names over the whole view, each claimed once a second, in steps of 10 m: an eavesdropper who walks through it is near one
 /// of them at any time.
@@ -67,4 +67,21 @@ fn a_carpet_of_claims_makes_nobody_of_an_eavesdropper_a_user() {
         });
         assert_eq!(others.count(), 0, "walk {k}: {raised:?}");
     }
+}
+
+/// A network whose users are many times those in view: the others claim every ten seconds to be 25 m outside of it. Each may have
+/// walked into view since, and none has: claims that cannot be held against a frame for their number would be a flood that never ends.
+#[test]
+fn a_network_of_many_users_outside_the_view_is_no_flood() {
+    let mut story = Story::new(30, crowd());
+    story.seconds = 60.0;
+    for k in 0..300 {
+        let along = f64::from(k % 75) * 4.0 - 150.0;
+        let (x, y) = [(along, 150.0), (along, -150.0), (150.0, along), (-150.0, along)][k as usize / 75];
+        for s in 0..6 {
+            let t = 10.0 * f64::from(s) + 0.03 * f64::from(k);
+            story.forged.push((t, forged(&format!("far-{k}"), t, x, y)));
+        }
+    }
+    tell(&story).expect(&[]);
 }

@@ -3,7 +3,7 @@
 use oapwatch::monitor::AlertKind::*;
 
 use crate::SEEDS;
-use crate::stories::{Actor, Story, crowd, tell};
+use crate::stories::{Actor, Expect, Story, crowd, tell};
 
 /// Equal beams 30 cm apart, after half a minute of one.
 #[test]

@@ -4,7 +4,7 @@ use oapwatch::monitor::AlertKind::*;
 use oapwatch::monitor::Severity;
 
 use crate::hostile::{forged, intrusion};
-use crate::stories::{Actor, Sensor, Story, crowd, tell, tell_with};
+use crate::stories::{Actor, Expect, Sensor, Story, crowd, tell, tell_with};
 
 #[test]
 fn a_blinded_sensor_is_one_alert() {

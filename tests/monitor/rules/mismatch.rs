@@ -3,7 +3,7 @@
 use oapwatch::monitor::AlertKind::*;
 
 use crate::SEEDS;
-use crate::stories::{Actor, Story, crowd, tell};
+use crate::stories::{Actor, Expect, Story, crowd, tell};
 
 #[test]
 fn a_user_that_drifts_away_is_one_mismatch() {

@@ -4,7 +4,7 @@ use oapwatch::monitor::AlertKind::*;
 use oapwatch::monitor::PositionStatus;
 
 use crate::SEEDS;
-use crate::stories::{Actor, Story, crowd, tell};
+use crate::stories::{Actor, Expect, Story, crowd, tell};
 
 #[test]
 fn a_shift_of_everybody_is_our_own_pose() {

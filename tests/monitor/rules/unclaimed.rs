@@ -3,7 +3,7 @@
 use oapwatch::monitor::AlertKind::*;
 
 use crate::SEEDS;
-use crate::stories::{Actor, Story, crowd, tell};
+use crate::stories::{Actor, Expect, Story, crowd, tell};
 
 #[test]
 fn an_intruder_is_alerted_within_a_second_and_cleared_when_gone() {

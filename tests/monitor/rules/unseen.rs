@@ -6,7 +6,7 @@ use oapwatch::monitor::Severity;
 
 use crate::SEEDS;
 use crate::hostile::forged;
-use crate::stories::{Actor, Story, crowd, tell, tell_with};
+use crate::stories::{Actor, Expect, Story, crowd, tell, tell_with};
 
 #[test]
 fn a_user_that_goes_dark_is_unseen() {

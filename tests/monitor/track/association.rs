@@ -1,6 +1,6 @@
 //! Users who meet, and part.
 
-use crate::stories::{Actor, Story, tell};
+use crate::stories::{Actor, Expect, Story, tell};
 
 #[test]
 fn crossing_users_raise_nothing() {

@@ -2,16 +2,16 @@
 
 use std::collections::BTreeMap;
 
-use oapwatch::claim::{Claim, ClaimState};
-use oapwatch::claims::{self, Store};
-use oapwatch::estimate::{Emitter, Error, Estimate, Flags, SecondMomentScore};
-use oapwatch::monitor::{AlertEvent, AlertEventKind, AlertKind, AlertState, Monitor, Observation, Report, Source};
-use oapwatch::optics::Camera;
+use crate::claim::{Claim, ClaimState};
+use crate::claims::{self, Store};
+use crate::estimate::{Emitter, Error, Estimate, Flags, SecondMomentScore};
+use crate::monitor::{AlertEvent, AlertEventKind, AlertKind, AlertState, Monitor, Observation, Report, Source};
+use crate::optics::Camera;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, Normal, StandardNormal};
 
-use super::{Sensor, Story, at, camera, expected, start};
+use super::{Sensor, Story, at, camera, start};
 
 /// What the monitor said.
 pub struct Told {
@@ -49,14 +49,8 @@ impl Told {
     pub fn ndjson(&self) -> String {
         self.events
             .iter()
-            .map(|e| serde_json::to_string(e).unwrap() + "\n")
+            .map(|e| serde_json::to_string(e).expect("an event is plain data") + "\n")
             .collect()
-    }
-
-    /// Exactly these were raised, each within its interval, and nothing else.
-    #[track_caller]
-    pub fn expect(&self, expected: &[(AlertKind, Option<&str>, f64, f64)]) {
-        expected::expect(&self.raised(), expected, &self.ndjson());
     }
 }
 
@@ -99,7 +93,10 @@ fn detect(story: &Story, t: f64, rng: &mut ChaCha8Rng) -> Vec<Emitter> {
             continue;
         }
         // Ten coherence times a frame: 29 % scintillation.
-        let fading = Normal::<f64>::new(1.0, 0.25).unwrap().sample(rng).clamp(0.3, 2.5);
+        let fading = Normal::<f64>::new(1.0, 0.25)
+            .expect("a standard deviation")
+            .sample(rng)
+            .clamp(0.3, 2.5);
         spots.push((p, actor.energy_j * fading));
     }
     if rng.random::<f64>() < story.ghosts {
@@ -129,7 +126,7 @@ fn detect(story: &Story, t: f64, rng: &mut ChaCha8Rng) -> Vec<Emitter> {
     }
     // A stream of its own: the other draws stay what they are without it.
     let mut shapes = ChaCha8Rng::seed_from_u64(story.seed ^ t.to_bits());
-    let error = Normal::new(0.0, story.position_std_m).unwrap();
+    let error = Normal::new(0.0, story.position_std_m).expect("a standard deviation");
     merged
         .into_iter()
         .map(|blob| {
@@ -156,12 +153,12 @@ pub fn claims(story: &Story) -> Vec<(f64, Claim)> {
     let mut all = Vec::new();
     for actor in &story.actors {
         let Some(user) = &actor.user else { continue };
-        let fresh = Normal::new(0.0, actor.sigma_m * (1.0 - story.claim_wander).sqrt()).unwrap();
+        let fresh = Normal::new(0.0, actor.sigma_m * (1.0 - story.claim_wander).sqrt()).expect("a standard deviation");
         // First-order Gauss-Markov with a correlation time of one minute.
         let keeps = (-actor.period_s / 60.0).exp();
         let stationary = actor.sigma_m * story.claim_wander.sqrt();
-        let drift = Normal::new(0.0, stationary * (1.0 - keeps * keeps).sqrt()).unwrap();
-        let begin = Normal::new(0.0, stationary).unwrap();
+        let drift = Normal::new(0.0, stationary * (1.0 - keeps * keeps).sqrt()).expect("a standard deviation");
+        let begin = Normal::new(0.0, stationary).expect("a standard deviation");
         let mut wander = [begin.sample(&mut rng), begin.sample(&mut rng)];
         let mut t = actor.phase_s;
         let mut over = false;
@@ -216,7 +213,7 @@ pub fn tell_with(story: &Story, keep: bool) -> Told {
         let t = frame as f64 / story.rate_hz;
         if story.restarts_at == Some(t) {
             // What the journal holds.
-            let mut open: BTreeMap<String, oapwatch::monitor::Alert> = BTreeMap::new();
+            let mut open: BTreeMap<String, crate::monitor::Alert> = BTreeMap::new();
             for event in &events {
                 open.insert(event.alert.id.clone(), event.alert.clone());
             }

@@ -1,21 +1,19 @@
-//! What those who look on cost the monitor. Takes minutes and wants a machine to itself, so it is not run by default:
-//! `cargo test --release --test daemon -- --ignored --nocapture viewers`.
+//! What viewers cost the monitor: latency without and with them, in turns.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::Duration;
 
 use futures_util::StreamExt;
-use serde_json::Value;
 use tokio_tungstenite::connect_async;
 
-use super::process::Daemon;
+use super::super::process::Daemon;
+use super::{FLOOR_US, RATE_HZ, number, start, status};
 
 const ROUNDS: usize = 5;
 const STREAMS: usize = 50;
 const POLLERS: usize = 10;
-/// Frames a second, and seconds until all of the status's window of 128 frames is of the present state.
-const RATE_HZ: f64 = 40.0;
+/// Until all of the status's window of 128 frames is of the present state.
 const SETTLE: Duration = Duration::from_secs(8);
 
 /// Reads the stream as a page does.
@@ -42,22 +40,16 @@ async fn poll(address: String, stop: Arc<AtomicBool>) {
 
 /// Median and 99th percentile of the newest 128 frames' latency, µs, and frames dropped so far.
 fn latency(daemon: &Daemon) -> [u64; 3] {
-    let status: Value = serde_json::from_str(&daemon.get("/v1/status").1).unwrap();
-    let (latency, frames) = (&status["latency"], &status["frames"]);
-    [&latency["median_us"], &latency["p99_us"], &frames["dropped"]].map(|v| v.as_u64().unwrap())
+    let status = status(daemon, None);
+    ["/latency/median_us", "/latency/p99_us", "/frames/dropped"].map(|path| number(&status, path))
 }
 
 #[test]
-#[ignore = "minutes; see the file's head"]
+#[ignore = "minutes; make siege"]
 fn viewers_do_not_slow_the_monitor_down() {
     let _ = rustls::crypto::ring::default_provider().install_default();
     let dir = tempfile::tempdir().unwrap();
-    let scene = include_str!("../../config/scenes/builtin.toml");
-    let scene = scene.replace("rate_hz = 10.0", &format!("rate_hz = {RATE_HZ:?}"));
-    let scene = scene.replace("integration_time_s = 0.1", "integration_time_s = 0.02");
-    std::fs::write(dir.path().join("scene.toml"), scene).unwrap();
-    let config = "[source]\nkind = \"simulator\"\nscene = \"scene.toml\"\n[api]\nrequests_per_second = 100000\n";
-    let daemon = Daemon::start(dir.path(), config);
+    let daemon = start(dir.path(), RATE_HZ, "[api]\nrequests_per_second = 100000\n");
     daemon.wait_for("/v1/positions", "positions", |v| v["frame"].as_u64() > Some(10));
     let address = daemon.address().to_owned();
     let runtime = tokio::runtime::Builder::new_multi_thread()
@@ -104,5 +96,5 @@ fn viewers_do_not_slow_the_monitor_down() {
     let (alone, watched) = (alone[ROUNDS / 2], watched[ROUNDS / 2]);
     println!("median p99: {alone} µs without, {watched} µs with");
     // The machine's other work shows in both; twice is what a viewer must never cost.
-    assert!(watched < 2 * alone.max(1000), "{watched} µs against {alone} µs");
+    assert!(watched < 2 * alone.max(FLOOR_US), "{watched} µs against {alone} µs");
 }

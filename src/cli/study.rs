@@ -1,0 +1,48 @@
+//! `oapwatch study`: measures what needs many random stories.
+
+use std::io::Write;
+
+use super::progress::Steps;
+use super::{Failure, Outcome};
+use crate::study::measurements::{ALL, Measurement};
+
+#[derive(Debug, clap::Args)]
+#[command(
+    after_help = "Examples:\n  oapwatch study honest intruder beyond drift\n  oapwatch study stranger --stories 12000 --seed 200000"
+)]
+pub struct Args {
+    /// What to measure: the first four of the monitor alone, the last of the calibration, the others through the simulator's pixels
+    #[arg(required = true, value_parser = clap::builder::PossibleValuesParser::new(ALL.iter().map(|m| m.name)))]
+    what: Vec<String>,
+    /// Stories of each, of 8 s to two minutes of frames (devices of the calibration)
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
+    stories: Option<u64>,
+    /// Seed of the first story; the others follow
+    #[arg(long, value_name = "S", default_value_t = 1000)]
+    seed: u64,
+}
+
+pub fn run(args: Args) -> Outcome {
+    let is_wanted = |m: &&Measurement| args.what.iter().any(|name| name == m.name);
+    let wanted: Vec<&Measurement> = ALL.iter().filter(is_wanted).collect();
+    let mut steps = Steps::new(wanted.len() as u64);
+    let mut broken = Vec::new();
+    for measurement in wanted {
+        let measured = measurement.run(args.stories.unwrap_or(measurement.stories), args.seed);
+        steps
+            .suspend(|| writeln!(std::io::stdout(), "## {}\n\n{}", measurement.name, measured.text))
+            .map_err(Failure::other)?;
+        steps.next(measurement.name);
+        if !measured.holds {
+            broken.push(measurement.name);
+        }
+    }
+    steps.finish();
+    match broken[..] {
+        [] => Ok(()),
+        _ => Err(Failure::other(anyhow::anyhow!(
+            "requirements not met: {}",
+            broken.join(", ")
+        ))),
+    }
+}

@@ -1,0 +1,43 @@
+//! Measurements over many random stories: how often honest users raise an alert, how often and how soon an attack does, and how
+//! much error a calibration leaves.
+
+mod alone;
+mod calibration;
+mod measured;
+mod pixels;
+
+pub use measured::Measured;
+
+/// Something to measure.
+pub struct Measurement {
+    pub name: &'static str,
+    /// Stories (devices of a calibration), unless another number is asked for.
+    pub stories: u64,
+    run: fn(stories: u64, seed: u64) -> Measured,
+}
+
+impl Measurement {
+    /// Measures `stories` stories, whose seeds begin with `seed`.
+    pub fn run(&self, stories: u64, seed: u64) -> Measured {
+        (self.run)(stories, seed)
+    }
+}
+
+/// All measurements, the monitor alone before those through pixels.
+pub const ALL: &[Measurement] = &[
+    measurement("honest", 1000, alone::honest_users),
+    measurement("intruder", 3000, alone::intruders),
+    measurement("beyond", 3000, alone::beyond),
+    measurement("drift", 300, alone::drifts),
+    measurement("honest-pixels", 15, pixels::honest_users),
+    measurement("honest-crowd", 15, pixels::honest_crowd),
+    measurement("stranger", 1500, pixels::strangers),
+    measurement("stranger-near", 300, pixels::strangers_near),
+    measurement("stranger-in-crowd", 200, pixels::strangers_in_crowd),
+    measurement("shadow", 10, pixels::shadows),
+    measurement("calibration", 5, calibration::error_left),
+];
+
+const fn measurement(name: &'static str, stories: u64, run: fn(u64, u64) -> Measured) -> Measurement {
+    Measurement { name, stories, run }
+}
