@@ -74,9 +74,17 @@ test-v4l2: setup
 .PHONY: test-deploy
 # The package in a virtual machine with systemd: installed, attacked, upgraded, purged. Needs root for mmdebstrap.
 test-deploy:
-	$(call need,sh -c 'command -v qemu-system-x86_64 && command -v busybox && command -v depmod && command -v cpio && command -v mmdebstrap && command -v mksquashfs',qemu-system-x86 busybox-static kmod cpio mmdebstrap squashfs-tools)
+	$(call need,sh -c 'command -v qemu-system-x86_64 && command -v busybox && command -v depmod && command -v cpio && command -v mmdebstrap && command -v mksquashfs && command -v xz',qemu-system-x86 busybox-static kmod cpio mmdebstrap squashfs-tools xz-utils)
 	@test -f target/oapwatch.deb || $(MAKE) deb
 	tests/deploy/run.sh
+
+.PHONY: test-power-cuts
+# Twenty power cuts of a virtual machine while alerts flow: what the log or a receiver heard is in the journal. Not in CI: minutes.
+# CUTS="--cuts 5 --seed 2" and the like go on to it.
+CUTS ?=
+test-power-cuts: build
+	$(call need,sh -c 'command -v qemu-system-x86_64 && command -v busybox && command -v depmod && command -v cpio && command -v xz && command -v mke2fs && command -v python3',qemu-system-x86 busybox-static kmod cpio xz-utils e2fsprogs python3-minimal)
+	tests/power_cuts/run.sh target/release/oapwatch $(CUTS)
 
 .PHONY: soak
 # Whether memory, file descriptors or threads grow, over SOAK_S seconds of 40 times the usual pace. Not in CI: it takes its time.

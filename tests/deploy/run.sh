@@ -45,7 +45,7 @@ umount /proc /sys
 exec switch_root /root /lib/systemd/systemd
 INIT
     chmod +x "$dir/init"
-    pack "$dir" "$work/initramfs.gz"
+    pack "$dir" "$work/initramfs.cpio"
 }
 
 root_image() {
@@ -106,7 +106,7 @@ root_image
 echo "Booting (software emulation; a few minutes at most)"
 status=0
 timeout 900 qemu-system-x86_64 -accel tcg -cpu max -smp 1 -m 1024 -nodefaults -display none -no-reboot \
-    -kernel "$vmlinux" -initrd "$work/initramfs.gz" \
+    -kernel "$vmlinux" -initrd "$work/initramfs.cpio" \
     -append "console=ttyS0 quiet loglevel=2 panic=-1 nokaslr mitigations=off tsc=reliable no_timer_check random.trust_cpu=on cryptomgr.notests systemd.show_status=false rd.systemd.show_status=false" \
     -drive "file=$work/root.squashfs,format=raw,if=virtio,readonly=on" \
     -device isa-debug-exit,iobase=0xf4,iosize=0x04 -serial stdio </dev/null | tee "$work/log" || status=${PIPESTATUS[0]}

@@ -55,7 +55,7 @@ install_modules() {
     done
 }
 
-# Packs folder $1 as the machine's first file system, $2.
+# Packs folder $1 as the machine's first file system, $2. Not compressed: the guest would unpack it under emulation.
 pack() {
-    (cd "$1" && find . | cpio --quiet -o -H newc | gzip -1) > "$2"
+    (cd "$1" && find . | cpio --quiet -o -H newc) > "$2"
 }

@@ -30,14 +30,14 @@ install_program "$guest" guest "$root"
 install_program "$program" oapwatch "$root"
 install -m 755 tests/v4l2/init.sh "$root/init"
 echo "$*" > "$root/scenarios"
-pack "$root" "$work/initramfs.gz"
+pack "$root" "$work/initramfs"
 
 # isa-debug-exit turns a value written to its port into QEMU's exit code, (value << 1) | 1.
 set +e
 timeout 300 qemu-system-x86_64 -accel tcg -cpu qemu64 -smp 1 -m "${MEMORY_MB:-512}" -nodefaults -no-user-config -display none \
     -serial stdio -monitor none -no-reboot -icount shift=1,sleep=off \
     -device isa-debug-exit,iobase=0xf4,iosize=0x04 \
-    -kernel "$vmlinux" -initrd "$work/initramfs.gz" \
+    -kernel "$vmlinux" -initrd "$work/initramfs" \
     -append "console=ttyS0 quiet loglevel=2 panic=-1 nokaslr mitigations=off tsc=reliable no_timer_check random.trust_cpu=on cryptomgr.notests" \
     < /dev/null
 code=$?
