@@ -66,6 +66,8 @@ rules! {
     select_nuisances,
     /// A rotated elliptical PSF is tried in the place of more sources. Needed with the condition `ellipse`.
     rotated_ellipse,
+    /// Sources that do not exceed the misfit around them are removed. Nothing needs it in the trade-off; see `docs/accuracy.md`.
+    prune_spurious,
     /// Noise that grows with the light is estimated from the residual, and pixels are weighted by it. Needed with the condition `gains`.
     reweighting,
     /// A fit is aborted once several times its predicted decrease misses the acceptance threshold. Saves a third of the time.

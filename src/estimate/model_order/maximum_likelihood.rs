@@ -8,6 +8,7 @@ use crate::estimate::model_order::nuisance_selection::{
     EARLY_ROUNDS, ROUNDS, has_paired_sources, has_unequal_energies, nuisances_can_replace_sources, select_nuisances,
     try_rotated_ellipse,
 };
+use crate::estimate::model_order::pruning::prune_spurious;
 use crate::estimate::model_order::refine::refine;
 use crate::estimate::model_order::search::Search;
 
@@ -67,6 +68,9 @@ pub(crate) fn maximum_likelihood(search: &mut Search, initial: Hypothesis) -> Hy
         refine(search, &mut candidate, ROUNDS);
     }
     drop_nuisances(search, &mut candidate);
+    if rules.prune_spurious && !search.is_explained_by(&candidate) {
+        prune_spurious(search, &mut candidate);
+    }
     search.converge(&mut candidate);
     candidate.into_hypothesis()
 }

@@ -12,6 +12,7 @@ pub mod power_prior;
 pub mod proposals;
 #[cfg(test)]
 mod proposals_test;
+pub mod pruning;
 pub mod refine;
 pub mod reweighting;
 pub mod search;
