@@ -165,7 +165,7 @@ mod tests {
         assert_eq!(scene.alerts.open().next().unwrap().1.severity, Severity::Critical);
         let mut empty = Scene::of_users(&[]);
         empty.claims_quiet_s = Some((31.0, 31.0));
-        assert_eq!(absent(&claims_stale(&empty.context())), [&LOG]);
+        assert_eq!(absent(&claims_stale(empty.context())), [&LOG]);
     }
 
     #[test]
