@@ -66,7 +66,8 @@ rules! {
     select_nuisances,
     /// A rotated elliptical PSF is tried in the place of more sources. Needed with the condition `ellipse`.
     rotated_ellipse,
-    /// Sources that do not exceed the misfit around them are removed. Nothing needs it in the trade-off; see `docs/accuracy.md`.
+    /// Sources that do not exceed the misfit around them are removed. No cell of the trade-off needs it; the scene `hazy-noon` does: without
+    /// it an alert more is raised.
     prune_spurious,
     /// Noise that grows with the light is estimated from the residual, and pixels are weighted by it. Needed with the condition `gains`.
     reweighting,
