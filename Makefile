@@ -5,6 +5,10 @@ comma := ,
 # install PACKAGE-IF-MISSING: $(call need,test command,packages)
 need = @$(1) >/dev/null 2>&1 || { echo "Installing $(2) (Debian packages)"; $(SUDO) apt-get update -qq && $(SUDO) env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends $(2) >/dev/null; }
 
+# A Python environment in target/NAME with what a file requires: $(call venv,NAME,FILE)
+venv = @cmp -s $(2) target/$(1)/installed.txt || { echo "Installing $(1)"; python3 -m venv --clear target/$(1) && \
+	target/$(1)/bin/pip install --quiet --requirement $(2) && cp $(2) target/$(1)/installed.txt; }
+
 .PHONY: run test build setup setup-test
 
 run: setup
@@ -12,6 +16,12 @@ run: setup
 	@cargo build --release --locked
 	@echo "Starting on the built-in simulator; stop with Ctrl-C"
 	@exec target/release/oapwatch run
+
+.PHONY: run-fleet
+# Three simulated access points, a NATS server and the hub, on this machine.
+run-fleet: build
+	$(call need,command -v nats-server,nats-server)
+	@deploy/run-fleet.sh
 
 build: setup
 	cargo build --release --locked
@@ -23,6 +33,10 @@ test: setup $(if $(CI),setup-test,test-skips)
 .PHONY: test-skips
 test-skips:
 	@command -v chromium chromium-browser google-chrome >/dev/null || echo "Skipping the page in a browser: Chromium is missing (make setup-test installs it)"
+	@test -x /usr/sbin/rsyslogd -a -x /usr/bin/prometheus-alertmanager || echo "Skipping other systems: rsyslog or prometheus-alertmanager is missing (make setup-test installs them)"
+	@test -x target/pymavlink/bin/python || echo "Skipping telemetry sent by pymavlink: it is missing (make setup-test installs it)"
+	@command -v nats-server >/dev/null || echo "Skipping the fleet with a real server: nats-server is missing (make setup-test installs it)"
+	@test -x target/systems/bin/taky || echo "Skipping TAK and SAPIENT: taky or sapient-pydantic is missing (make setup-test installs them)"
 	@test -x target/schemathesis/bin/schemathesis || echo "Skipping requests made from the API's description: schemathesis is missing (make setup-test installs it)"
 
 .PHONY: test-checked
@@ -37,10 +51,12 @@ setup:
 
 setup-test:
 	$(call need,command -v chromium,chromium chromium-driver)
+	$(call need,test -x /usr/sbin/rsyslogd -a -e /usr/lib/$(shell uname -m)-linux-gnu/rsyslog/lmnsd_gtls.so -a -x /usr/bin/prometheus-alertmanager,rsyslog rsyslog-gnutls prometheus-alertmanager)
+	$(call need,command -v nats-server,nats-server)
 	$(call need,python3 -c 'import ensurepip$(comma) venv',python3-venv)
-	@cmp -s tests/schemathesis/requirements.txt target/schemathesis/installed.txt || { echo "Installing schemathesis"; \
-		python3 -m venv --clear target/schemathesis && target/schemathesis/bin/pip install --quiet --requirement tests/schemathesis/requirements.txt \
-		&& cp tests/schemathesis/requirements.txt target/schemathesis/installed.txt; }
+	$(call venv,schemathesis,tests/schemathesis/requirements.txt)
+	$(call venv,pymavlink,tests/platform/requirements.txt)
+	$(call venv,systems,tests/notify/requirements.txt)
 
 .PHONY: test-licences
 # A debug build of cargo-deny takes half the time of a release build and checks as fast.
@@ -125,7 +141,7 @@ test-aarch64: aarch64 build
 # Coverage-guided fuzzing, FUZZ_S seconds a target: libFuzzer with the address sanitizer, which a stable toolchain has too when told
 # that it is another one. Not in CI: it takes every dependency once more.
 FUZZ_S ?= 60
-FUZZ := npy config calibration scene claims http v4l2 locate onnx
+FUZZ := npy config calibration scene claims mavlink ulg http v4l2 locate onnx
 HOST = $(shell rustc -vV | sed -n 's/^host: //p')
 SANITIZED = RUSTC_BOOTSTRAP=1 RUSTFLAGS="-Zsanitizer=address" RUSTC_WRAPPER=$(CURDIR)/fuzz/rustc.sh
 fuzz: setup

@@ -2,7 +2,7 @@
 
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
-use utoipa::openapi::schema::{KnownFormat, ObjectBuilder, OneOfBuilder, Schema, SchemaFormat, Type};
+use utoipa::openapi::schema::{ArrayBuilder, KnownFormat, ObjectBuilder, OneOfBuilder, Schema, SchemaFormat, Type};
 
 /// One line of the network's log.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
@@ -15,10 +15,18 @@ pub struct Claim {
     pub x_m: f64,
     #[schema(minimum = -1e7, maximum = 1e7)]
     pub y_m: f64,
+    /// Height above the world's origin; on the ground where it is left out.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schema(minimum = -1e7, maximum = 1e7)]
+    pub z_m: Option<f64>,
     /// Standard deviation per axis of the claimed position.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schema(minimum = 0)]
     pub sigma_m: Option<f64>,
+    /// Covariance of the claimed position, in place of `sigma_m`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    #[schema(schema_with = cov_schema)]
+    pub cov_m2: Option<[[f64; 2]; 2]>,
     /// Power that the user reports to send; evidence only.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     #[schema(minimum = 0)]
@@ -26,6 +34,23 @@ pub struct Claim {
     #[serde(default)]
     #[schema(nullable)]
     pub state: ClaimState,
+}
+
+impl Claim {
+    /// An active user's claim to be at a place, m, without a word on its error.
+    pub fn at(time: Timestamp, user: String, [x_m, y_m]: [f64; 2]) -> Self {
+        Self {
+            time,
+            user,
+            x_m,
+            y_m,
+            z_m: None,
+            sigma_m: None,
+            cov_m2: None,
+            power_w: None,
+            state: ClaimState::Active,
+        }
+    }
 }
 
 /// Whether the user still transmits.
@@ -144,6 +169,12 @@ fn user_schema() -> Schema {
         .pattern(Some(name_pattern()));
     let either = OneOfBuilder::new().item(text).item(number()).build();
     Schema::OneOf(either)
+}
+
+fn cov_schema() -> Schema {
+    let two = || ArrayBuilder::new().min_items(Some(2)).max_items(Some(2));
+    let rows = two().items(two().items(number()));
+    Schema::Array(rows.description(Some("Symmetric and not negative, m²")).build())
 }
 
 fn number() -> ObjectBuilder {

@@ -5,7 +5,10 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 
 use crate::estimate::Learned;
-use crate::{api, calibrate, claims, estimate, frames, journal, logging, monitor, notify, optics, scene, toml_file};
+use crate::{
+    api, calibrate, claims, estimate, export, fleet, frames, geo, journal, logging, monitor, notify, optics, platform,
+    scene, toml_file,
+};
 
 /// A config file. Every table may be left out.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
@@ -13,18 +16,28 @@ use crate::{api, calibrate, claims, estimate, frames, journal, logging, monitor,
 pub struct Config {
     pub optics: optics::Config,
     pub source: frames::Config,
+    pub world: geo::Config,
+    pub platform: platform::Config,
     pub record: frames::record::Config,
     pub claims: claims::Config,
     pub estimator: estimate::Config,
     pub monitor: monitor::Config,
+    pub zone: Vec<monitor::zones::Config>,
+    pub known_light: Vec<monitor::KnownLightConfig>,
+    pub maintenance: Vec<monitor::MaintenanceConfig>,
     pub api: api::Config,
     pub journal: journal::Config,
     pub webhook: Vec<notify::Config>,
+    pub export: Vec<export::Config>,
+    pub fleet: fleet::Config,
     pub log: logging::Config,
     /// Keys that the file sets although the rest of it leaves them without effect; filled in by [`Config::load`].
     #[serde(skip)]
     pub unused: Vec<String>,
 }
+
+/// Share of the view from which ignored zones are warned of.
+const MUCH_IGNORED: f64 = 0.1;
 
 /// Why a config file cannot be used.
 #[derive(Debug, thiserror::Error)]
@@ -36,7 +49,18 @@ pub enum Error {
     #[error("{path}: {source}")]
     Optics { path: PathBuf, source: optics::Error },
     #[error("{path}: {source}")]
+    World { path: PathBuf, source: geo::ConfigError },
+    #[error("{path}: {source}")]
+    Platform {
+        path: PathBuf,
+        source: platform::ConfigError,
+    },
+    #[error("{path}: {source}")]
     Frames { path: PathBuf, source: frames::Error },
+    #[error(
+        "{path}: claims.origin: expected [world] origin = {{ latitude_deg, longitude_deg, height_m, datum }}, which replaces it"
+    )]
+    ClaimsOrigin { path: PathBuf },
     #[error("{path}: record.folder: expected a folder, since [record] is given; found nothing")]
     NoRecordFolder { path: PathBuf },
 }
@@ -86,11 +110,15 @@ impl Config {
 
     /// Reads a config without the calibration that it names.
     pub fn load_uncalibrated(path: &Path) -> Result<Self, Error> {
+        let given: toml::Table = toml_file::read(path)?;
+        if given.get("claims").is_some_and(|claims| claims.get("origin").is_some()) {
+            return Err(Error::ClaimsOrigin { path: path.to_owned() });
+        }
         let mut config: Self = toml_file::read(path)?;
         let base = path.parent().unwrap_or(Path::new("")).to_owned();
         config.rebase(&base);
         config.validate(path)?;
-        let given: toml::Table = toml_file::read(path)?;
+        config.claims.axes = config.world.axes();
         if given.contains_key("record") && config.record.folder.is_none() {
             return Err(Error::NoRecordFolder { path: path.to_owned() });
         }
@@ -101,6 +129,14 @@ impl Config {
     /// Checks the numbers of the tables that do not check them where they are used.
     fn validate(&self, path: &Path) -> Result<(), Error> {
         self.optics.validate().map_err(|source| Error::Optics {
+            path: path.to_owned(),
+            source,
+        })?;
+        self.world.validate().map_err(|source| Error::World {
+            path: path.to_owned(),
+            source,
+        })?;
+        self.platform.validate().map_err(|source| Error::Platform {
             path: path.to_owned(),
             source,
         })?;
@@ -129,6 +165,7 @@ impl Config {
             let is_used = match key {
                 "network" => is_learned,
                 "known_power" => name == "map",
+                "memory_s" => name == "sequence",
                 _ => true,
             };
             if !is_used {
@@ -149,7 +186,20 @@ impl Config {
                 "monitor.tolerated_distance_m = {tolerated}: no user in the field of view, {diagonal:.3} m across, can be that far from a claim"
             ));
         }
+        warnings.extend(self.ignored_ground(camera));
         warnings
+    }
+
+    /// Zones in which a stranger raises nothing, where they are much of the view. A config whose zones cannot be used is refused
+    /// elsewhere.
+    fn ignored_ground(&self, camera: &optics::Camera) -> Option<String> {
+        let zones = monitor::zones::load(&self.zone).ok()?;
+        let half = camera.to_ground([camera.x.half_width(), camera.y.half_width()]);
+        let share = monitor::zones::ignored_share(zones, half);
+        (share > MUCH_IGNORED).then(|| {
+            let percent = (100.0 * share).round();
+            format!("zone: those of kind \"ignore\" cover {percent} % of the view; a stranger there raises nothing")
+        })
     }
 
     fn rebase(&mut self, base: &Path) {
@@ -160,12 +210,17 @@ impl Config {
             &mut self.source.scene,
             &mut self.source.frames,
             &mut self.record.folder,
+            &mut self.platform.poses,
+            &mut self.platform.signing_key_file,
             &mut self.claims.log,
             &mut self.api.token_file,
             &mut self.api.read_token_file,
             &mut self.api.tls_cert_file,
             &mut self.api.tls_key_file,
             &mut self.journal.path,
+            &mut self.fleet.ca_file,
+            &mut self.fleet.credentials_file,
+            &mut self.fleet.nkey_file,
         ];
         for path in optional.into_iter().flatten() {
             *path = located(base, path, credentials.as_deref());
@@ -173,8 +228,24 @@ impl Config {
         if let api::Listen::Unix(path) = &mut self.api.listen {
             *path = located(base, path, credentials.as_deref());
         }
+        for zone in &mut self.zone {
+            if let Some(path) = &mut zone.geojson {
+                *path = located(base, path, credentials.as_deref());
+            }
+        }
         for webhook in &mut self.webhook {
             let files = [Some(&mut webhook.secret_file), webhook.ca_file.as_mut()];
+            for path in files.into_iter().flatten() {
+                *path = located(base, path, credentials.as_deref());
+            }
+        }
+        for export in &mut self.export {
+            let files = [
+                &mut export.ca_file,
+                &mut export.client_cert_file,
+                &mut export.client_key_file,
+                &mut export.token_file,
+            ];
             for path in files.into_iter().flatten() {
                 *path = located(base, path, credentials.as_deref());
             }
@@ -261,7 +332,7 @@ mod tests {
             while let Some((name, table)) = tables.pop() {
                 let header = match name.as_str() {
                     "" => String::new(),
-                    "webhook" => "[[webhook]]".to_owned(),
+                    "webhook" | "export" | "zone" | "known_light" | "maintenance" => format!("[[{name}]]"),
                     name => format!("[{name}]"),
                 };
                 for key in keys_of(&header) {
@@ -298,12 +369,26 @@ mod tests {
             ("[source]\nrate_hz = -5", "source.rate_hz: expected"),
             ("[source]\nkind = \"replay\"\nspeed = -1", "source.speed: expected"),
             ("[source.v4l2]\nstall_s = 0", "source.v4l2.stall_s: expected"),
+            (
+                "[world]\norigin = { latitude_deg = 91, longitude_deg = 0, height_m = 0, datum = \"msl\" }",
+                "world.origin.latitude_deg: expected",
+            ),
+            (
+                "[platform]\nmount = { yaw_deg = 1000 }",
+                "platform.mount.yaw_deg: expected",
+            ),
+            ("[platform]\nkind = \"replay\"", "platform.poses: expected"),
+            ("[platform]\npose_lost_s = 0", "platform.pose_lost_s: expected"),
             ("[record]\nlimit_mb = 10", "record.folder: expected a folder"),
             ("[record]\nfolder = \"r\"\nbefore_s = 1e9", "record.before_s: expected"),
         ] {
             let error = loaded(text).expect_err(text);
             assert!(error.contains(expected) && error.contains("found"), "{text}: {error}");
         }
+        let origin = "[claims.origin]\nlatitude_deg = 48\nlongitude_deg = 11";
+        assert!(loaded(origin).expect_err("replaced").contains("[world] origin"));
+        let undated = "[world]\norigin = { latitude_deg = 48, longitude_deg = 11, height_m = 5 }";
+        assert!(loaded(undated).expect_err("no datum").contains("datum"));
         loaded("[optics]\nspot_sigma_m = 0.01\n[record]\nfolder = \"r\"").unwrap();
     }
 

@@ -14,12 +14,15 @@ use mimalloc as _;
 
 pub mod claim;
 pub mod frame;
+pub mod geo;
 pub mod hash;
 pub mod logging;
 pub mod metric;
 pub mod optics;
+pub mod pose;
 pub mod stats;
 pub mod toml_file;
+pub mod ulog;
 
 pub mod assign;
 pub mod estimate;
@@ -28,11 +31,15 @@ pub mod scene;
 pub mod calibrate;
 pub mod claims;
 pub mod frames;
+pub mod platform;
 
 pub mod monitor;
 
 #[allow(clippy::disallowed_methods, reason = "requests have deadlines and are dated")]
 pub mod api;
+pub mod export;
+#[allow(clippy::disallowed_methods, reason = "messages are dated")]
+pub mod fleet;
 pub mod journal;
 pub mod notify;
 #[allow(clippy::disallowed_methods, reason = "the time of an estimate is a result")]
@@ -46,6 +53,8 @@ pub mod config;
     reason = "it lives in the present and hands the time down"
 )]
 pub mod daemon;
+#[allow(clippy::disallowed_methods, reason = "silence is measured in the hub's own time")]
+pub mod hub;
 #[allow(
     clippy::disallowed_methods,
     reason = "a stage's time is a metric and decides nothing"

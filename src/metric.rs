@@ -9,12 +9,16 @@ pub const FRAMES_DROPPED: &str = "oapwatch_frames_dropped_total";
 pub const FRAMES_UNUSABLE: &str = "oapwatch_frames_unusable_total";
 /// The time budget of the estimator ended before its search did.
 pub const FRAMES_CUT_SHORT: &str = "oapwatch_frames_cut_short_total";
+/// Weighted squared residual per degree of freedom of the latest frame.
+pub const REDUCED_CHI2: &str = "oapwatch_frame_reduced_chi2";
+/// Share of a spot's light by which the spots of the latest frame were taken to differ from the model.
+pub const SPOT_ERROR: &str = "oapwatch_frame_spot_error";
 pub const LAST_GOOD_FRAME: &str = "oapwatch_last_good_frame_timestamp_seconds";
 /// Label `stage`: one of [`STAGES`].
 pub const STAGE_SECONDS: &str = "oapwatch_stage_duration_seconds";
 /// From the end of the exposure to the published report.
 pub const FRAME_SECONDS: &str = "oapwatch_frame_latency_seconds";
-/// Label `status`: verified, mismatch, unclaimed, pending.
+/// Label `status`: verified, mismatch, unclaimed, pending, known, ignored.
 pub const EMITTERS: &str = "oapwatch_emitters";
 pub const USERS_UNSEEN: &str = "oapwatch_users_unseen";
 /// Label `kind`.
@@ -25,12 +29,28 @@ pub const ALERTS_OPEN: &str = "oapwatch_alerts_open";
 pub const CLAIMS: &str = "oapwatch_claims_total";
 pub const CLAIMS_LAST: &str = "oapwatch_claims_last_timestamp_seconds";
 pub const CLAIMS_SKIPPED: &str = "oapwatch_claims_log_skipped_bytes_total";
+pub const POSES: &str = "oapwatch_poses_total";
+/// Label `reason`.
+pub const POSE_REFUSED: &str = "oapwatch_pose_refused_total";
+/// Of the newest pose, when it was last used.
+pub const POSE_AGE: &str = "oapwatch_pose_age_seconds";
+pub const POSE_CLOCK_ERROR: &str = "oapwatch_pose_clock_error_seconds";
 /// Labels `endpoint` and `outcome`.
 pub const WEBHOOK_ATTEMPTS: &str = "oapwatch_webhook_attempts_total";
 /// Label `endpoint`, as of the three.
 pub const WEBHOOK_QUEUED: &str = "oapwatch_webhook_queued";
 pub const WEBHOOK_OLDEST: &str = "oapwatch_webhook_oldest_queued_seconds";
 pub const WEBHOOK_DEAD_LETTERS: &str = "oapwatch_webhook_dead_letters";
+/// Label `outcome`: stored, failed.
+pub const FLEET_ALERTS: &str = "oapwatch_fleet_alerts_total";
+/// Labels `topic` and `outcome`: sent, failed; at the hub: taken, or why refused.
+pub const FLEET_MESSAGES: &str = "oapwatch_fleet_messages_total";
+pub const FLEET_CONNECTED: &str = "oapwatch_fleet_connected";
+pub const FLEET_WAITING: &str = "oapwatch_fleet_alerts_waiting";
+/// Labels `endpoint` and `outcome`.
+pub const EXPORT_HEARD: &str = "oapwatch_export_heard_total";
+/// Labels `endpoint` and `outcome`.
+pub const EXPORT_UPDATES: &str = "oapwatch_export_updates_total";
 pub const JOURNAL_BYTES: &str = "oapwatch_journal_bytes";
 /// 1 while alerts reach the disk.
 pub const JOURNAL_WRITABLE: &str = "oapwatch_journal_writable";
@@ -105,6 +125,29 @@ pub fn describe() {
         Unit::Seconds,
         "Unix time of the last frame with a result; 0 before the first."
     );
+    c!(POSES, "Poses of the autopilot that were taken.");
+    c!(
+        POSE_REFUSED,
+        "Telemetry that was refused, by reason: malformed, checksum, other_system, unsigned, signature, replayed, time, attitude, position, frame, unplaced, duplicate."
+    );
+    g!(
+        POSE_AGE,
+        Unit::Seconds,
+        "Age of the newest pose at the latest frame; absent on a fixed platform."
+    );
+    g!(
+        POSE_CLOCK_ERROR,
+        Unit::Seconds,
+        "Largest error of the autopilot's clock against the camera's, by TIMESYNC; absent where it is not answered."
+    );
+    g!(
+        REDUCED_CHI2,
+        "Weighted squared residual per degree of freedom of the latest frame; near 1 where the model explains it."
+    );
+    g!(
+        SPOT_ERROR,
+        "Share of a spot's light by which the latest frame's spots differ from the model; 0 where it explains them."
+    );
     h!(STAGE_SECONDS, Unit::Seconds, "Time a frame spends in each stage.");
     h!(
         FRAME_SECONDS,
@@ -126,16 +169,34 @@ pub fn describe() {
         Unit::Seconds,
         "Unix time stated by the newest accepted claim; 0 before the first."
     );
-    c!(WEBHOOK_ATTEMPTS, "Webhook delivery attempts, by endpoint and outcome.");
-    g!(WEBHOOK_QUEUED, "Webhook deliveries in the queue.");
+    c!(
+        WEBHOOK_ATTEMPTS,
+        "Delivery attempts of webhooks and exports, by endpoint and outcome."
+    );
+    g!(WEBHOOK_QUEUED, "Deliveries of webhooks and exports in the queue.");
     g!(
         WEBHOOK_OLDEST,
         Unit::Seconds,
-        "Age of the oldest webhook delivery in the queue."
+        "Age of the oldest delivery of a webhook or export in the queue."
     );
     g!(
         WEBHOOK_DEAD_LETTERS,
-        "Webhook deliveries that failed for good and are kept for a replay."
+        "Deliveries of webhooks and exports that failed for good and are kept for a replay."
+    );
+    c!(FLEET_ALERTS, "Alert events published to the fleet, by outcome.");
+    c!(
+        FLEET_MESSAGES,
+        "Fleet messages other than a station's alerts, by topic and outcome."
+    );
+    g!(FLEET_CONNECTED, "1 while the NATS server is connected.");
+    g!(FLEET_WAITING, "Alert events that wait for the NATS server.");
+    c!(
+        EXPORT_HEARD,
+        "Messages from the receivers of exports, by endpoint and what became of them."
+    );
+    c!(
+        EXPORT_UPDATES,
+        "Rounds of latest positions and open alerts to exports, by endpoint and outcome."
     );
     g!(JOURNAL_BYTES, Unit::Bytes, "Size of the journal on disk.");
     g!(JOURNAL_WRITABLE, "1 while alerts reach the disk, else 0.");

@@ -9,8 +9,11 @@ use crate::config::Config;
 use crate::estimate::{self, Estimate, Estimator};
 use crate::frame::Frame;
 use crate::frames::{self, SourceKind};
-use crate::monitor::{self, Monitor, Observation, Report};
+use crate::monitor::zones::{self, Zone};
+use crate::monitor::{self, KnownLight, Look, Monitor, Observation, Report, Window};
+use crate::notify;
 use crate::optics::Camera;
+use crate::platform::{self, Placement, Platform};
 
 /// Why a config describes no pipeline.
 #[derive(Debug, thiserror::Error)]
@@ -19,10 +22,14 @@ pub enum Error {
     Estimator(#[from] estimate::ConfigError),
     #[error(transparent)]
     Monitor(#[from] monitor::ConfigError),
+    #[error("{0}")]
+    Places(String),
     #[error(transparent)]
     Claims(#[from] claims::ConfigError),
     #[error(transparent)]
     Source(#[from] frames::Error),
+    #[error(transparent)]
+    Platform(#[from] platform::Error),
 }
 
 /// Owns everything that one frame after another goes through.
@@ -31,14 +38,52 @@ pub struct Pipeline {
     /// Time allowed a frame.
     budget: Option<Duration>,
     saturation_j: f64,
+    platform: Platform,
     pub claims: Store,
     pub monitor: Monitor,
+}
+
+/// The zones, known lights and maintenance windows of a config, checked.
+#[derive(Clone, Debug)]
+pub struct Places {
+    zones: Vec<Zone>,
+    lights: Vec<KnownLight>,
+    windows: Vec<Window>,
+}
+
+impl Places {
+    pub fn of(config: &Config) -> Result<Self, Error> {
+        let zones = zones::load(&config.zone).map_err(|e| Error::Places(e.to_string()))?;
+        let known = notify::names(&config.webhook);
+        for zone in &zones {
+            if let Some(name) = zone.webhooks.iter().flatten().find(|name| !known.contains(name)) {
+                let message = format!(
+                    "zone {:?}: webhooks: expected the name of a [[webhook]], found {name:?}",
+                    zone.name
+                );
+                return Err(Error::Places(message));
+            }
+        }
+        Ok(Self {
+            zones,
+            lights: monitor::known_lights_of(&config.known_light).map_err(Error::Places)?,
+            windows: monitor::windows_of(&config.maintenance).map_err(Error::Places)?,
+        })
+    }
+
+    /// Puts them in force in place of those of an earlier config.
+    pub fn put(self, monitor: &mut Monitor) -> Result<(), Error> {
+        let put = monitor.set_fixed(self.zones, self.lights, self.windows);
+        put.map_err(|e| Error::Places(e.to_string()))
+    }
 }
 
 /// What became of a frame.
 pub struct Step {
     pub report: Report,
     pub estimate: Result<Estimate, estimate::Error>,
+    /// Where the camera was.
+    pub placement: Placement,
     /// Time the estimator took.
     pub estimation: Duration,
     /// Time the monitor took.
@@ -57,13 +102,21 @@ impl Pipeline {
             file: file.map(|f| f.display().to_string()),
             rate_hz: config.source.frame_rate_hz()?,
         };
+        let mut monitor = Monitor::new(&config.monitor, &config.claims, camera, source);
+        Places::of(config)?.put(&mut monitor)?;
         Ok(Self {
             estimator: estimate::build(&config.estimator, camera)?,
             budget: config.estimator.budget(),
             saturation_j: camera.saturation_limit_j(),
+            platform: Platform::open(&config.platform, &config.world, camera.altitude_m)?,
             claims: Store::new(&config.claims),
-            monitor: Monitor::new(&config.monitor, &config.claims, camera, source),
+            monitor,
         })
+    }
+
+    /// The buffer that an autopilot's poses go into; none where they come from elsewhere.
+    pub fn live_poses(&self) -> Option<platform::SharedPoses> {
+        self.platform.live()
     }
 
     pub fn estimator(&self) -> &'static str {
@@ -94,16 +147,34 @@ impl Pipeline {
             None => self.estimator.estimate_until(frame, &is_over),
         };
         let estimated = Instant::now();
+        let placement = self.platform.at(frame.time);
+        let look = match &placement {
+            Placement::Level => Look::Level,
+            Placement::At { sight, pose, is_lost } => Look::From {
+                sight,
+                age_s: pose.age_s,
+                is_lost: *is_lost,
+            },
+            Placement::Unknown { waited_s, is_lost } => Look::Unknown {
+                waited_s: *waited_s,
+                is_lost: *is_lost,
+            },
+        };
         let observation = Observation {
             frame: frame.index,
             time: frame.time,
             result: estimate.as_ref(),
             digest,
+            look,
         };
         let report = self.monitor.step(observation, &mut self.claims);
+        if let (Placement::At { pose, .. }, Some(error)) = (&placement, self.monitor.pose_error()) {
+            self.platform.learn(error, pose);
+        }
         Step {
             report,
             estimate,
+            placement,
             estimation: estimated - began,
             verdicts: estimated.elapsed(),
         }
@@ -123,6 +194,7 @@ impl Pipeline {
             is_cut_short: false,
             estimator: self.estimator.name(),
             reduced_chi2: f64::NAN,
+            spot_error: 0.0,
             saturated_share,
             condition: 1.0,
             steps: 0,

@@ -175,3 +175,115 @@ fn input_that_cannot_be_used_is_named() {
     let out = oapwatch(&[&"locate", &"--config", &at("broken.toml"), &frames]);
     assert_eq!(out.status.code(), Some(64), "{}", String::from_utf8_lossy(&out.stderr));
 }
+
+/// Frames of a scene, and a config that takes its spots for Gaussians: `frames.npy` and `device.toml` in `dir`.
+fn scene_frames(dir: &Path, optics: &str, emitters: &str, effects: &str, frames: usize) {
+    let at = |name: &str| dir.join(name);
+    let optics = format!("[optics]\npixels = [48, 48]\nsensor_size_m = [0.0225, 0.0225]\n{optics}\n");
+    let scene = format!(
+        "{optics}\n[link]\nintegration_time_s = 0.1\n\n{emitters}\n\n[effects]\nthermal_noise = {{}}\n{effects}\n"
+    );
+    std::fs::write(at("scene.toml"), scene).unwrap();
+    std::fs::write(at("device.toml"), optics).unwrap();
+    let made = oapwatch(&[
+        &"simulate",
+        &"--scene",
+        &at("scene.toml"),
+        &"--frames",
+        &frames.to_string(),
+        &"--seed",
+        &"3",
+        &"--out",
+        &dir,
+    ]);
+    assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
+}
+
+fn learned(dir: &Path) -> Output {
+    let at = |name: &str| dir.join(name);
+    oapwatch(&[
+        &"calibrate",
+        &"--config",
+        &at("device.toml"),
+        &"--out",
+        &at("calibration.toml"),
+        &"--picture",
+        &at("spot.svg"),
+        &"--json",
+        &at("frames.npy"),
+    ])
+}
+
+/// Six beams anywhere in view, some of them overlapping.
+const SIX: &str = "[random_emitters]\ncount = [6, 6]\narea_m = [170.0, 170.0]";
+
+#[test]
+fn an_airy_disc_is_learned_from_frames_of_unknown_positions() {
+    let dir = tempfile::tempdir().unwrap();
+    let effects = "[effects.spot]\nkind = \"airy\"\nfirst_zero_m = 2.0e-3";
+    scene_frames(dir.path(), "spot_sigma_m = 7.5e-4", SIX, effects, 60);
+    let out = learned(dir.path());
+    assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
+    let report: serde_json::Value = serde_json::from_slice(&out.stdout).unwrap();
+    let reduced =
+        |key: &str| report[key]["chi2"].as_f64().unwrap() / report[key]["degrees_of_freedom"].as_f64().unwrap();
+    // Twelve held-out frames of some 2,000 pixels each scatter by one per cent; spots that overlap closely add a little.
+    assert!(reduced("before") > 2.0 && reduced("after") < 1.1, "{report}");
+    assert!(
+        (report["noise_std_j"].as_f64().unwrap() / 1e-6 - 1.0).abs() < 0.03,
+        "{report}"
+    );
+    // Of an Airy disc 83.8 % lies within the first dark ring (Rayleigh, 1881).
+    let curve = report["spot"]["encircled_energy"].as_array().unwrap();
+    let near = curve
+        .iter()
+        .min_by_key(|p| ((p[0].as_f64().unwrap() - 2.0e-3).abs() * 1e9) as i64)
+        .unwrap();
+    assert!((near[1].as_f64().unwrap() - 0.838).abs() < 0.03, "{near}");
+    assert!(
+        std::fs::read_to_string(dir.path().join("spot.svg"))
+            .unwrap()
+            .starts_with("<svg")
+    );
+
+    // What was written is read back and names the shape.
+    std::fs::write(
+        dir.path().join("calibrated.toml"),
+        std::fs::read_to_string(dir.path().join("device.toml")).unwrap() + "calibration = \"calibration.toml\"\n",
+    )
+    .unwrap();
+    let out = oapwatch(&[&"check", &dir.path().join("calibrated.toml")]);
+    assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
+    let text = std::fs::read_to_string(dir.path().join("calibration.toml")).unwrap();
+    assert!(text.contains("[spot.shape]") && text.contains("error ="), "{text}");
+}
+
+#[test]
+fn a_gaussian_that_is_known_is_not_calibrated_again() {
+    let dir = tempfile::tempdir().unwrap();
+    scene_frames(dir.path(), "spot_sigma_m = 7.5e-4", SIX, "", 50);
+    let out = learned(dir.path());
+    let text = String::from_utf8_lossy(&out.stderr);
+    assert_eq!(out.status.code(), Some(1), "{text}");
+    assert!(text.contains("is as good as the learned one"), "{text}");
+    assert!(!dir.path().join("calibration.toml").exists());
+}
+
+#[test]
+fn frames_that_teach_nothing_are_refused() {
+    let still = "[[user]]\nname = \"u-1\"\nmotion.still = [20, -30]";
+    let weak = "[[user]]\nname = \"u-1\"\npower_w = 1e-5\nmotion.still = [20, -30]";
+    for (emitters, frames, expected) in [
+        (still, 100, "sixteenths of a pixel"),
+        (weak, 70, "no spots in 70 frames"),
+        (SIX, 10, "expected at least 15 frames, found 10"),
+    ] {
+        let dir = tempfile::tempdir().unwrap();
+        scene_frames(dir.path(), "spot_sigma_m = 7.5e-4", emitters, "", frames);
+        let out = learned(dir.path());
+        let text = String::from_utf8_lossy(&out.stderr);
+        assert_eq!(out.status.code(), Some(2), "{text}");
+        assert!(text.contains(expected), "{text}");
+        assert!(!dir.path().join("calibration.toml").exists());
+    }
+}

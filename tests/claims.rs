@@ -1,5 +1,8 @@
 //! The claims room from outside: a log that lives, and a store that cannot be filled up or lied into.
 
+#[path = "claims/formats.rs"]
+mod formats;
+
 use std::fs::{self, OpenOptions};
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -26,7 +29,9 @@ fn claim(user: &str, s: f64, x_m: f64) -> Claim {
         user: user.into(),
         x_m,
         y_m: 0.0,
+        z_m: None,
         sigma_m: None,
+        cov_m2: None,
         power_w: None,
         state: ClaimState::Active,
     }

@@ -1,10 +1,13 @@
 //! The estimators from outside: the bound, the covariance's honesty, the number of emitters, and frames that nobody meant.
 //! Frames are drawn here, from the optics alone.
 
+use std::sync::Arc;
+
 use ndarray::Array2;
 use oapwatch::assign::ospa;
 use oapwatch::estimate::{Config, ESTIMATORS, Error, Estimate, Estimator, Flags, KnownPower, build, position_bound};
 use oapwatch::frame::Frame;
+use oapwatch::optics::spot::{Field, SpotShape, Template};
 use oapwatch::optics::{self, Camera, psf};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -370,4 +373,155 @@ fn a_budget_ends_the_search_and_says_so() {
     assert!(short.emitters.iter().all(|e| e.flags.contains(Flags::OUT_OF_TIME)));
     assert!(!long.is_cut_short);
     assert_eq!(long.emitters.len(), 8);
+}
+
+/// A Moffat profile (1969) of index 2.5, of about the width of a Gaussian of `sigma_m`: lenses with scattered light have such halos.
+fn moffat(sigma_m: f64) -> impl Fn(f64, f64) -> f64 {
+    let scale = 2.05 * sigma_m;
+    let peak = 1.5 / (std::f64::consts::PI * scale * scale);
+    move |x, y| peak * (1.0 + (x * x + y * y) / (scale * scale)).powf(-2.5)
+}
+
+/// Spots of any density at places on the sensor, m, each with a peak of `snr` standard deviations of the noise.
+fn render_density(
+    camera: &Camera,
+    density: &dyn Fn(f64, f64) -> f64,
+    spots: &[([f64; 2], f64)],
+    rng: &mut ChaCha8Rng,
+) -> Array2<f64> {
+    const FINE: i32 = 4;
+    let noise = Normal::new(0.0, camera.noise_std_j).unwrap();
+    let mut pixels = Array2::from_shape_simple_fn(camera.shape(), || noise.sample(rng));
+    let pitch = camera.x.pitch_m;
+    for ((b, a), pixel) in pixels.indexed_iter_mut() {
+        for &([x, y], snr) in spots {
+            let mut sum = 0.0;
+            for k in 0..FINE * FINE {
+                let [i, j] = [k % FINE, k / FINE].map(|s| (f64::from(s) + 0.5) / f64::from(FINE) - 0.5);
+                sum += density(camera.x.centre(a) + i * pitch - x, camera.y.centre(b) + j * pitch - y);
+            }
+            *pixel += snr * camera.noise_std_j * sum / f64::from(FINE * FINE) / density(0.0, 0.0);
+        }
+    }
+    pixels
+}
+
+const FIVE: [[f64; 2]; 5] = [
+    [-9.1e-3, 8.3e-3],
+    [8.7e-3, 9.2e-3],
+    [0.4e-3, -0.7e-3],
+    [-8.2e-3, -9.4e-3],
+    [9.3e-3, -8.1e-3],
+];
+
+#[test]
+fn the_halo_of_a_lens_is_no_emitter_and_needs_no_calibration() {
+    let camera = camera(1e-3, 64, 1e-6);
+    let mut rng = ChaCha8Rng::seed_from_u64(22);
+    let spots = FIVE.map(|at| (at, 300.0));
+    let frame = frame(render_density(&camera, &moffat(1e-3), &spots, &mut rng));
+    let estimate = estimator(None, &camera).estimate(&frame).unwrap();
+    assert_eq!(estimate.emitters.len(), 5, "{:?}", places(&estimate));
+    assert!((0.001..=0.1).contains(&estimate.spot_error), "{}", estimate.spot_error);
+    for at in FIVE {
+        let nearest = estimate
+            .emitters
+            .iter()
+            .map(|e| (e.sensor_m[0] - at[0]).hypot(e.sensor_m[1] - at[1]));
+        // A tenth of a pixel.
+        assert!(nearest.fold(f64::MAX, f64::min) < 5e-5, "{at:?}");
+    }
+    let trusting = Camera {
+        spot_error: Some(0.0),
+        ..camera
+    };
+    let estimate = estimator(None, &trusting).estimate(&frame).unwrap();
+    assert!(estimate.emitters.len() > 5, "the halo is bright enough to tell");
+}
+
+#[test]
+fn strangers_beside_users_raise_no_spot_error() {
+    let camera = camera(1e-3, 64, 1e-6);
+    let mut rng = ChaCha8Rng::seed_from_u64(23);
+    let gaussian = |x: f64, y: f64| (-0.5 * (x * x + y * y) / 1e-6).exp();
+    let mut spots: Vec<_> = FIVE.map(|at| (at, 300.0)).into();
+    for ([x, y], [dx, dy]) in FIVE.into_iter().zip([[4e-3, 0.0], [-2e-3, -3e-3], [0.0, 4e-3]]) {
+        spots.push(([x + dx, y + dy], 20.0));
+    }
+    let frame = frame(render_density(&camera, &gaussian, &spots, &mut rng));
+    let estimate = estimator(None, &camera).estimate(&frame).unwrap();
+    assert_eq!(estimate.emitters.len(), 8, "{:?}", places(&estimate));
+    assert_eq!(estimate.spot_error, 0.0);
+}
+
+#[test]
+fn a_frame_without_noise_does_not_lose_its_brightest_beam() {
+    let camera = camera(1e-3, 64, 1e-6);
+    let mut rng = ChaCha8Rng::seed_from_u64(24);
+    for sigma in [0.9e-3, 0.986e-3, 1e-3, 1.1e-3] {
+        let silent = Camera {
+            noise_std_j: 1e-300,
+            ..camera.clone()
+        };
+        let gaussian = |x: f64, y: f64| (-0.5 * (x * x + y * y) / (sigma * sigma)).exp();
+        let at = [1.3e-3, -4.1e-3];
+        let frame = frame(render_density(&silent, &gaussian, &[(at, 2e297)], &mut rng));
+        let estimate = estimator(None, &camera).estimate(&frame).unwrap();
+        let nearest = estimate
+            .emitters
+            .iter()
+            .map(|e| (e.sensor_m[0] - at[0]).hypot(e.sensor_m[1] - at[1]));
+        assert!(
+            nearest.fold(f64::MAX, f64::min) < camera.x.pitch_m,
+            "{sigma}: {:?}",
+            places(&estimate)
+        );
+    }
+}
+
+#[test]
+fn a_measured_spot_reaches_its_bound_with_an_honest_covariance() {
+    let mut camera = camera(1e-3, 64, 1e-6);
+    let field = Field {
+        half_sensor_m: [camera.x.half_width(), camera.y.half_width()],
+    };
+    let template = Template::of_density(field, 2.5e-4, 9e-3, moffat(1e-3));
+    camera.spot_shape = Some(Arc::new(SpotShape::from_template(&template, 1e-5).unwrap()));
+    camera.spot_error = Some(0.0);
+    let mut estimator = estimator(None, &camera);
+    let mut rng = ChaCha8Rng::seed_from_u64(25);
+    let (mut ratio, mut inside, mut count) = (0.0, 0, 0.0);
+    for _ in 0..12 {
+        let spots: Vec<_> = FIVE
+            .iter()
+            .map(|at| (at.map(|v| v + rng.random_range(-1e-3..1e-3)), ENERGY_J))
+            .collect();
+        let noise = Normal::new(0.0, camera.noise_std_j).unwrap();
+        let mut pixels: Vec<f64> = (0..64 * 64).map(|_| noise.sample(&mut rng)).collect();
+        for &(at, energy) in &spots {
+            optics::add_spot(&camera, at, energy, &mut pixels);
+        }
+        let frame = frame(Array2::from_shape_vec((64, 64), pixels).unwrap());
+        let estimate = estimator.estimate(&frame).unwrap();
+        assert_eq!(estimate.emitters.len(), 5, "{:?}", places(&estimate));
+        let ground: Vec<_> = spots.iter().map(|s| camera.to_ground(s.0)).collect();
+        let bounds = position_bound(&camera, &ground, &[ENERGY_J; 5]);
+        for (p, bound) in ground.iter().zip(bounds) {
+            let e = (estimate.emitters.iter())
+                .min_by(|a, b| {
+                    let d = |e: &&oapwatch::estimate::Emitter| (e.x_m - p[0]).hypot(e.y_m - p[1]);
+                    d(a).total_cmp(&d(b))
+                })
+                .unwrap();
+            let d = [e.x_m - p[0], e.y_m - p[1]];
+            let [[a, b], [_, c]] = e.cov_m2;
+            let z = (c * d[0] * d[0] - 2.0 * b * d[0] * d[1] + a * d[1] * d[1]) / (a * c - b * b);
+            inside += u32::from(z < 5.99);
+            ratio += (d[0] * d[0] + d[1] * d[1]) / bound;
+            count += 1.0;
+        }
+    }
+    // Of 120 squared normal variates the mean is within 1 ± 0.13 two times in three.
+    assert!((0.6..1.5).contains(&(ratio / count)), "{}", ratio / count);
+    assert!(inside >= 52, "{inside} of 60 within the 95 % ellipse");
 }

@@ -34,7 +34,9 @@ fn claim(k: u64) -> Claim {
         // All 17 digits of it: a reader that rounds twice would show.
         x_m: 100.0 * (k as f64 + 0.1).sin(),
         y_m: -80.0 / 3.0,
+        z_m: None,
         sigma_m: Some(1.0),
+        cov_m2: None,
         power_w: None,
         state: ClaimState::Active,
     }

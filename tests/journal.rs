@@ -30,7 +30,11 @@ fn alert(id: &str, kind: AlertKind, raised_s: i64) -> Alert {
             frame: raised_s.unsigned_abs(),
             file: None,
         },
+        zone: None,
+        webhooks: None,
+        maintenance: None,
         acknowledgement: None,
+        station: None,
     }
 }
 
@@ -172,10 +176,12 @@ async fn matching_endpoints_get_an_outbox_row() {
     let config = at(&dir.path().join("a.db"));
     let subscriptions = vec![
         Subscription {
+            has_operator_acts: false,
             endpoint: "all".to_owned(),
             kinds: None,
         },
         Subscription {
+            has_operator_acts: false,
             endpoint: "unseen".to_owned(),
             kinds: Some(vec![AlertKind::UserUnseen]),
         },
@@ -202,6 +208,7 @@ async fn a_disk_that_refuses_writes_stops_nothing() {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("a.db");
     let all = Subscription {
+        has_operator_acts: false,
         endpoint: "all".to_owned(),
         kinds: None,
     };
@@ -285,6 +292,7 @@ async fn retention_keeps_what_is_open_or_still_to_be_delivered() {
     let dir = tempfile::tempdir().unwrap();
     let path = dir.path().join("a.db");
     let subscriptions = vec![Subscription {
+        has_operator_acts: false,
         endpoint: "unseen".to_owned(),
         kinds: Some(vec![AlertKind::UserUnseen]),
     }];

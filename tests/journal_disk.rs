@@ -28,7 +28,11 @@ fn raised(k: u64) -> AlertEvent {
             frame: k,
             file: None,
         },
+        zone: None,
+        webhooks: None,
+        maintenance: None,
         acknowledgement: None,
+        station: None,
     };
     AlertEvent {
         event: AlertEventKind::Raised,
@@ -42,6 +46,7 @@ fn open(dir: &Path) -> Journal {
         ..Config::default()
     };
     let all = Subscription {
+        has_operator_acts: false,
         endpoint: "all".to_owned(),
         kinds: None,
     };

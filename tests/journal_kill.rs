@@ -51,7 +51,11 @@ fn event(kind: AlertEventKind, id: &str) -> AlertEvent {
             frame: 1,
             file: None,
         },
+        zone: None,
+        webhooks: None,
+        maintenance: None,
         acknowledgement: None,
+        station: None,
     };
     AlertEvent { event: kind, alert }
 }

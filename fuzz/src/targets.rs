@@ -8,10 +8,14 @@ use oapwatch::claims::{self, Claim};
 use oapwatch::config::Config;
 use oapwatch::estimate;
 use oapwatch::frames::npy::Reader;
-use oapwatch::frames::v4l2::{Granted, Layout, PixelFormat, Region};
+use oapwatch::frames::v4l2::{Bayer, DecodeError, Decoding, Granted, Layout, PixelFormat, Region, Response, Transfer};
 use oapwatch::optics;
+use oapwatch::platform::mavlink::{self, Event, Moment, Signing};
+use oapwatch::platform::px4_log;
+use oapwatch::pose::PoseSigmas;
 use oapwatch::scene::{Plan, Scene};
 use oapwatch::study::stability::trial;
+use oapwatch::ulog;
 use sha2::{Digest, Sha256};
 
 /// Runs `target` on a file that holds `bytes`, in memory where that is possible.
@@ -122,9 +126,9 @@ pub fn v4l2(bytes: &[u8]) {
         return;
     };
     let word = |k: usize| u16::from_le_bytes([head[2 * k], head[2 * k + 1]]);
-    let formats = [PixelFormat::GREY, PixelFormat::Y10, PixelFormat::Y12];
+    let formats = PixelFormat::ALL;
     let granted = Granted {
-        format: formats[usize::from(head[18]) % 3],
+        format: formats[usize::from(head[18]) % formats.len()],
         width: word(0).into(),
         height: word(1).into(),
         stride: word(2).into(),
@@ -137,16 +141,29 @@ pub fn v4l2(bytes: &[u8]) {
     };
     let bit = |k: u8| head[19] >> k & 1 == 1;
     let shape = (usize::from(word(8) % 64) + 1, usize::from(word(7) % 64) + 1);
-    let Ok(layout) = Layout::new(granted, (!bit(0)).then_some(region), shape, [bit(1), bit(2)], None) else {
+    let decoding = Decoding {
+        region: (!bit(0)).then_some(region),
+        shape,
+        flip: [bit(1), bit(2)],
+        saturation: None,
+        response: Response {
+            transfer: Transfer::ALL[usize::from(head[19] >> 5) % Transfer::ALL.len()],
+            limited_range: bit(3),
+        },
+        black: 0.0,
+        bayer: if bit(4) { Bayer::Sites } else { Bayer::Binned },
+    };
+    let Ok(layout) = Layout::new(granted, &decoding) else {
         return;
     };
     match layout.decode(image) {
-        Some((counts, saturated)) => {
-            assert_eq!(counts.dim(), shape);
-            assert!(counts.iter().all(|c| *c >= 0.0 && c.is_finite()));
-            assert!(saturated.is_none_or(|s| s.dim() == shape));
+        Ok(decoded) => {
+            assert_eq!(decoded.counts.dim(), shape);
+            assert!(decoded.counts.iter().all(|c| c.is_finite() && (*c >= 0.0 || bit(3))));
+            assert!(decoded.saturated.is_none_or(|s| s.dim() == shape));
         }
-        None => assert!(image.len() < layout.bytes_needed()),
+        Err(DecodeError::Short { found, needed }) => assert!(found == image.len() && found < needed),
+        Err(DecodeError::Jpeg(reason)) => assert!(granted.format.is_compressed() && !reason.is_empty()),
     }
 }
 
@@ -203,4 +220,66 @@ pub fn onnx(bytes: &[u8]) {
             Err(e) => assert!(!e.to_string().is_empty()),
         }
     });
+}
+
+/// Telemetry: as one datagram, as a stream in two pieces, and as the payloads of frames whose checksums are right (message, length,
+/// payload; again). Every pose is a rotation with a finite place and a positive diagonal of its covariance.
+pub fn mavlink(bytes: &[u8]) {
+    let check = |event: Event| {
+        if let Event::Pose(sample) = event {
+            assert!((sample.attitude.norm() - 1.0).abs() < 1e-9);
+            assert!(sample.place.enu_m.iter().all(|v| v.is_finite()));
+            assert!(sample.cov.iter().all(|v| v.is_finite()));
+            assert!(sample.cov.diagonal().iter().all(|v| *v > 0.0));
+        }
+    };
+    let second = 1_000_000_000;
+    let moment = |k: usize| Moment {
+        now_ns: (k as i64 + 1) * second / 50,
+        unix_ns: 1_780_000_000 * second,
+    };
+    let heartbeat = mavlink::build(mavlink::Kind::Heartbeat, [1, 1], 0, &[0, 0, 0, 0, 2, 12], false);
+    let reader = |signing| {
+        let mut reader = mavlink::Reader::new(None, PoseSigmas::default(), signing);
+        reader.datagram(&heartbeat, moment(0), &mut |_| {});
+        reader
+    };
+    reader(None).datagram(bytes, moment(1), &mut |event| check(event));
+    reader(Some(Signing::new([1; 32]))).datagram(bytes, moment(1), &mut |event| check(event));
+    let (first, second) = bytes.split_at(bytes.len() / 2);
+    let mut stream = reader(None);
+    stream.stream(first, moment(1), &mut |event| check(event));
+    stream.stream(second, moment(1), &mut |event| check(event));
+
+    let mut framed = reader(None);
+    let mut rest = bytes;
+    for k in 1.. {
+        let [message, length, ref payload @ ..] = *rest else {
+            break;
+        };
+        let kind = mavlink::Kind::ALL[usize::from(message) % mavlink::Kind::ALL.len()];
+        let (payload, next) = payload.split_at(payload.len().min(length.into()));
+        framed.datagram(
+            &mavlink::build(kind, [1, 1], 0, payload, false),
+            moment(k),
+            &mut |event| check(event),
+        );
+        rest = next;
+    }
+}
+
+/// Flight logs: poses in order, each a rotation with a finite place, or a message.
+pub fn ulg(bytes: &[u8]) {
+    match ulog::read_from(bytes) {
+        Ok(log) => {
+            let poses = px4_log::poses(&log, PoseSigmas::default());
+            assert!(poses.is_sorted_by_key(|pose| pose.time_us));
+            for pose in poses {
+                assert!((pose.attitude.norm() - 1.0).abs() < 1e-9);
+                assert!(pose.place.enu_m.iter().all(|v| v.is_finite()) && pose.cov.iter().all(|v| v.is_finite()));
+            }
+        }
+        Err(ulog::Fault::Malformed(_, message)) => assert!(!message.is_empty()),
+        Err(ulog::Fault::Read(e)) => panic!("memory can be read: {e}"),
+    }
 }

@@ -1,53 +1,98 @@
-//! `POST /v1/claims`: parses a body of claims and hands them to the compute thread.
+//! `POST /v1/claims`: parses a body of claims in any of the formats and hands them to the compute thread.
 
 use axum::body::Bytes;
 use axum::extract::State as Shared;
 use axum::extract::rejection::BytesRejection;
+use axum::http::header::CONTENT_TYPE;
 use axum::http::{HeaderMap, StatusCode};
 use axum::response::Response;
+use serde::Deserialize;
 
 use super::client::Caller;
-use super::extract::check_media_type;
+use super::extract::{Query, check_media_type};
 use super::intake::Intake;
 use super::problem::Problem;
 use super::respond;
 use super::state::{Command, State, busy};
 use crate::claim::Claim;
-use crate::{claims, metric};
+use crate::claims::{self, Format, LineReader};
+use crate::metric;
 
 /// Claims taken from one body.
 const MAX_CLAIMS: usize = 20_000;
-/// Claims come as JSON or NDJSON, by whatever name.
-const MEDIA_TYPES: [&str; 6] = [
+/// Claims come as JSON or NDJSON, by whatever name, or in a format with a name of its own.
+const MEDIA_TYPES: [&str; 10] = [
     "application/json",
     "application/x-ndjson",
     "application/ndjson",
     "application/jsonl",
     "application/octet-stream",
     "text/plain",
+    "text/csv",
+    "application/xml",
+    "text/xml",
+    "application/cot+xml",
 ];
 /// A request with so many claims takes up as much of the queue to the monitor as one that has few.
 const CLAIMS_A_PLACE: usize = 500;
 
-/// Claims of a body with the line each stands on: one JSON object over any number of lines, or one a line. The fields
-/// are always the documented ones, whatever names the log has for them.
-fn parse(body: &[u8], intake: &mut Intake) -> Vec<(usize, Claim)> {
-    let names = claims::Config::default();
-    if let Ok(claim) = claims::parse_line(body, &names) {
+#[derive(Debug, Deserialize, utoipa::IntoParams)]
+#[into_params(parameter_in = Query)]
+#[serde(deny_unknown_fields)]
+pub struct ClaimsQuery {
+    /// How the claims are written. Left out, the media type says: `text/csv` is "csv", XML is "cot", anything else "oapwatch"
+    format: Option<Format>,
+}
+
+/// The format that a media type stands for.
+fn format_of(headers: &HeaderMap) -> Format {
+    let named = headers.get(CONTENT_TYPE).and_then(|value| value.to_str().ok());
+    let essence = named.and_then(|text| text.split(';').next()).unwrap_or_default();
+    match essence.trim().to_ascii_lowercase().as_str() {
+        "text/csv" => Format::Csv,
+        "application/xml" | "text/xml" | "application/cot+xml" => Format::Cot,
+        _ => Format::Oapwatch,
+    }
+}
+
+/// Cuts a body into what may be claims, each with the line that it begins on: lines, or XML events over any number of lines.
+fn pieces(body: &[u8], format: Format) -> Vec<(usize, &[u8])> {
+    let end: &[u8] = match format {
+        Format::Cot => b"</event>",
+        _ => b"\n",
+    };
+    let (mut found, mut rest, mut line) = (Vec::new(), body, 1);
+    while !rest.is_empty() {
+        let length = rest.windows(end.len()).position(|bytes| bytes == end);
+        let length = length.map_or(rest.len(), |at| at + end.len());
+        let (piece, after) = rest.split_at(length);
+        let blank = piece.iter().take_while(|byte| byte.is_ascii_whitespace());
+        let begins = line + blank.filter(|byte| **byte == b'\n').count();
+        if !piece.trim_ascii().is_empty() {
+            found.push((begins, piece));
+        }
+        line += piece.iter().filter(|byte| **byte == b'\n').count();
+        rest = after;
+    }
+    found
+}
+
+/// Claims of a body with the line each stands on: one JSON object over any number of lines, or one a line, or as the format has
+/// it. The fields are always the documented ones, whatever names the log has for them.
+fn parse(body: &[u8], reading: &claims::Config, intake: &mut Intake) -> Vec<(usize, Claim)> {
+    if let Ok(claim) = claims::parse_line(body, reading) {
         return vec![(1, claim)];
     }
     let mut found = Vec::new();
-    for (k, line) in body.split(|b| *b == b'\n').enumerate() {
-        if line.trim_ascii().is_empty() {
-            continue;
-        }
+    let mut reader = LineReader::default();
+    for (line, piece) in pieces(body, reading.format) {
         if found.len() == MAX_CLAIMS {
-            intake.refuse(k + 1, format!("more than {MAX_CLAIMS} claims in one body"));
+            intake.refuse(line, format!("more than {MAX_CLAIMS} claims in one body"));
             continue;
         }
-        match claims::parse_line(line, &names) {
-            Ok(claim) => found.push((k + 1, claim)),
-            Err(e) => intake.refuse(k + 1, e.to_string()),
+        match reader.read(piece, reading) {
+            Ok(claim) => found.extend(claim.map(|claim| (line, claim))),
+            Err(e) => intake.refuse(line, e.to_string()),
         }
     }
     found
@@ -56,29 +101,36 @@ fn parse(body: &[u8], intake: &mut Intake) -> Vec<(usize, Claim)> {
 /// Takes claims from the access network
 ///
 /// One claim as JSON, or one a line as NDJSON, at most 4 MiB of it; `Content-Encoding: gzip` is taken. Lines that cannot be taken
-/// are refused one by one, the others stand.
-#[utoipa::path(post, path = "/v1/claims", tag = "claims",
+/// are refused one by one, the others stand. 3GPP shapes, Cisco Spaces events, Cursor on Target and CSV are taken too, see `format`.
+#[utoipa::path(post, path = "/v1/claims", tag = "claims", params(ClaimsQuery),
     request_body(description = "A claim, or one a line", content(
-        (Claim = "application/json"), (String = "application/x-ndjson"))),
+        (Claim = "application/json"), (String = "application/x-ndjson"), (String = "text/csv"))),
     responses(
         (status = 200, description = "At least one claim was taken", body = Intake),
-        (status = 400, description = "The body cannot be read: no gzip, though it says so", body = Problem, content_type = "application/problem+json"),
+        (status = 400, description = "The query or the body cannot be read: no gzip, though it says so", body = Problem, content_type = "application/problem+json"),
         (status = 409, description = "The claims contradict, or are older than, what is known; `reasons` says which", body = Problem, content_type = "application/problem+json"),
         (status = 413, description = "The body is too large, sent or decompressed", body = Problem, content_type = "application/problem+json"),
-        (status = 415, description = "Neither JSON nor NDJSON, or neither plain nor gzip", body = Problem, content_type = "application/problem+json"),
+        (status = 415, description = "Neither JSON nor NDJSON nor another format that is taken, or neither plain nor gzip", body = Problem, content_type = "application/problem+json"),
         (status = 422, description = "No claim was taken; `reasons` says why", body = Problem, content_type = "application/problem+json"),
         (status = 503, description = "The monitor is too busy, or has no room for another user; come back", body = Problem, content_type = "application/problem+json"),
     ))]
 pub async fn post(
     Shared(state): Shared<State>,
     caller: Caller,
+    Query(query): Query<ClaimsQuery>,
     headers: HeaderMap,
     body: Result<Bytes, BytesRejection>,
 ) -> Result<Response, Problem> {
     check_media_type(&headers, &MEDIA_TYPES)?;
     let body = body?;
     let mut intake = Intake::default();
-    let (lines, claims): (Vec<_>, Vec<_>) = parse(&body, &mut intake).into_iter().unzip();
+    let format = query.format.unwrap_or_else(|| format_of(&headers));
+    let reading = claims::Config {
+        format,
+        axes: state.axes,
+        ..claims::Config::default()
+    };
+    let (lines, claims): (Vec<_>, Vec<_>) = parse(&body, &reading, &mut intake).into_iter().unzip();
     let sent = claims.len();
     metrics::counter!(metric::CLAIMS, "outcome" => "malformed").increment(intake.refused as u64);
     if sent > 0 {

@@ -6,7 +6,7 @@ use ndarray::Array2;
 
 use crate::estimate::{self, Emitter};
 use crate::frame::Frame;
-use crate::optics::{Camera, psf};
+use crate::optics::{self, Camera};
 
 /// Turns recorded frames into fits, one at a time: pictures that are asked for together must not take the cores that the live
 /// frames need.
@@ -64,16 +64,12 @@ impl Fitter {
 
 /// The frame that emitters give, J, no brighter than a pixel can be.
 fn predicted(camera: &Camera, emitters: &[Emitter]) -> Array2<f64> {
-    let mut model = Array2::zeros(camera.shape());
-    let (mut x, mut y) = (vec![0.0; camera.x.n], vec![0.0; camera.y.n]);
+    let (ny, nx) = camera.shape();
+    let mut model = vec![0.0; ny * nx];
     for emitter in emitters {
-        let sigma = camera.spot_sigma_at(emitter.sensor_m);
-        psf::profile(&camera.x, emitter.sensor_m[0], sigma, &mut x);
-        psf::profile(&camera.y, emitter.sensor_m[1], sigma, &mut y);
-        for ((row, column), value) in model.indexed_iter_mut() {
-            *value += emitter.energy_j * x[column] * y[row];
-        }
+        optics::add_spot(camera, emitter.sensor_m, emitter.energy_j, &mut model);
     }
+    let model = Array2::from_shape_vec((ny, nx), model).expect("one value a pixel");
     let ceiling = camera.saturation_j.unwrap_or(f64::INFINITY);
     model.mapv_into(|value: f64| value.min(ceiling))
 }

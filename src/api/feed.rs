@@ -97,15 +97,19 @@ struct Body<'a> {
 }
 
 impl Published {
+    /// Claims in and around the field of view, bounded in number.
+    pub fn claims_in_view(&self) -> impl Iterator<Item = &Claim> {
+        let [half_x, half_y] = self.snapshot.status.field_of_view_m;
+        let near = move |c: &&Claim| c.x_m.abs() <= 1.5 * half_x && c.y_m.abs() <= 1.5 * half_y;
+        self.snapshot.report.claims.iter().filter(near).take(CLAIMS_SHOWN)
+    }
+
     /// JSON object of the report, the claims in view and the status.
     pub fn body(&self) -> &str {
         self.body.get_or_init(|| {
-            let report = &self.snapshot.report;
-            let [half_x, half_y] = self.snapshot.status.field_of_view_m;
-            let near = |c: &&Claim| c.x_m.abs() <= 1.5 * half_x && c.y_m.abs() <= 1.5 * half_y;
             let body = Body {
-                report,
-                claims: report.claims.iter().filter(near).take(CLAIMS_SHOWN).collect(),
+                report: &self.snapshot.report,
+                claims: self.claims_in_view().collect(),
                 status: &self.snapshot.status,
             };
             serde_json::to_string(&body).expect("a snapshot is plain data")

@@ -22,11 +22,15 @@ mod frame;
 mod guard;
 mod history;
 mod intake;
+mod known_lights;
 mod listener;
+mod maintenance;
 mod openapi;
 mod page;
 mod picture;
 mod picture_cache;
+mod pose;
+mod pose_status;
 mod positions;
 mod probes;
 mod problem;
@@ -40,13 +44,19 @@ mod table;
 mod tokens;
 mod webhooks;
 mod websocket;
+mod zones;
 
 pub use config::{Config, ConfigError};
 pub use feed::Feed;
 pub use listener::{Listen, ListenError, Listener};
+pub use picture::frame_png;
+pub use pose_status::{PoseNow, PoseStatus};
 pub use server::{Error, Server};
-pub use snapshot::{ClaimsStatus, FrameCounts, JournalStatus, Latency, Snapshot, SourceState, SourceStatus, Status};
-pub use state::{Acknowledged, Command, State};
+pub use snapshot::{
+    ClaimsStatus, FrameCounts, JournalStatus, Latency, Snapshot, SourceState, SourceStatus, StationState,
+    StationStatus, Status,
+};
+pub use state::{Acknowledged, Command, State, ZonesRefused};
 pub use tokens::TokenError;
 
 use std::num::NonZeroU32;
@@ -131,7 +141,7 @@ fn cors(config: &Config) -> CorsLayer {
     }
     CorsLayer::new()
         .allow_origin(AllowOrigin::list(origins))
-        .allow_methods([Method::GET, Method::POST, Method::DELETE])
+        .allow_methods([Method::GET, Method::POST, Method::PUT, Method::DELETE])
         .allow_headers([header::AUTHORIZATION, header::CONTENT_TYPE, header::IF_NONE_MATCH])
         .expose_headers([header::ETAG, header::LINK, header::RETRY_AFTER])
         .max_age(Duration::from_secs(600))
@@ -145,6 +155,7 @@ async fn measure(request: Request, next: Next) -> Response {
     let method = match *request.method() {
         Method::GET => "GET",
         Method::POST => "POST",
+        Method::PUT => "PUT",
         Method::HEAD => "HEAD",
         Method::DELETE => "DELETE",
         _ => "other",

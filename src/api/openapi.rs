@@ -9,7 +9,10 @@ use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
 
 use super::state::State;
-use super::{acknowledge, alerts, audit_log, claims, evidence, frame, positions, probes, sse, webhooks, websocket};
+use super::{
+    acknowledge, alerts, audit_log, claims, evidence, frame, known_lights, maintenance, pose, positions, probes, sse,
+    webhooks, websocket, zones,
+};
 
 #[derive(OpenApi)]
 #[openapi(
@@ -42,6 +45,8 @@ pub fn router() -> (Router<State>, utoipa::openapi::OpenApi) {
         .routes(routes!(positions::history))
         .routes(routes!(positions::history_csv))
         .routes(routes!(positions::status))
+        .routes(routes!(pose::pose))
+        .routes(routes!(positions::stations))
         .routes(routes!(alerts::list))
         .routes(routes!(alerts::csv))
         .routes(routes!(alerts::get))
@@ -50,6 +55,11 @@ pub fn router() -> (Router<State>, utoipa::openapi::OpenApi) {
         .routes(routes!(evidence::png))
         .routes(routes!(evidence::json))
         .routes(routes!(claims::post))
+        .routes(routes!(known_lights::list, known_lights::approve))
+        .routes(routes!(known_lights::revoke))
+        .routes(routes!(zones::get, zones::put))
+        .routes(routes!(maintenance::list, maintenance::begin))
+        .routes(routes!(maintenance::end))
         .routes(routes!(frame::frame_png))
         .routes(routes!(websocket::websocket))
         .routes(routes!(sse::events))

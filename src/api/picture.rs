@@ -104,7 +104,7 @@ pub fn marks_of_alert(alert: &Alert, camera: &Camera) -> Vec<Mark> {
         .and_then(|c| Some([c["x_m"].as_f64()?, c["y_m"].as_f64()?]));
     let seen = alert.x_m.zip(alert.y_m).map(|(x, y)| [x, y]);
     let status = match alert.kind {
-        AlertKind::UnclaimedEmitter => PositionStatus::Unclaimed,
+        AlertKind::UnclaimedEmitter | AlertKind::KnownLightChanged => PositionStatus::Unclaimed,
         _ => PositionStatus::Mismatch,
     };
     let claimed = claimed.map(|place| (place, PositionStatus::Pending));
@@ -134,6 +134,14 @@ pub fn png(frame: &Frame, camera: &Camera, marks: &[Mark], scale: usize) -> Resu
     picture.panel(0, scale, |at| light(frame, at, low, high));
     picture.mark(0, camera, marks, scale);
     picture.encode()
+}
+
+/// PNG of a frame on its own, at least `side` picture pixels along its longer side.
+///
+/// # Errors
+/// The frame is too large for a PNG.
+pub fn frame_png(frame: &Frame, camera: &Camera, side: usize) -> Result<Vec<u8>, png::EncodingError> {
+    png(frame, camera, &[], scale_for(frame, side))
 }
 
 /// PNG of a fit: the data, the model on the same scale of colours, and the residual, from -5 σ (blue) over black to +5 σ (orange).
@@ -199,6 +207,10 @@ fn outline(status: PositionStatus, dx: f64, dy: f64) -> f64 {
     let circle = (dx.hypot(dy) - radius).abs();
     match status {
         PositionStatus::Verified => circle,
+        // A triangle.
+        PositionStatus::Known | PositionStatus::Ignored => (dy - 0.6 * radius)
+            .max(0.866 * dx.abs() - 0.5 * dy - 0.6 * radius)
+            .abs(),
         PositionStatus::Pending if (dy.atan2(dx) * 4.0 / std::f64::consts::PI).rem_euclid(2.0) < 1.0 => circle,
         PositionStatus::Pending => f64::INFINITY,
         PositionStatus::Mismatch => (dx.abs() + dy.abs() - 1.3 * radius).abs() * std::f64::consts::FRAC_1_SQRT_2,
@@ -219,6 +231,7 @@ fn mark(picture: &mut Picture, left: usize, [cx, cy]: [f64; 2], status: Position
         PositionStatus::Pending => ([255, 255, 255], black),
         PositionStatus::Mismatch => ([240, 228, 66], black),
         PositionStatus::Unclaimed => ([255, 255, 255], [225, 40, 20]),
+        PositionStatus::Known | PositionStatus::Ignored => ([170, 170, 170], black),
     };
     let reach = 24;
     for py in (cy as i64 - reach)..=(cy as i64 + reach) {

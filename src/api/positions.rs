@@ -11,7 +11,7 @@ use super::extract::{Path, Query, within};
 use super::feed::Published;
 use super::history::{Moment, PastBeam};
 use super::problem::Problem;
-use super::snapshot::Status;
+use super::snapshot::{StationStatus, Status};
 use super::state::State;
 use super::table::{self, Columns};
 use super::{conditional, respond};
@@ -66,6 +66,27 @@ pub async fn user_position(
         user,
     };
     Ok(conditional::answer(&headers, latest.seq, || respond::json(&found)))
+}
+
+/// The access points of a hub.
+#[derive(Debug, Serialize, utoipa::ToSchema)]
+pub struct Stations<'a> {
+    stations: &'a [StationStatus],
+}
+
+/// The access points of a hub, with their health; none at an access point itself
+#[utoipa::path(get, path = "/v1/stations", tag = "fleet",
+    responses(
+        (status = 200, description = "Every access point that has said anything since the hub began", body = Stations<'_>),
+        (status = 304, description = "Nothing new since the ETag given in If-None-Match"),
+        (status = 503, description = "Nothing has been looked at yet", body = Problem, content_type = "application/problem+json"),
+    ))]
+pub async fn stations(Shared(state): Shared<State>, headers: HeaderMap) -> Result<Response, Problem> {
+    let latest = latest(&state)?;
+    Ok(conditional::answer(&headers, latest.seq, || {
+        let stations = &latest.snapshot.status.stations;
+        respond::json(&Stations { stations })
+    }))
 }
 
 /// How the monitor itself is doing

@@ -6,6 +6,7 @@ use std::sync::Arc;
 use jiff::Timestamp;
 use serde::Serialize;
 
+use super::pose_status::PoseStatus;
 use crate::frame::Frame;
 use crate::monitor::{AlertKind, Report};
 use crate::notify::EndpointStatus;
@@ -18,6 +19,8 @@ pub struct Snapshot {
     /// The pixels the report was made from; `None` when the step had no usable frame.
     pub frame: Option<Arc<Frame>>,
     pub camera: Arc<Camera>,
+    /// `None` for a hub, which has no platform.
+    pub pose: Option<PoseStatus>,
     pub status: Status,
 }
 
@@ -38,6 +41,40 @@ pub struct Status {
     pub alerts_open: BTreeMap<AlertKind, u64>,
     /// Half-widths of the watched area on the ground, m.
     pub field_of_view_m: [f64; 2],
+    /// The access points of a hub.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub stations: Vec<StationStatus>,
+}
+
+/// One access point as its hub knows it.
+#[derive(Clone, Debug, Serialize, utoipa::ToSchema)]
+pub struct StationStatus {
+    pub site: String,
+    pub station: String,
+    pub state: StationState,
+    #[schema(value_type = String, format = DateTime)]
+    pub last_seen_at: Timestamp,
+    /// From the newest positions' frame to their arrival at the hub, by both clocks, s.
+    pub lag_s: Option<f64>,
+    /// Alert events that wait at the station for the link.
+    pub alerts_waiting: u64,
+    pub emitters: usize,
+    /// Half-widths of the watched area on the ground, m.
+    pub field_of_view_m: Option<[f64; 2]>,
+    /// The station's own `GET /v1/status`.
+    #[schema(value_type = Object)]
+    pub status: serde_json::Value,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, utoipa::ToSchema)]
+#[serde(rename_all = "lowercase")]
+pub enum StationState {
+    /// Messages arrive and its frames can be used.
+    Good,
+    /// Messages arrive, but its source gives no usable frames.
+    Blind,
+    /// No message has arrived for `[fleet] lost_after_s`.
+    Lost,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, utoipa::ToSchema)]

@@ -16,8 +16,10 @@ use super::problem::Problem;
 use crate::claim::Claim;
 use crate::estimate;
 use crate::frames::record;
+use crate::geo::LocalAxes;
 use crate::journal::Journal;
-use crate::monitor::Alert;
+use crate::monitor::zones::{Zone, ZoneError, ZoneMap};
+use crate::monitor::{Alert, KnownLight, KnownLightStatus, LightError, LightRequest, MaintenanceError, Window};
 use crate::notify::Notifier;
 
 /// What the handlers work with. The daemon builds it; cloning is cheap.
@@ -37,6 +39,8 @@ pub struct State {
     /// The recorder's folder for evidence, where frames are recorded.
     pub(super) evidence: Option<Arc<Path>>,
     pub(super) fitter: Arc<Fitter>,
+    /// The local axes on the earth, for posted claims in latitude and longitude.
+    pub(super) axes: Option<LocalAxes>,
     /// Turns true when the server stops: streams then close.
     pub(super) stopping: watch::Sender<bool>,
 }
@@ -58,6 +62,7 @@ impl State {
             journal,
             metrics,
             ready,
+            axes: None,
             notifier: None,
             pictures: Arc::default(),
             stopping: watch::Sender::new(false),
@@ -81,6 +86,11 @@ impl State {
             }
         })?;
         answer.await.map_err(|_| busy())
+    }
+
+    pub fn with_axes(mut self, axes: Option<LocalAxes>) -> Self {
+        self.axes = axes;
+        self
     }
 
     pub fn with_webhooks(mut self, notifier: Notifier) -> Self {
@@ -114,6 +124,51 @@ pub enum Command {
         by: Option<String>,
         reply: oneshot::Sender<Acknowledged>,
     },
+    KnownLights {
+        reply: oneshot::Sender<Vec<KnownLightStatus>>,
+    },
+    /// The compute thread sets the request's time.
+    Approve {
+        request: LightRequest,
+        reply: oneshot::Sender<Result<KnownLight, LightError>>,
+    },
+    Revoke {
+        id: String,
+        reply: oneshot::Sender<Result<KnownLight, LightError>>,
+    },
+    Zones {
+        reply: oneshot::Sender<ZoneMap>,
+    },
+    PutZones {
+        zones: Vec<Zone>,
+        /// Digest of the zones that the operator has changed; none to change whatever is in force.
+        unless_changed: Option<u64>,
+        reply: oneshot::Sender<Result<ZoneMap, ZonesRefused>>,
+    },
+    Maintenance {
+        reply: oneshot::Sender<Vec<Window>>,
+    },
+    /// A window that begins when the compute thread takes it, unless `from` says otherwise.
+    BeginMaintenance {
+        from: Option<jiff::Timestamp>,
+        until: jiff::Timestamp,
+        by: String,
+        note: Option<String>,
+        reply: oneshot::Sender<Result<Window, MaintenanceError>>,
+    },
+    EndMaintenance {
+        id: String,
+        reply: oneshot::Sender<Result<Window, MaintenanceError>>,
+    },
+}
+
+/// Why zones were not put in force.
+#[derive(Debug)]
+pub enum ZonesRefused {
+    Bad(ZoneError),
+    /// Somebody else has changed them meanwhile.
+    Changed,
+    AtHub,
 }
 
 /// Outcome of an acknowledgement or its withdrawal. Asking twice is no error.

@@ -16,7 +16,7 @@ use crate::notify::{AskError, EndpointStatus, Notifier, TestOutcome};
 /// Dead letters listed at most.
 const MAX_LETTERS: usize = 1000;
 
-/// How each webhook fares.
+/// How each webhook and export fares.
 #[derive(Debug, Serialize, utoipa::ToSchema)]
 pub struct Endpoints {
     webhooks: Vec<EndpointStatus>,
@@ -59,7 +59,7 @@ impl From<AskError> for Problem {
     }
 }
 
-/// How each webhook fares, without its secret and without the query of its URL
+/// How each webhook and export fares, without its secret and without the query of its URL
 #[utoipa::path(get, path = "/v1/webhooks", tag = "webhooks",
     responses((status = 200, description = "In the order of the config", body = Endpoints)))]
 pub async fn list(Shared(state): Shared<State>) -> Response {

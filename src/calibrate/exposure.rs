@@ -4,7 +4,8 @@ use faer::linalg::matmul::triangular::{self, BlockStructure};
 use faer::linalg::solvers::{Llt, Solve as _};
 use faer::{Accum, Mat, Par, Side};
 
-use crate::optics::{Camera, PixelMaps, psf};
+use crate::optics::spot::{Profile, SpotShape};
+use crate::optics::{self, Axis, Camera, PixelMaps, psf};
 
 /// One light source in one frame.
 #[derive(Clone, Debug)]
@@ -72,22 +73,13 @@ impl Exposure {
 
     /// Writes the expected value of ideal pixels (unit gain, no dark level), J.
     pub fn ideal(&self, camera: &Camera, out: &mut [f64]) {
-        let (ny, nx) = camera.shape();
         let [level, slope_x, slope_y] = self.background.unwrap_or_default();
         for (p, value) in out.iter_mut().enumerate() {
             let [u, v] = unit_position(camera, p);
             *value = level + slope_x * u + slope_y * v;
         }
-        let (mut fx, mut fy) = (vec![0.0; nx], vec![0.0; ny]);
         for spot in &self.spots {
-            let sigma = camera.spot_sigma_at(spot.sensor_m);
-            psf::profile(&camera.x, spot.sensor_m[0], sigma, &mut fx);
-            psf::profile(&camera.y, spot.sensor_m[1], sigma, &mut fy);
-            for (row, &wy) in out.chunks_exact_mut(nx).zip(&fy) {
-                for (value, &wx) in row.iter_mut().zip(&fx) {
-                    *value += spot.energy_j * wy * wx;
-                }
-            }
+            optics::add_spot(camera, spot.sensor_m, spot.energy_j, out);
         }
     }
 
@@ -125,6 +117,11 @@ impl Exposure {
         };
         let (mut rx, mut ry) = (vec![empty; nx], vec![empty; ny]);
         for (i, spot) in self.spots.iter().enumerate() {
+            if let Some(shape) = &camera.spot_shape {
+                let columns = j.subcols_mut(PER_SPOT * i, PER_SPOT - 1);
+                shape_columns(camera, shape, spot, &weight, columns);
+                continue;
+            }
             let sigma = camera.spot_sigma_at(spot.sensor_m);
             psf::profile_response(&camera.x, spot.sensor_m[0], sigma, &mut rx);
             psf::profile_response(&camera.y, spot.sensor_m[1], sigma, &mut ry);
@@ -272,6 +269,33 @@ impl Exposure {
         for spot in &mut self.spots {
             for k in 0..2 {
                 spot.sensor_m[k] = spot.sensor_m[k].clamp(-limit[k], limit[k]);
+            }
+        }
+    }
+}
+
+/// Weighted derivatives of a measured spot by x, y and energy. Its width is not fitted: that column stays zero.
+fn shape_columns(camera: &Camera, shape: &SpotShape, spot: &Spot, weight: &[f64], mut columns: faer::MatMut<'_, f64>) {
+    let [u, v] = spot.sensor_m;
+    // Fraction and derivative by the place, of every pixel.
+    let along = |axis: &Axis, at: f64, profile: &Profile| -> Vec<[f64; 2]> {
+        let edges: Vec<_> = (0..=axis.n).map(|k| profile.value(axis.edge(k) - at)).collect();
+        edges
+            .windows(2)
+            .map(|e| [e[1].cumulative - e[0].cumulative, e[0].density - e[1].density])
+            .collect()
+    };
+    for (k, (w, du, dv)) in shape.weights_at(u, v).enumerate() {
+        let (fx, fy) = (
+            along(&camera.x, u, shape.x_profile(k)),
+            along(&camera.y, v, shape.y_profile(k)),
+        );
+        for (row, [y, y1]) in fy.iter().enumerate() {
+            for (col, [x, x1]) in fx.iter().enumerate() {
+                let p = row * camera.x.n + col;
+                columns[(p, 0)] += weight[p] * spot.energy_j * (w * x1 + du * x) * y;
+                columns[(p, 1)] += weight[p] * spot.energy_j * x * (w * y1 + dv * y);
+                columns[(p, 2)] += weight[p] * w * x * y;
             }
         }
     }

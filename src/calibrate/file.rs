@@ -7,7 +7,8 @@ use std::sync::Arc;
 use ndarray::Array2;
 use serde::Deserialize;
 
-use crate::optics::{Calibration, Distortion, PixelMaps};
+use crate::optics::{Calibration, Distortion, PixelMaps, spot};
+use crate::toml_file::{Key, OutOfRange};
 
 /// Layout of the file; a reader refuses any other.
 const VERSION: u32 = 1;
@@ -32,6 +33,8 @@ pub enum Error {
         expected: usize,
         found: usize,
     },
+    #[error("{path}: {source}")]
+    Shape { path: PathBuf, source: OutOfRange },
     #[error("{path}: pixels.bad: [{x}, {y}] lies outside the {nx} × {ny} map")]
     BadPixelOutside {
         path: PathBuf,
@@ -57,6 +60,8 @@ struct Layout {
 struct Spot {
     sigma_m: f64,
     growth: f64,
+    error: Option<f64>,
+    shape: Option<spot::Layout>,
 }
 
 #[derive(Deserialize)]
@@ -90,10 +95,17 @@ pub fn read(path: &Path) -> Result<Calibration, Error> {
         });
     }
     let pixels = layout.pixels.map(|maps| pixel_maps(path, maps)).transpose()?;
+    let shape = layout.spot.shape.map(|shape| shape.shape(&Key::new("spot.shape")));
+    let shape = shape.transpose().map_err(|source| Error::Shape {
+        path: path.to_owned(),
+        source,
+    })?;
     Ok(Calibration {
         distortion: layout.geometry,
         spot_sigma_m: layout.spot.sigma_m,
         spot_growth: layout.spot.growth,
+        spot_shape: shape.map(Arc::new),
+        spot_error: layout.spot.error,
         noise_std_j: layout.noise.std_j,
         pixels: pixels.map(Arc::new),
     })
@@ -145,16 +157,39 @@ pub fn render(calibration: &Calibration, remarks: &[String]) -> String {
          # principal_point_m + z·focal_scale·(t·(1 + k1 r² + k2 r⁴ + k3 r⁶) + tangential part of p1, p2).\n\
          [geometry]\nprincipal_point_m = [{}]\nfocal_scale = {:?}\nradial = [{}]\ntangential = [{}]\n\n\
          # σ_eff at a distance d from the principal point: sigma_m·(1 + growth·d²/R²), R the sensor's half-diagonal.\n\
-         [spot]\nsigma_m = {:e}\ngrowth = {:e}\n\n\
-         [noise]\nstd_j = {:e}\n",
+         [spot]\nsigma_m = {:e}\ngrowth = {:e}\n",
         list(&d.principal_point_m),
         d.focal_scale,
         list(&d.radial),
         list(&d.tangential),
         calibration.spot_sigma_m,
         calibration.spot_growth,
-        calibration.noise_std_j,
     );
+    if let Some(error) = calibration.spot_error {
+        let _ = write!(
+            out,
+            "# Share of a spot's light by which it differs from its model.\nerror = {error:e}\n"
+        );
+    }
+    let _ = write!(out, "\n[noise]\nstd_j = {:e}\n", calibration.noise_std_j);
+    if let Some(shape) = &calibration.spot_shape {
+        let _ = write!(
+            out,
+            "\n# The spot's light is Σ w(u, v)·a(x)·b(y): w polynomials 1, u, v, u², uv, v², … of the place on the sensor over \
+             half_sensor_m;\n# a and b cubic B-splines with knots knot_m apart, centred on the spot.\n[spot.shape]\n"
+        );
+        let layout = spot::Layout::of(shape);
+        let _ = write!(
+            out,
+            "knot_m = {:e}\nhalf_sensor_m = [{}]\n",
+            layout.knot_m,
+            list(&layout.half_sensor_m)
+        );
+        for term in &layout.term {
+            let [field, x, y] = [&term.field, &term.x, &term.y].map(|values| list(values));
+            let _ = write!(out, "[[spot.shape.term]]\nfield = [{field}]\nx = [{x}]\ny = [{y}]\n");
+        }
+    }
     if let Some(maps) = &calibration.pixels {
         let bad: Vec<String> = maps
             .bad
@@ -213,6 +248,19 @@ fn write_synced(path: &Path, text: &str) -> std::io::Result<()> {
 mod tests {
     use super::*;
 
+    fn shape() -> spot::SpotShape {
+        let field = spot::Field {
+            half_sensor_m: [0.015, 0.012],
+        };
+        let mut template = spot::Template::of_density(field, 5e-4, 4e-3, |x, y| (-1e6 * (x * x + x * y + y * y)).exp());
+        let mut astigmatism =
+            spot::Template::of_density(field, 5e-4, 4e-3, |x, y| (x - y) * (-2e6 * (x * x + y * y)).exp());
+        let mut change = astigmatism.components.remove(0);
+        change.field = spot::FieldPolynomial(vec![0.0, 0.3, -0.1]);
+        template.components.push(change);
+        spot::SpotShape::from_template(&template, 1e-3).unwrap()
+    }
+
     fn calibration() -> Calibration {
         let mut maps = PixelMaps::ideal((2, 3));
         maps.gain[[1, 2]] = 1.01234567;
@@ -227,6 +275,8 @@ mod tests {
             },
             spot_sigma_m: 1.05e-3,
             spot_growth: 0.03,
+            spot_shape: Some(Arc::new(shape())),
+            spot_error: Some(0.004),
             noise_std_j: 1.02e-6,
             pixels: Some(Arc::new(maps)),
         }
@@ -259,6 +309,12 @@ mod tests {
                 "pixels.gain: row 1 has 2 values, row 0 has 3",
             ),
             ("growth", "grwth", "unknown field `grwth`"),
+            (
+                "knot_m = 5e-4",
+                "knot_m = 0.0",
+                "spot.shape.knot_m: expected a positive finite number, found 0.0",
+            ),
+            ("field = [", "field = [1.0, ", "light that adds up to 1"),
         ] {
             assert!(text.contains(from), "{text}");
             std::fs::write(&path, text.replace(from, to)).unwrap();

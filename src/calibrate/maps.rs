@@ -20,21 +20,41 @@ struct Sums {
     zz: f64,
 }
 
+/// One frame as the maps see it: expected values of ideal pixels and recorded ones, J, and which are used; row by row.
+pub struct Pixels<'a> {
+    pub ideal: Vec<f64>,
+    pub recorded: &'a [f64],
+    pub used: Vec<bool>,
+}
+
+/// The maps of fitted exposures. None when there are too few.
+pub fn estimate(camera: &Camera, exposures: &[Exposure]) -> Option<PixelMaps> {
+    let frames = exposures.iter().filter(|s| s.is_inlier).map(|exposure| {
+        let mut ideal = vec![0.0; exposure.pixels.len()];
+        exposure.ideal(camera, &mut ideal);
+        Pixels {
+            ideal,
+            recorded: &exposure.pixels,
+            used: exposure.valid.clone(),
+        }
+    });
+    estimate_from(camera.shape(), camera.noise_std_j, frames)
+}
+
 /// Estimates the maps as the posterior mean of z = (g − 1)·m + d under Gaussian scatter of g around 1 and d around 0.
 /// The two scatters are estimated too, by expectation-maximisation (empirical Bayes: Efron and Morris, 1973), so that
 /// pixels with little light stay near the array's mean. None when there are too few frames.
-pub fn estimate(camera: &Camera, exposures: &[Exposure]) -> Option<PixelMaps> {
-    let is_inlier: Vec<&Exposure> = exposures.iter().filter(|s| s.is_inlier).collect();
-    if is_inlier.len() < MIN_FRAMES {
-        return None;
-    }
-    let (ny, nx) = camera.shape();
+pub fn estimate_from<'a>(
+    (ny, nx): (usize, usize),
+    noise_j: f64,
+    frames: impl Iterator<Item = Pixels<'a>>,
+) -> Option<PixelMaps> {
     let mut sums = vec![Sums::default(); ny * nx];
-    let mut ideal = vec![0.0; ny * nx];
-    for exposure in &is_inlier {
-        exposure.ideal(camera, &mut ideal);
-        for (p, sum) in sums.iter_mut().enumerate().filter(|(p, _)| exposure.valid[*p]) {
-            let (m, z) = (ideal[p], exposure.pixels[p] - ideal[p]);
+    let mut count = 0;
+    for frame in frames {
+        count += 1;
+        for (p, sum) in sums.iter_mut().enumerate().filter(|(p, _)| frame.used[*p]) {
+            let (m, z) = (frame.ideal[p], frame.recorded[p] - frame.ideal[p]);
             sum.n += 1.0;
             sum.m += m;
             sum.mm += m * m;
@@ -43,7 +63,10 @@ pub fn estimate(camera: &Camera, exposures: &[Exposure]) -> Option<PixelMaps> {
             sum.zz += z * z;
         }
     }
-    let noise2 = camera.noise_std_j.powi(2);
+    if count < MIN_FRAMES {
+        return None;
+    }
+    let noise2 = noise_j.powi(2);
     let bad: Vec<bool> = find_bad(&sums, noise2);
     let good = |p: usize| !bad[p] && sums[p].n > 0.0;
     let (mut gain_var, mut dark_var): (f64, f64) = (0.02_f64.powi(2), noise2);

@@ -1,12 +1,15 @@
-//! Layer 2: fits the camera, the spot and the pixel maps to frames with known positions.
+//! Layer 2: fits the camera, the spot and the pixel maps to frames with known positions, or without.
 
 mod bundle;
 mod cross_validation;
 mod device;
 mod exposure;
 pub mod file;
+pub mod first_look;
 mod maps;
+pub mod photon_transfer;
 mod sources;
+pub mod spot;
 mod survey_residuals;
 pub mod truth;
 

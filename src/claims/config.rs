@@ -3,6 +3,36 @@
 use std::path::PathBuf;
 
 use serde::{Deserialize, Serialize};
+use serde_json::Value;
+
+use crate::geo::LocalAxes;
+
+/// Confidence of a shape that names none: one standard deviation of a scalar, as positioning systems usually mean it.
+pub(super) const DEFAULT_CONFIDENCE: f64 = 0.68;
+
+/// How lines of the log are written.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, utoipa::ToSchema)]
+#[serde(rename_all = "kebab-case")]
+pub enum Format {
+    /// A JSON object with the fields that `[claims.fields]` names.
+    #[default]
+    Oapwatch,
+    /// 3GPP shapes (TS 23.032) as TS 29.572 writes them in JSON.
+    Gad,
+    /// `DEVICE_LOCATION_UPDATE` of the Cisco Spaces Firehose.
+    CiscoSpaces,
+    /// Cursor on Target: self-reports, an XML event a line.
+    Cot,
+    /// Columns that `[claims.fields]` names, after a header.
+    Csv,
+}
+
+impl Format {
+    /// The name in a config or query.
+    pub fn named(name: &str) -> Option<Self> {
+        serde_json::from_value(Value::from(name)).ok()
+    }
+}
 
 /// `[claims]`: where claims come from and how their lines are read.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -10,10 +40,15 @@ use serde::{Deserialize, Serialize};
 pub struct Config {
     /// NDJSON log, followed like `tail -F`.
     pub log: Option<PathBuf>,
+    /// How its lines are written.
+    pub format: Format,
+    /// Probability that a place lies within an uncertainty shape that states none.
+    pub confidence: f64,
     /// Names of the fields, for logs of other shapes.
     pub fields: Fields,
-    /// Where local (0, 0) lies, for logs in latitude and longitude.
-    pub origin: Option<Origin>,
+    /// The world's local axes, for claims in latitude and longitude; those of `[world]`.
+    #[serde(skip)]
+    pub axes: Option<LocalAxes>,
     /// Standard deviation per axis of a claim that does not state one.
     pub default_sigma_m: f64,
     /// Added to every claim's time: the camera's clock minus the network's.
@@ -33,25 +68,15 @@ pub struct Fields {
     pub x_m: String,
     pub y_m: String,
     pub sigma_m: String,
+    pub cov_m2: String,
     pub power_w: String,
     pub state: String,
-    /// Read instead of `x_m` and `y_m` when `[claims.origin]` is given.
+    /// Height above the world's origin; the ground where it is left out.
+    pub z_m: String,
+    /// Read instead of `x_m`, `y_m` and `z_m` where a line has them; `[world] origin` places them.
     pub latitude_deg: String,
     pub longitude_deg: String,
-}
-
-/// The UAV's nadir on WGS 84; x points east and y north from there, turned by `heading_deg`.
-#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Origin {
-    pub latitude_deg: f64,
-    pub longitude_deg: f64,
-    /// Height of the ground above the ellipsoid.
-    #[serde(default)]
-    pub altitude_m: f64,
-    /// Compass bearing of the y axis, clockwise from north.
-    #[serde(default)]
-    pub heading_deg: f64,
+    pub height_m: String,
 }
 
 /// Why a `[claims]` table cannot be used.
@@ -67,8 +92,10 @@ impl Default for Config {
     fn default() -> Self {
         Self {
             log: None,
+            format: Format::default(),
+            confidence: DEFAULT_CONFIDENCE,
             fields: Fields::default(),
-            origin: None,
+            axes: None,
             default_sigma_m: 1.0,
             clock_offset_s: 0.0,
             max_users: 20_000,
@@ -85,10 +112,13 @@ impl Default for Fields {
             x_m: "x_m".into(),
             y_m: "y_m".into(),
             sigma_m: "sigma_m".into(),
+            cov_m2: "cov_m2".into(),
             power_w: "power_w".into(),
             state: "state".into(),
+            z_m: "z_m".into(),
             latitude_deg: "latitude_deg".into(),
             longitude_deg: "longitude_deg".into(),
+            height_m: "height_m".into(),
         }
     }
 }
@@ -106,6 +136,12 @@ impl Config {
             "default_sigma_m",
             "0.0001 to 100000 (metres; a wider claim says nothing)",
             sigma,
+        )?;
+        check(
+            (0.05..=0.999).contains(&self.confidence),
+            "confidence",
+            "0.05 to 0.999 (the probability that a place lies within its shape)",
+            self.confidence,
         )?;
         let offset = self.clock_offset_s;
         check(
@@ -126,34 +162,6 @@ impl Config {
             "65536 to 1073741824",
             self.tail_bytes as f64,
         )?;
-        if let Some(origin) = &self.origin {
-            let latitude = origin.latitude_deg;
-            check(
-                latitude.abs() < 89.0,
-                "origin.latitude_deg",
-                "between -89 and 89",
-                latitude,
-            )?;
-            let longitude = origin.longitude_deg;
-            check(
-                longitude.abs() <= 180.0,
-                "origin.longitude_deg",
-                "between -180 and 180",
-                longitude,
-            )?;
-            check(
-                origin.altitude_m.abs() < 10_000.0,
-                "origin.altitude_m",
-                "within 10 km of the ellipsoid",
-                origin.altitude_m,
-            )?;
-            check(
-                origin.heading_deg.abs() <= 360.0,
-                "origin.heading_deg",
-                "between -360 and 360",
-                origin.heading_deg,
-            )?;
-        }
         Ok(())
     }
 }

@@ -8,7 +8,8 @@ use std::time::SystemTime;
 
 use jiff::Timestamp;
 
-use super::{Claim, Config, LineError, parse_line, rotated};
+use super::format::LineReader;
+use super::{Claim, Config, LineError, rotated};
 
 /// Longest line accepted; a longer one is refused as a whole.
 pub const LONGEST_LINE: usize = 64 * 1024;
@@ -78,6 +79,7 @@ struct Lines {
     overlong: bool,
     /// The line at hand lost its beginning.
     is_cut: bool,
+    reader: LineReader,
 }
 
 impl Lines {
@@ -113,12 +115,12 @@ impl Lines {
             self.partial.clear();
             return;
         } else {
-            parse_line(&self.partial, config)
+            self.reader.read(&self.partial, config)
         };
         self.partial.clear();
         self.overlong = false;
         match read {
-            Ok(claim) => poll.claims.push(claim),
+            Ok(claim) => poll.claims.extend(claim),
             Err(error) => {
                 poll.refused_count += 1;
                 if poll.refused.len() < MOST_NAMED {
@@ -133,13 +135,14 @@ impl Lines {
     fn skip(&mut self) {
         *self = Self {
             is_cut: true,
+            reader: std::mem::take(&mut self.reader),
             ..Self::default()
         };
     }
 
     /// Ends the line at hand if it is a claim without its newline; more may come of one that is not.
     fn finish_claim(&mut self, config: &Config, poll: &mut Poll) {
-        if !self.is_cut && !self.overlong && parse_line(&self.partial, config).is_ok() {
+        if !self.is_cut && !self.overlong && self.reader.clone().read(&self.partial, config).is_ok() {
             self.finish(config, poll);
         }
     }
@@ -304,7 +307,7 @@ impl Open {
         if let Some(most_behind) = most_behind {
             let end = self.file.metadata()?.len();
             if end.saturating_sub(self.offset) > most_behind {
-                self.skip_to(end - most_behind, poll)?;
+                self.skip_to(end - most_behind, config, poll)?;
             }
         }
         self.file.seek(SeekFrom::Start(self.offset))?;
@@ -318,8 +321,22 @@ impl Open {
         Ok(())
     }
 
+    /// Reads the first line, without which no other can be. One that is none is refused with every line that follows.
+    fn read_header(&mut self, config: &Config) -> io::Result<()> {
+        let mut start = Vec::new();
+        self.file.seek(SeekFrom::Start(0))?;
+        (&self.file).take(LONGEST_LINE as u64).read_to_end(&mut start)?;
+        if let Some(end) = start.iter().position(|&b| b == b'\n') {
+            let _ = self.lines.reader.read(&start[..end], config);
+        }
+        Ok(())
+    }
+
     /// Passes over what lies before `offset`, but for the head that tells a rewritten log.
-    fn skip_to(&mut self, offset: u64, poll: &mut Poll) -> io::Result<()> {
+    fn skip_to(&mut self, offset: u64, config: &Config, poll: &mut Poll) -> io::Result<()> {
+        if self.lines.reader.needs_header(config) {
+            self.read_header(config)?;
+        }
         let missing = HEAD_BYTES.saturating_sub(self.head.len());
         self.file.seek(SeekFrom::Start(self.head.len() as u64))?;
         (&self.file).take(missing as u64).read_to_end(&mut self.head)?;

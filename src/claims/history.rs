@@ -29,7 +29,9 @@ struct Made {
     time: Timestamp,
     x_m: f64,
     y_m: f64,
+    z_m: Option<f64>,
     sigma_m: Option<f64>,
+    cov_m2: Option<[[f64; 2]; 2]>,
     power_w: Option<f64>,
     state: ClaimState,
 }
@@ -52,7 +54,9 @@ impl Made {
             time: claim.time,
             x_m: claim.x_m,
             y_m: claim.y_m,
+            z_m: claim.z_m,
             sigma_m: claim.sigma_m,
+            cov_m2: claim.cov_m2,
             power_w: claim.power_w,
             state: claim.state,
         }
@@ -64,7 +68,9 @@ impl Made {
             user,
             x_m: self.x_m,
             y_m: self.y_m,
+            z_m: self.z_m,
             sigma_m: self.sigma_m,
+            cov_m2: self.cov_m2,
             power_w: self.power_w,
             state: self.state,
         }
@@ -189,7 +195,9 @@ mod tests {
             user: "u".into(),
             x_m,
             y_m: 0.0,
+            z_m: None,
             sigma_m: None,
+            cov_m2: None,
             power_w: None,
             state: ClaimState::Active,
         }

@@ -148,7 +148,9 @@ mod tests {
             user: user.into(),
             x_m: 0.0,
             y_m: 0.0,
+            z_m: None,
             sigma_m: None,
+            cov_m2: None,
             power_w: None,
             state: ClaimState::Active,
         }

@@ -3,8 +3,10 @@
 use jiff::{SignedDuration, Timestamp};
 use serde_json::Value;
 
-use super::{Claim, ClaimState, Config, config::Origin};
+use super::format::checked_cov;
+use super::{Claim, ClaimState, Config};
 use crate::claim::{escape_undisplayable, is_displayable_name};
+use crate::geo::{Geodetic, LocalAxes};
 
 /// Longest user name accepted, in bytes.
 const LONGEST_USER: usize = 256;
@@ -12,7 +14,7 @@ const LONGEST_USER: usize = 256;
 const FARTHEST_M: f64 = 1e7;
 
 /// Some editors and Windows programs begin a UTF-8 file with it.
-const BYTE_ORDER_MARK: &[u8] = b"\xef\xbb\xbf";
+pub(super) const BYTE_ORDER_MARK: &[u8] = b"\xef\xbb\xbf";
 
 /// Why a line is no claim.
 #[derive(Debug, thiserror::Error)]
@@ -27,45 +29,66 @@ pub enum LineError {
         expected: &'static str,
         found: String,
     },
+    #[error("not an XML event: {0}")]
+    NotXml(String),
+    #[error("not comma-separated: {0}")]
+    NotCsv(#[from] csv::Error),
+    #[error("expected {expected} cells as in the header, found {found}")]
+    Columns { expected: usize, found: usize },
+    #[error("expected a header before it, found none")]
+    NoHeader,
+    #[error("latitude and longitude need [world] origin, which places them on the earth; the config has none")]
+    NoOrigin,
     #[error("the line is longer than {limit} bytes")]
     TooLong { limit: usize },
 }
 
-/// Reads one line of the network's log: a JSON object with the fields that `config` names, by default
-/// `{"time", "user", "x_m", "y_m", "sigma_m"?, "power_w"?, "state"?}`. Other fields are ignored.
-pub fn parse_line(line: &[u8], config: &Config) -> Result<Claim, LineError> {
+/// A line as a JSON object.
+pub(super) fn object(line: &[u8]) -> Result<Value, LineError> {
     let line = line.strip_prefix(BYTE_ORDER_MARK).unwrap_or(line);
     let object: Value = serde_json::from_slice(line)?;
-    if !object.is_object() {
-        return Err(wrong("the line", "a JSON object", &object));
+    match object.is_object() {
+        true => Ok(object),
+        false => Err(wrong("the line", "a JSON object", &object)),
     }
+}
+
+/// Reads an object with the fields that `config` names, by default
+/// `{"time", "user", "x_m", "y_m", "sigma_m"?, "cov_m2"?, "power_w"?, "state"?}`. Other fields are ignored.
+pub(super) fn parse_object(object: &Value, config: &Config) -> Result<Claim, LineError> {
     let names = &config.fields;
-    let time = time(
-        &names.time,
-        required(&object, &names.time, TIME)?,
-        config.clock_offset_s,
-    )?;
-    let user = user(&names.user, required(&object, &names.user, USER)?)?;
-    let [x_m, y_m] = match &config.origin {
-        None => [
-            number(&object, &names.x_m, METRES, |x| x.abs() <= FARTHEST_M)?,
-            number(&object, &names.y_m, METRES, |y| y.abs() <= FARTHEST_M)?,
-        ],
-        Some(origin) => local_metres(
-            origin,
-            number(&object, &names.latitude_deg, LATITUDE, |l| l.abs() <= 90.0)?,
-            number(&object, &names.longitude_deg, LONGITUDE, |l| l.abs() <= 180.0)?,
-        ),
+    let time = time(&names.time, required(object, &names.time, TIME)?, config.clock_offset_s)?;
+    let user = user(&names.user, required(object, &names.user, USER)?)?;
+    let metre = |name: &str| number(object, name, METRES, is_near);
+    let ([x_m, y_m], z_m) = match optional(object, &names.latitude_deg) {
+        Some(_) => place(
+            object,
+            &names.latitude_deg,
+            &names.longitude_deg,
+            &names.height_m,
+            config,
+        )?,
+        None => {
+            let z_m = optional(object, &names.z_m).map(|_| metre(&names.z_m)).transpose()?;
+            ([metre(&names.x_m)?, metre(&names.y_m)?], z_m)
+        }
     };
-    let sigma_m = match optional(&object, &names.sigma_m) {
+    let sigma_m = match optional(object, &names.sigma_m) {
         None => None,
-        Some(_) => Some(number(&object, &names.sigma_m, SIGMA, |s| s >= 0.0)?),
+        Some(_) => Some(number(object, &names.sigma_m, SIGMA, |s| s >= 0.0)?),
     };
-    let power_w = match optional(&object, &names.power_w) {
+    let cov_m2 = match optional(object, &names.cov_m2) {
         None => None,
-        Some(_) => Some(number(&object, &names.power_w, POWER, |p| p >= 0.0)?),
+        Some(value) => {
+            let cov = serde_json::from_value(value.clone()).ok().and_then(checked_cov);
+            Some(cov.ok_or_else(|| wrong(&names.cov_m2, COV, value))?)
+        }
     };
-    let state = match optional(&object, &names.state) {
+    let power_w = match optional(object, &names.power_w) {
+        None => None,
+        Some(_) => Some(number(object, &names.power_w, POWER, |p| p >= 0.0)?),
+    };
+    let state = match optional(object, &names.state) {
         None => ClaimState::Active,
         Some(value) => match value.as_str() {
             Some("active") => ClaimState::Active,
@@ -74,25 +97,47 @@ pub fn parse_line(line: &[u8], config: &Config) -> Result<Claim, LineError> {
         },
     };
     Ok(Claim {
-        time,
-        user,
-        x_m,
-        y_m,
+        z_m,
         sigma_m,
+        cov_m2,
         power_w,
         state,
+        ..Claim::at(time, user, [x_m, y_m])
     })
 }
 
-const TIME: &str = "an RFC 3339 time or seconds since 1970";
-const USER: &str = "a name of 1 to 256 visible characters, without white space at its ends";
-const METRES: &str = "metres within 10000 km of the nadir";
+/// A place in degrees under these names, in our axes, m, with its height where one is stated under that name.
+pub(super) fn place(
+    object: &Value,
+    latitude: &str,
+    longitude: &str,
+    height: &str,
+    config: &Config,
+) -> Result<([f64; 2], Option<f64>), LineError> {
+    let latitude_deg = number(object, latitude, LATITUDE, |l| l.abs() <= 90.0)?;
+    let longitude_deg = number(object, longitude, LONGITUDE, |l| l.abs() <= 180.0)?;
+    let height_m = optional(object, height)
+        .map(|_| number(object, height, METRES, is_near))
+        .transpose()?;
+    let axes = config.axes.as_ref().ok_or(LineError::NoOrigin)?;
+    Ok(local_metres(axes, latitude_deg, longitude_deg, height_m))
+}
+
+/// Whether a coordinate is one, in metres.
+pub(super) fn is_near(metres: f64) -> bool {
+    metres.abs() <= FARTHEST_M
+}
+
+pub(super) const TIME: &str = "an RFC 3339 time or seconds since 1970";
+pub(super) const USER: &str = "a name of 1 to 256 visible characters, without white space at its ends";
+pub(super) const METRES: &str = "metres within 10000 km of the origin";
 const LATITUDE: &str = "degrees between -90 and 90";
 const LONGITUDE: &str = "degrees between -180 and 180";
 const SIGMA: &str = "metres, zero or more";
+const COV: &str = "[[xx, xy], [xy, yy]] in m², symmetric and not negative";
 const POWER: &str = "watts, zero or more";
 
-fn optional<'a>(object: &'a Value, name: &str) -> Option<&'a Value> {
+pub(super) fn optional<'a>(object: &'a Value, name: &str) -> Option<&'a Value> {
     let value = if name.starts_with('/') {
         object.pointer(name)
     } else {
@@ -101,14 +146,14 @@ fn optional<'a>(object: &'a Value, name: &str) -> Option<&'a Value> {
     value.filter(|v| !v.is_null())
 }
 
-fn required<'a>(object: &'a Value, name: &str, expected: &'static str) -> Result<&'a Value, LineError> {
+pub(super) fn required<'a>(object: &'a Value, name: &str, expected: &'static str) -> Result<&'a Value, LineError> {
     optional(object, name).ok_or_else(|| LineError::Missing {
         field: name.to_owned(),
         expected,
     })
 }
 
-fn wrong(field: &str, expected: &'static str, found: &Value) -> LineError {
+pub(super) fn wrong(field: &str, expected: &'static str, found: &Value) -> LineError {
     let mut found = escape_undisplayable(&found.to_string()).into_owned();
     if found.len() > 80 {
         let cut = (0..=77).rev().find(|&i| found.is_char_boundary(i)).unwrap_or(0);
@@ -122,7 +167,12 @@ fn wrong(field: &str, expected: &'static str, found: &Value) -> LineError {
     }
 }
 
-fn number(object: &Value, name: &str, expected: &'static str, fits: impl Fn(f64) -> bool) -> Result<f64, LineError> {
+pub(super) fn number(
+    object: &Value,
+    name: &str,
+    expected: &'static str,
+    fits: impl Fn(f64) -> bool,
+) -> Result<f64, LineError> {
     let value = required(object, name, expected)?;
     match value.as_f64() {
         Some(x) if x.is_finite() && fits(x) => Ok(x),
@@ -130,7 +180,7 @@ fn number(object: &Value, name: &str, expected: &'static str, fits: impl Fn(f64)
     }
 }
 
-fn user(name: &str, value: &Value) -> Result<String, LineError> {
+pub(super) fn user(name: &str, value: &Value) -> Result<String, LineError> {
     let user = match value {
         Value::String(s) => s.clone(),
         Value::Number(n) => n.to_string(),
@@ -142,7 +192,7 @@ fn user(name: &str, value: &Value) -> Result<String, LineError> {
     Ok(user)
 }
 
-fn time(name: &str, value: &Value, offset_s: f64) -> Result<Timestamp, LineError> {
+pub(super) fn time(name: &str, value: &Value, offset_s: f64) -> Result<Timestamp, LineError> {
     let stamp = match value {
         // RFC 3339 knows four digits of a year.
         Value::String(s) if s.starts_with(|c: char| c.is_ascii_digit()) => s.parse::<Timestamp>().ok(),
@@ -158,26 +208,26 @@ fn time(name: &str, value: &Value, offset_s: f64) -> Result<Timestamp, LineError
         .ok_or_else(|| wrong(name, TIME, value))
 }
 
-/// East and north metres of a geodetic position near `origin` on WGS 84, from the meridian and prime-vertical
-/// radii of curvature (Torge and Müller, 2012, eqs. 4.13 and 4.14), turned into the camera's axes. Good to millimetres
-/// within a kilometre.
-fn local_metres(origin: &Origin, latitude_deg: f64, longitude_deg: f64) -> [f64; 2] {
-    const A: f64 = 6_378_137.0;
-    const E2: f64 = 6.694_379_990_141_3e-3;
-    let middle = (0.5 * (latitude_deg + origin.latitude_deg)).to_radians();
-    let w2 = 1.0 - E2 * middle.sin().powi(2);
-    let meridian = A * (1.0 - E2) / (w2 * w2.sqrt()) + origin.altitude_m;
-    let prime_vertical = A / w2.sqrt() + origin.altitude_m;
-    let turn = (longitude_deg - origin.longitude_deg + 540.0).rem_euclid(360.0) - 180.0;
-    let north = meridian * (latitude_deg - origin.latitude_deg).to_radians();
-    let east = prime_vertical * middle.cos() * turn.to_radians();
-    let (sin, cos) = origin.heading_deg.to_radians().sin_cos();
-    [east * cos - north * sin, east * sin + north * cos]
+/// East and north metres of a place about the world's origin, and its height above it where one is stated. Without one it is as
+/// high as the origin: a height moves east and north by a ten-thousandth of it within a kilometre.
+fn local_metres(
+    axes: &LocalAxes,
+    latitude_deg: f64,
+    longitude_deg: f64,
+    height_m: Option<f64>,
+) -> ([f64; 2], Option<f64>) {
+    let [x, y, z] = axes.to_local(Geodetic {
+        latitude_deg,
+        longitude_deg,
+        height_m: height_m.unwrap_or(axes.height_m()),
+    });
+    ([x, y], height_m.map(|_| z))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::claims::parse_line;
 
     fn parse(line: &str) -> Result<Claim, LineError> {
         parse_line(line.as_bytes(), &Config::default())
@@ -257,22 +307,27 @@ mod tests {
         config.fields.time = "ts".into();
         config.fields.latitude_deg = "/pos/lat".into();
         config.fields.longitude_deg = "/pos/lon".into();
-        config.origin = Some(Origin {
+        let line = br#"{"ts":1795248000,"user":7,"pos":{"lat":48.001,"lon":11.001}}"#;
+        let error = parse_line(line, &config).unwrap_err().to_string();
+        assert!(error.contains("[world] origin"), "{error}");
+        config.axes = Some(LocalAxes::at(Geodetic {
             latitude_deg: 48.0,
             longitude_deg: 11.0,
-            altitude_m: 0.0,
-            heading_deg: 0.0,
-        });
+            height_m: 0.0,
+        }));
         config.clock_offset_s = 1.5;
-        let line = br#"{"ts":1795248000,"user":7,"pos":{"lat":48.001,"lon":11.001}}"#;
         let c = parse_line(line, &config).unwrap();
         // One degree of latitude at 48° is 111.20 km, one of longitude 74.63 km (tables of WGS 84).
         assert!((c.y_m - 111.2).abs() < 0.01, "{}", c.y_m);
         assert!((c.x_m - 74.63).abs() < 0.01, "{}", c.x_m);
         assert_eq!(c.user, "7");
         assert_eq!(c.time.as_millisecond(), 1_795_248_001_500);
-        config.origin.as_mut().unwrap().heading_deg = 90.0;
-        let c = parse_line(line, &config).unwrap();
-        assert!((c.y_m - 74.63).abs() < 0.01 && (c.x_m + 111.2).abs() < 0.01, "{c:?}");
+        assert_eq!(c.z_m, None);
+        let line = br#"{"ts":1795248000,"user":7,"pos":{"lat":48.001,"lon":11.001},"height_m":12.5}"#;
+        assert!((parse_line(line, &config).unwrap().z_m.unwrap() - 12.5).abs() < 2e-3);
+        // Local metres stay possible beside an origin.
+        let local = br#"{"ts":1795248000,"user":7,"x_m":3,"y_m":4,"z_m":5}"#;
+        let c = parse_line(local, &config).unwrap();
+        assert_eq!((c.x_m, c.y_m, c.z_m), (3.0, 4.0, Some(5.0)));
     }
 }

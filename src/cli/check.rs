@@ -7,9 +7,10 @@ use serde_json::{Value, json};
 
 use super::{Failure, Outcome};
 use crate::config::Config;
+use crate::notify::Endpoint;
 use crate::pipeline::Pipeline;
 use crate::scene::{Plan, Scene};
-use crate::{api, frames, notify, toml_file};
+use crate::{api, export, frames, notify, toml_file};
 
 /// Keys of a scene that no config has.
 const OF_SCENES: [&str; 7] = [
@@ -23,13 +24,18 @@ const OF_SCENES: [&str; 7] = [
 ];
 
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Examples:\n  oapwatch check oapwatch.toml\n  oapwatch check --json config/scenes/paper.toml")]
+#[command(
+    after_help = "Examples:\n  oapwatch check oapwatch.toml\n  oapwatch check --json config/scenes/paper.toml\n  oapwatch check --send oapwatch.toml"
+)]
 pub struct Args {
     /// A config or scene
     file: PathBuf,
     /// Print one JSON object instead of a sentence, also where the file is refused
     #[arg(long)]
     json: bool,
+    /// Send an event that is marked as a test to every webhook and export of the config, and say what came back
+    #[arg(long)]
+    send: bool,
 }
 
 /// What a file describes.
@@ -37,6 +43,7 @@ struct Checked {
     sentence: String,
     facts: Value,
     warnings: Vec<String>,
+    receivers: Vec<Endpoint>,
 }
 
 /// A file that can be used is described on stdout, with its probable mistakes on stderr.
@@ -64,7 +71,50 @@ pub fn run(args: Args) -> Outcome {
             eprintln!("oapwatch: {name}: warning: {warning}");
         }
     }
-    Ok(())
+    match args.send {
+        true => send(&checked.receivers, args.json, &mut out),
+        false => Ok(()),
+    }
+}
+
+/// Sends a test event to each receiver, one after the other.
+fn send(receivers: &[Endpoint], json: bool, out: &mut impl Write) -> Outcome {
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build();
+    let runtime = runtime.map_err(Failure::other)?;
+    let mut failed = 0;
+    for receiver in receivers {
+        let outcome = runtime.block_on(notify::send_test(receiver, "check", notify::Clock::wall()));
+        failed += usize::from(!outcome.delivered);
+        let Endpoint {
+            name, kind, shown_url, ..
+        } = receiver;
+        let written = if json {
+            writeln!(
+                out,
+                "{}",
+                json!({ "name": name, "kind": kind, "address": shown_url, "outcome": outcome })
+            )
+        } else {
+            let said = match (&outcome.error, outcome.status) {
+                (Some(error), _) => format!("NOT delivered: {error}"),
+                (None, Some(status)) => format!("delivered in {} ms; the receiver answered {status}", outcome.took_ms),
+                // Datagrams and plain streams are not answered.
+                (None, None) => format!("sent in {} ms; look there whether it arrived", outcome.took_ms),
+            };
+            writeln!(out, "{kind} {name} ({shown_url}): {said}")
+        };
+        written.map_err(Failure::other)?;
+    }
+    if receivers.is_empty() {
+        eprintln!("oapwatch: there is no [[webhook]] or [[export]] to send to");
+    }
+    match failed {
+        0 => Ok(()),
+        _ => Err(Failure::other(anyhow::anyhow!(
+            "{failed} of {} test events were not delivered",
+            receivers.len()
+        ))),
+    }
 }
 
 fn check(file: &Path) -> Result<Checked, Failure> {
@@ -83,6 +133,7 @@ fn scene(file: &Path) -> Result<Checked, Failure> {
         sentence: format!("a scene, {users} users and {intruders} intruders"),
         facts: json!({ "kind": "scene", "users": users, "intruders": intruders, "rate_hz": scene.rate_hz }),
         warnings: Vec::new(),
+        receivers: Vec::new(),
     })
 }
 
@@ -91,10 +142,13 @@ fn config(file: &Path) -> Result<Checked, Failure> {
     let camera = config.camera().map_err(Failure::config)?;
     let pipeline = Pipeline::new(&config, &camera).map_err(Failure::config)?;
     frames::open(&config.source, &camera).map_err(Failure::config)?;
+    config.platform.telemetry().map_err(Failure::config)?;
     config.log.filter().map_err(Failure::config)?;
     config.journal.validate().map_err(Failure::config)?;
     api::Server::new(config.api.clone()).map_err(Failure::config)?;
-    notify::load(&config.webhook).map_err(Failure::config)?;
+    let mut receivers = notify::load(&config.webhook).map_err(Failure::config)?;
+    let exports = export::load(&config.export, &receivers, &config.world).map_err(Failure::config)?;
+    receivers.extend(exports.into_iter().map(|export| export.endpoint));
     let (pixels, source, estimator) = (
         [camera.x.n, camera.y.n],
         config.source.kind.name(),
@@ -107,5 +161,6 @@ fn config(file: &Path) -> Result<Checked, Failure> {
         ),
         facts: json!({ "kind": "config", "pixels": pixels, "source": source, "estimator": estimator }),
         warnings: config.warnings(&camera),
+        receivers,
     })
 }

@@ -11,7 +11,9 @@ use super::{Failure, Outcome, progress};
 use crate::config::Config;
 use crate::estimate::{self, Emitter};
 use crate::frame::Frame;
-use crate::frames::npy;
+use crate::frames::{self, npy};
+use crate::geo::View;
+use crate::platform::{Placement, Platform};
 
 #[derive(Debug, clap::Args)]
 #[command(
@@ -37,6 +39,33 @@ struct Line<'a> {
     #[serde(skip_serializing_if = "Option::is_none")]
     error: Option<String>,
     latency_us: u64,
+    /// Weighted squared residual per degree of freedom.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    reduced_chi2: Option<f64>,
+    /// Share of a spot's light by which the spots were taken to differ from the model.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    spot_error: Option<f64>,
+}
+
+/// Moves emitters from where a level camera would see them to where this one does, with its pose's uncertainty. One whose ray
+/// does not come down to the ground has no position and is left out.
+fn place(emitters: &mut Vec<Emitter>, platform: &mut Platform, view: &mut View, time: jiff::Timestamp) {
+    view.sight = match platform.at(time) {
+        Placement::Level => return,
+        Placement::At { sight, .. } => Some(sight),
+        Placement::Unknown { .. } => return emitters.clear(),
+    };
+    emitters.retain_mut(|e| {
+        let Some(placed) = view.place(e.sensor_m, [e.x_m, e.y_m], e.cov_m2) else {
+            return false;
+        };
+        [e.x_m, e.y_m] = placed.position_m.into();
+        let pose = view.pose_cov(placed.position_m);
+        let [[a, b], [_, c]] = placed.cov_m2;
+        let off = b + pose[(0, 1)];
+        e.cov_m2 = [[a + pose[(0, 0)], off], [off, c + pose[(1, 1)]]];
+        true
+    });
 }
 
 pub fn run(args: Args) -> Outcome {
@@ -57,13 +86,17 @@ pub fn run(args: Args) -> Outcome {
         true => Path::new("/dev/stdin"),
         false => &args.frames,
     };
-    let frames = npy::Reader::open(path, camera.joules_per_count).map_err(Failure::input)?;
+    let recording = npy::Reader::open(path, camera.joules_per_count).map_err(Failure::input)?;
     let budget = config.estimator.budget();
     let start = config.source.start.unwrap_or(jiff::Timestamp::UNIX_EPOCH);
+    let rate_hz = config.source.rate_hz.unwrap_or(frames::Config::DEFAULT_RATE_HZ);
+    let platform = Platform::open(&config.platform, &config.world, camera.altitude_m);
+    let mut platform = platform.map_err(Failure::config)?;
+    let mut view = View::level(&camera);
     let mut out = std::io::BufWriter::new(std::io::stdout().lock());
     let bar = progress::count("frames");
-    let (mut usable, mut first_error) = (0_u64, None);
-    for (index, pixels) in frames.enumerate() {
+    let (mut usable, mut misshapen, mut first_error) = (0_u64, 0_u64, None);
+    for (index, pixels) in recording.enumerate() {
         let pixels = match pixels {
             Ok(pixels) => pixels,
             Err(e) => {
@@ -73,13 +106,16 @@ pub fn run(args: Args) -> Outcome {
         };
         let frame = Frame {
             index: index as u64,
-            time: start,
+            time: frames::frame_time(start, rate_hz, index as u64),
             pixels,
             masked: None,
         };
         let clock = Instant::now();
         let is_over = || budget.is_some_and(|budget| clock.elapsed() >= budget);
-        let estimate = estimator.estimate_until(&frame, &is_over);
+        let mut estimate = estimator.estimate_until(&frame, &is_over);
+        if let Ok(estimate) = &mut estimate {
+            place(&mut estimate.emitters, &mut platform, &mut view, frame.time);
+        }
         let latency_us = clock.elapsed().as_micros() as u64;
         let (emitters, error) = match &estimate {
             Ok(estimate) => {
@@ -96,13 +132,24 @@ pub fn run(args: Args) -> Outcome {
             emitters,
             error,
             latency_us,
+            reduced_chi2: estimate.as_ref().ok().map(|e| e.reduced_chi2),
+            spot_error: estimate.as_ref().ok().map(|e| e.spot_error).filter(|e| *e > 0.0),
         };
+        misshapen += u64::from(line.spot_error.is_some());
         serde_json::to_writer(&mut out, &line).map_err(|e| Failure::other(std::io::Error::from(e)))?;
         writeln!(out).map_err(Failure::other)?;
         bar.inc(1);
     }
     bar.finish_and_clear();
     out.flush().map_err(Failure::other)?;
+    if 2 * misshapen > usable && camera.spot_error.is_none() {
+        eprintln!(
+            "{misshapen} of {usable} frames: the spot is not what the config says (positions are less precise, faint emitters \
+             beside bright ones are not seen); run `oapwatch calibrate --config {} --out CALIBRATION.toml {}`",
+            args.config.display(),
+            path.display()
+        );
+    }
     match (usable, first_error) {
         (0, Some(error)) => Err(Failure::Input(anyhow!(
             "{}: no frame can be used; the first: {error}",

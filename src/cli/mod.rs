@@ -1,18 +1,24 @@
 //! The command line: one file per command.
 
 mod calibrate;
+mod camera_source;
+mod capture;
 mod check;
+mod claims;
 mod completions;
 mod devices;
 mod explain;
 mod failure;
+mod fleet;
 mod golden;
+mod interrupt;
 mod locate;
 mod man;
 mod picture;
 mod progress;
 mod review;
 mod run;
+mod setup;
 mod simulate;
 mod simulated_recording;
 mod stability;
@@ -42,6 +48,8 @@ pub struct Cli {
 enum Command {
     /// Run the monitor: frames in, positions and alerts out, API and dashboard on 127.0.0.1:8787
     Run(run::Args),
+    /// Run the hub of a fleet: alerts and positions of many access points, over NATS
+    Fleet(fleet::Args),
     /// Find the emitters in a recording, one JSON object a frame on stdout
     Locate(locate::Args),
     /// Run the whole chain over a replay as fast as possible and print the alert events
@@ -50,7 +58,7 @@ enum Command {
     Simulate(simulate::Args),
     /// List the effects that a scene simulates, the reason and the cost of each
     Explain(explain::Args),
-    /// Fit the device's calibration from frames with known positions
+    /// Learn the device's calibration from its frames, with or without known positions
     Calibrate(calibrate::Args),
     /// Measure what accuracy costs in time
     Tradeoff(tradeoff::Args),
@@ -65,8 +73,14 @@ enum Command {
     Study(study::Args),
     /// Validate a config or scene without running it
     Check(check::Args),
+    /// Print what is understood of a claims log, and why the rest is refused
+    Claims(claims::Args),
     /// List V4L2 devices with their formats and sizes
     Devices(devices::Args),
+    /// Look at a camera and write a config for it
+    Setup(setup::Args),
+    /// Write a camera's frames to a file, as the daemon would see them
+    Capture(capture::Args),
     /// Print shell completions
     Completions(completions::Args),
     /// Write the manual pages
@@ -85,6 +99,7 @@ pub fn main() -> ExitCode {
     };
     let outcome = match cli.command {
         Command::Run(args) => run::run(args),
+        Command::Fleet(args) => fleet::run(args),
         Command::Locate(args) => locate::run(args),
         Command::Review(args) => review::run(args),
         Command::Simulate(args) => simulate::run(args),
@@ -96,7 +111,10 @@ pub fn main() -> ExitCode {
         Command::Stability(args) => stability::run(args),
         Command::Study(args) => study::run(args),
         Command::Check(args) => check::run(args),
+        Command::Claims(args) => claims::run(args),
         Command::Devices(args) => devices::run(args),
+        Command::Setup(args) => setup::run(args),
+        Command::Capture(args) => capture::run(args),
         Command::Completions(args) => completions::run(args),
         Command::Man(args) => man::run(args),
     };

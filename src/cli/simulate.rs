@@ -2,14 +2,13 @@
 
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::Ordering;
 
 use anyhow::Context;
 use jiff::Timestamp;
 
 use super::simulated_recording::Recording;
-use super::{Failure, Outcome, progress};
+use super::{Failure, Outcome, interrupt, progress};
 use crate::scene::{Plan, Scene};
 
 #[derive(Debug, clap::Args)]
@@ -42,7 +41,7 @@ pub fn run(args: Args) -> Outcome {
     let scene = Scene::load(&args.scene).map_err(Failure::config)?;
     let plan = Plan::compile(&scene, args.seed).map_err(Failure::config)?;
     let plan = plan.starting_at(args.start);
-    let interrupted = watch_for_interrupt().map_err(Failure::other)?;
+    let interrupted = interrupt::watch().map_err(Failure::other)?;
     let shape = plan.camera().shape();
     let mut recording = Recording::create(&args.out, shape).map_err(Failure::other)?;
 
@@ -100,25 +99,4 @@ fn write_config(path: &Path, scene: &Scene, start: Timestamp) -> anyhow::Result<
     );
     std::fs::write(path, text).with_context(|| path.display().to_string())?;
     Ok(true)
-}
-
-/// Becomes true on Ctrl-C or SIGTERM.
-fn watch_for_interrupt() -> std::io::Result<Arc<AtomicBool>> {
-    let flag = Arc::new(AtomicBool::new(false));
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
-    let raised = Arc::clone(&flag);
-    let mut terminate = {
-        let _inside = runtime.enter();
-        tokio::signal::unix::signal(tokio::signal::unix::SignalKind::terminate())?
-    };
-    std::thread::spawn(move || {
-        runtime.block_on(async {
-            tokio::select! {
-                _ = tokio::signal::ctrl_c() => {}
-                _ = terminate.recv() => {}
-            }
-        });
-        raised.store(true, Ordering::Relaxed);
-    });
-    Ok(flag)
 }

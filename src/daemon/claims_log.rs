@@ -171,7 +171,9 @@ mod tests {
             user,
             x_m: 0.0,
             y_m: 0.0,
+            z_m: None,
             sigma_m: None,
+            cov_m2: None,
             power_w: None,
             state: ClaimState::Active,
         };

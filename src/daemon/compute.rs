@@ -9,6 +9,7 @@ use jiff::{SignedDuration, Timestamp};
 use tokio::sync::mpsc;
 
 use super::claims_log::ClaimsLog;
+use super::pose::Poses;
 use super::posts::Posts;
 use super::publish::Outlet;
 use super::reload::Settings;
@@ -54,6 +55,7 @@ pub struct Compute {
     pub webhooks: notify::Notifier,
     pub supervisor: Supervisor,
     pub camera: Arc<Camera>,
+    pub poses: Poses,
     pub claims_log: Option<String>,
     pub source: String,
     /// A replay runs on the clock of its recording, every other source on the wall clock.
@@ -137,7 +139,9 @@ impl Compute {
             estimate,
             estimation,
             verdicts,
+            placement,
         } = self.pipeline.step(&frame);
+        self.poses.update(frame.time, &placement);
         let s = &mut self.state;
         s.counts.captured += 1;
         s.clock = frame.time;
@@ -148,6 +152,15 @@ impl Compute {
         match &estimate {
             Ok(estimate) => {
                 metrics::counter!(metric::FRAMES_CUT_SHORT).increment(u64::from(estimate.is_cut_short));
+                metrics::gauge!(metric::REDUCED_CHI2).set(estimate.reduced_chi2);
+                metrics::gauge!(metric::SPOT_ERROR).set(estimate.spot_error);
+                if estimate.spot_error > 0.0 && self.camera.spot_error.is_none() && !s.has_warned_of_spot {
+                    s.has_warned_of_spot = true;
+                    tracing::warn!(
+                        spot_error = estimate.spot_error,
+                        "the spot is not what the config says: run `oapwatch calibrate`"
+                    );
+                }
                 if s.last_good.is_none() {
                     tracing::info!(frame = frame.index, "the first usable frame was processed");
                 }
@@ -233,6 +246,7 @@ impl Compute {
             self.state.name_evidence(&mut event.alert);
             self.state.note(event);
         }
+        self.keep_lights();
         self.state.gauge(&report);
         let at = report.time;
         self.outlet.events(std::mem::take(&mut report.events), at);
@@ -243,6 +257,7 @@ impl Compute {
             report,
             frame,
             camera,
+            pose: Some(self.poses.latest()),
             status,
         };
         if self.is_replay {
@@ -313,6 +328,7 @@ impl Compute {
             field_of_view_m: self
                 .camera
                 .to_ground([self.camera.x.half_width(), self.camera.y.half_width()]),
+            stations: Vec::new(),
         }
     }
 

@@ -38,6 +38,7 @@ impl Compute {
                     let outcome = self.acknowledged(&id, event);
                     self.outlet.acknowledged(reply, outcome);
                 }
+                other => self.operate(other),
             }
         }
         let now = self.now();
@@ -73,7 +74,12 @@ impl Compute {
 
     /// Takes settings that were loaded again.
     pub(super) fn take_settings(&mut self) {
-        let Ok(Settings { monitor, claims }) = self.settings.try_recv() else {
+        let Ok(Settings {
+            monitor,
+            claims,
+            places,
+        }) = self.settings.try_recv()
+        else {
             return;
         };
         self.pipeline.reconfigure(&monitor, &claims);
@@ -87,6 +93,9 @@ impl Compute {
                     Err(error) => tracing::error!(%error, "the claims log is not followed: no thread for it"),
                 }
             }
+        }
+        if let Err(error) = places.put(&mut self.pipeline.monitor) {
+            tracing::error!(%error, "zones of the config and of the API do not go together; those from before stay");
         }
         self.claims_log = claims.log.map(|path| path.display().to_string());
     }

@@ -3,6 +3,8 @@
 mod claims_log;
 mod compute;
 mod intake;
+mod operator;
+mod pose;
 mod posts;
 mod process;
 mod publish;
@@ -27,7 +29,9 @@ use crate::frames::{self, Capture, FrameSource, SourceKind};
 use crate::journal::Journal;
 use crate::optics::Camera;
 use crate::pipeline::Pipeline;
-use crate::{api, logging, metric, notify};
+use crate::platform::mavlink::Link;
+use crate::platform::{self, Telemetry};
+use crate::{api, export, fleet, logging, metric, notify};
 use claims_log::ClaimsLog;
 use compute::Compute;
 use publish::Outlet;
@@ -51,9 +55,12 @@ pub struct Daemon {
     camera: Camera,
     pipeline: Pipeline,
     source: Box<dyn FrameSource>,
+    telemetry: Option<Link>,
     recorder: Option<Recorder>,
     server: api::Server,
     endpoints: Vec<notify::Endpoint>,
+    exports: Vec<export::Export>,
+    station: Option<fleet::Station>,
     journal: Journal,
     metrics: PrometheusHandle,
 }
@@ -75,9 +82,16 @@ impl Daemon {
         }
         let server = api::Server::new(config.api.clone())?;
         let endpoints = notify::load(&config.webhook)?;
+        let exports = export::load(&config.export, &endpoints, &config.world)?;
         let source = frames::open(&config.source, &camera)?;
+        let telemetry = platform::open_telemetry(&config.platform)?;
         let recorder = Recorder::start(&config.record)?;
-        let subscriptions = endpoints.iter().map(notify::Endpoint::subscription).collect();
+        let station = fleet::Station::new(&config.fleet)?;
+        let receivers = endpoints.iter().chain(exports.iter().map(|export| &export.endpoint));
+        let subscriptions = receivers
+            .map(notify::Endpoint::subscription)
+            .chain(station.as_ref().map(|_| fleet::Station::subscription()))
+            .collect();
         let journal = Journal::open(&config.journal, subscriptions)?;
         Ok(Self {
             config,
@@ -85,9 +99,12 @@ impl Daemon {
             camera,
             pipeline,
             source,
+            telemetry,
             recorder,
             server,
             endpoints,
+            exports,
+            station,
             journal,
             metrics,
         })
@@ -102,6 +119,7 @@ impl Daemon {
         let open = self.journal.open_alerts()?;
         let known: Vec<_> = open.iter().map(|a| (a.id.clone(), a.kind)).collect();
         self.pipeline.monitor.restore(open);
+        operator::restore(&self.journal, &mut self.pipeline.monitor)?;
 
         let (stop, stopped) = watch::channel(false);
         let stops = || {
@@ -115,18 +133,29 @@ impl Daemon {
         let feed = Arc::new(api::Feed::new(self.journal.last_seq(), micros));
         let outlet = Outlet::default();
         let publisher = tokio::spawn(outlet.clone().publish(self.journal.clone(), feed.clone()));
-        let (notifier, deliveries) = notify::spawn(
-            self.endpoints,
-            self.journal.clone(),
-            notify::Clock::wall(),
-            micros,
-            stops(),
-        );
         let (commands, orders) = mpsc::channel(COMMANDS);
+        let mut exports = export::Running::new(export::Context {
+            journal: self.journal.clone(),
+            feed: feed.clone(),
+            commands: commands.clone(),
+            clock: notify::Clock::wall(),
+        });
+        let mut endpoints = self.endpoints;
+        endpoints.extend(exports.replace(self.exports));
+        let (notifier, deliveries) =
+            notify::spawn(endpoints, self.journal.clone(), notify::Clock::wall(), micros, stops());
+        if let Some(station) = self.station {
+            let publishing = station.run(self.journal.clone(), feed.clone(), stops());
+            tokio::spawn(async move {
+                if let Err(error) = publishing.await {
+                    tracing::error!(%error, "nothing is published to the fleet");
+                }
+            });
+        }
         let (reloaded, settings) = mpsc::channel(1);
         let ready = Arc::new(AtomicBool::new(false));
         let state = api::State::new(feed, commands, self.journal.clone(), metrics.clone(), ready.clone());
-        let mut state = state.with_webhooks(notifier.clone());
+        let mut state = state.with_webhooks(notifier.clone()).with_axes(self.config.claims.axes);
         if let Some(folder) = &self.config.record.folder {
             state = state.with_evidence(folder, &self.config.estimator);
         }
@@ -148,6 +177,9 @@ impl Daemon {
             listener.url(self.server.scheme())?,
         );
         let is_replay = source.kind == SourceKind::Replay;
+        let telemetry = self.telemetry.zip(self.pipeline.live_poses());
+        let telemetry = telemetry.map(|(link, poses)| Telemetry::start(link, poses, self.config.world.clone()));
+        let _telemetry = telemetry.transpose()?;
         let halt = Arc::new(AtomicBool::new(false));
         if !is_replay {
             self.pipeline.claims.expect_live_claims();
@@ -169,6 +201,7 @@ impl Daemon {
             journal: self.journal.clone(),
             webhooks: notifier.clone(),
             supervisor: Supervisor::default(),
+            poses: pose::Poses::new(&self.config.platform, self.config.world.axes(), self.camera.altitude_m),
             camera: Arc::new(self.camera),
             claims_log: log.map(|l| l.display().to_string()),
             source: source.kind.name().to_owned(),
@@ -186,6 +219,7 @@ impl Daemon {
             path: self.path,
             logging,
             webhooks: notifier,
+            exports,
             settings: reloaded,
         };
         let outcome = tokio::select! {

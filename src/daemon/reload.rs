@@ -8,13 +8,15 @@ use tokio::sync::mpsc;
 
 use super::supervisor::Supervisor;
 use crate::config::Config;
-use crate::{claims, logging, monitor, notify};
+use crate::pipeline::Places;
+use crate::{claims, export, logging, monitor, notify};
 
 /// What the compute thread takes while it runs.
 #[derive(Debug)]
 pub struct Settings {
     pub monitor: monitor::Config,
     pub claims: claims::Config,
+    pub places: Places,
 }
 
 /// What a reload reads and changes.
@@ -24,6 +26,7 @@ pub struct Reload {
     pub path: Option<PathBuf>,
     pub logging: logging::Handle,
     pub webhooks: notify::Notifier,
+    pub exports: export::Running,
     pub settings: mpsc::Sender<Settings>,
 }
 
@@ -59,7 +62,9 @@ impl Reload {
         new.monitor.validate()?;
         new.claims.validate()?;
         new.journal.validate()?;
-        let endpoints = notify::load(&new.webhook)?;
+        let places = Places::of(&new)?;
+        let mut endpoints = notify::load(&new.webhook)?;
+        let exports = export::load(&new.export, &endpoints, &new.world)?;
         for warning in new.warnings(&new.camera()?) {
             tracing::warn!("{warning}");
         }
@@ -67,10 +72,12 @@ impl Reload {
             self.logging.set(&new.log)?;
         }
         let changed = new.tables_that_differ(&self.current);
+        endpoints.extend(self.exports.replace(exports));
         self.webhooks.replace(endpoints).await?;
         let settings = Settings {
             monitor: new.monitor.clone(),
             claims: new.claims.clone(),
+            places,
         };
         // An error would mean that the compute thread has ended, and with it the daemon.
         let _ = self.settings.send(settings).await;
@@ -78,6 +85,10 @@ impl Reload {
         self.current.monitor = new.monitor.clone();
         self.current.claims = new.claims.clone();
         self.current.webhook = new.webhook.clone();
+        self.current.zone = new.zone.clone();
+        self.current.known_light = new.known_light.clone();
+        self.current.maintenance = new.maintenance.clone();
+        self.current.export = new.export.clone();
         let (fixed, changed): (Vec<_>, Vec<_>) = {
             let fixed = new.tables_that_differ(&self.current);
             changed.into_iter().partition(|table| fixed.contains(table))

@@ -25,6 +25,8 @@ pub(super) struct State {
     pub malformed: u64,
     pub last_good: Option<Timestamp>,
     pub fault: Option<String>,
+    /// Whether it was said that the spots differ from the model.
+    pub has_warned_of_spot: bool,
     pub source: SourceState,
     pub latencies: VecDeque<Duration>,
     pub arrivals: VecDeque<Instant>,
@@ -50,6 +52,7 @@ impl State {
             malformed: 0,
             last_good: None,
             fault: None,
+            has_warned_of_spot: false,
             source: SourceState::Starting,
             latencies: VecDeque::with_capacity(WINDOW),
             arrivals: VecDeque::with_capacity(WINDOW),
@@ -102,8 +105,8 @@ impl State {
 
     /// Sets the gauges that follow from a report.
     pub fn gauge(&self, report: &Report) {
-        use PositionStatus::{Mismatch, Pending, Unclaimed, Verified};
-        for status in [Verified, Mismatch, Unclaimed, Pending] {
+        use PositionStatus::{Ignored, Known, Mismatch, Pending, Unclaimed, Verified};
+        for status in [Verified, Mismatch, Unclaimed, Pending, Known, Ignored] {
             let count = report.emitters.iter().filter(|e| e.status == status).count();
             gauge!(metric::EMITTERS, "status" => word(status)).set(count as f64);
         }

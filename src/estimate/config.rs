@@ -19,6 +19,9 @@ pub struct Config {
     /// Time allowed a frame, ms; the best hypothesis reached by then is returned. Whoever holds the clock passes the test to
     /// [`Estimator::estimate_until`](crate::estimate::Estimator::estimate_until); see [`Config::budget`].
     pub budget_ms: Option<f64>,
+    /// How long the `sequence` estimator remembers, s: what frames said fades with this time constant, and after a gap this long nothing is
+    /// left.
+    pub memory_s: Option<f64>,
     /// What the `map` estimator may assume of users' power; without it `map` is `ml`.
     pub known_power: Option<KnownPower>,
     /// The rules in force; all, but where a study measures what one of them gains.
@@ -27,6 +30,14 @@ pub struct Config {
 }
 
 impl Config {
+    /// How long the `sequence` estimator remembers: as long as people walk straight on.
+    const MEMORY_S: f64 = 60.0;
+
+    /// How long the `sequence` estimator remembers, s.
+    pub fn memory_s(&self) -> f64 {
+        self.memory_s.unwrap_or(Self::MEMORY_S)
+    }
+
     /// Time allowed a frame.
     pub fn budget(&self) -> Option<Duration> {
         self.budget_ms.map(|ms| Duration::from_secs_f64(ms * 1e-3))

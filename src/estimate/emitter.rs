@@ -50,6 +50,13 @@ pub struct SecondMomentScore {
     pub information: [[f64; 3]; 3],
 }
 
+/// How an emitter moves on the ground.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Velocity {
+    pub vx_m_s: f64,
+    pub vy_m_s: f64,
+}
+
 /// One fitted light source, placed on the ground.
 #[derive(Clone, Debug, Serialize)]
 pub struct Emitter {
@@ -59,6 +66,9 @@ pub struct Emitter {
     pub cov_m2: [[f64; 2]; 2],
     /// Collected energy over the whole spot (also the part that falls off the sensor).
     pub energy_j: f64,
+    /// Velocity along x and y, where the estimator follows emitters over frames.
+    #[serde(flatten, skip_serializing_if = "Option::is_none")]
+    pub velocity: Option<Velocity>,
     /// Standard deviation of `energy_j`.
     #[serde(skip)]
     pub energy_std_j: f64,
@@ -80,6 +90,8 @@ pub struct Estimate {
     pub is_cut_short: bool,
     /// Weighted squared residual per degree of freedom; near 1 when the model explains the frame.
     pub reduced_chi2: f64,
+    /// Share of a spot's light by which the spots were taken to differ from the PSF; 0 where it explains the frame.
+    pub spot_error: f64,
     /// Share of pixels at or above saturation.
     pub saturated_share: f64,
     /// Condition number (1-norm) of the information matrix scaled to a unit diagonal; 1 where nothing was found.

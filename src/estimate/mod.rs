@@ -17,6 +17,7 @@ mod model;
 mod model_order;
 mod preprocess;
 mod rules;
+mod sequence;
 #[doc(hidden)]
 pub mod stages;
 #[cfg(test)]
@@ -25,7 +26,7 @@ mod uncertainty;
 
 pub use config::{Config, ConfigError, KnownPower};
 pub use detect::heatmap_network::NetworkError;
-pub use emitter::{Emitter, Estimate, Flags, SecondMomentScore};
+pub use emitter::{Emitter, Estimate, Flags, SecondMomentScore, Velocity};
 pub use error::Error;
 pub use estimator::Estimator;
 pub use estimators::build::build;

@@ -117,6 +117,7 @@ impl Stages {
             &self.camera,
             noise_j,
             None,
+            None,
         );
         found.emitters
     }

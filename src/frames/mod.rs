@@ -24,6 +24,7 @@ pub mod v4l2;
 pub use capture::Capture;
 pub use config::{Config, SourceKind};
 pub use error::Error;
+pub use replay::frame_time;
 pub use simulator::Simulator;
 pub use slot::Captured;
 pub use source::{FrameSource, Next};

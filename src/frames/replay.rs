@@ -127,11 +127,16 @@ impl Replay {
     }
 
     fn time(&self, frame: u64) -> Timestamp {
-        let nanos = (frame as f64 / self.rate_hz * 1e9).round();
-        self.start
-            .checked_add(SignedDuration::from_nanos_i128(nanos as i128))
-            .unwrap_or(Timestamp::MAX)
+        frame_time(self.start, self.rate_hz, frame)
     }
+}
+
+/// The time of a recording's frame: start + frame/rate.
+pub fn frame_time(start: Timestamp, rate_hz: f64, frame: u64) -> Timestamp {
+    let nanos = (frame as f64 / rate_hz * 1e9).round();
+    start
+        .checked_add(SignedDuration::from_nanos_i128(nanos as i128))
+        .unwrap_or(Timestamp::MAX)
 }
 
 impl FrameSource for Replay {

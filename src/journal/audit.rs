@@ -1,4 +1,4 @@
-//! The audit log: who acknowledged alerts, posted claims, changed webhooks, or was refused.
+//! The audit log: who acknowledged alerts, approved lights, drew zones, posted claims, changed webhooks, or was refused.
 
 use jiff::Timestamp;
 
@@ -17,6 +17,16 @@ pub enum AuditAction {
     EnableWebhook,
     #[serde(rename = "webhook.test")]
     TestWebhook,
+    #[serde(rename = "known_light.approve")]
+    ApproveLight,
+    #[serde(rename = "known_light.revoke")]
+    RevokeLight,
+    #[serde(rename = "zones.put")]
+    PutZones,
+    #[serde(rename = "maintenance.begin")]
+    BeginMaintenance,
+    #[serde(rename = "maintenance.end")]
+    EndMaintenance,
     /// A request was refused: wrong token, foreign host or origin, too many requests.
     #[serde(rename = "request.refused")]
     Refused,

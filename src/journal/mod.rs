@@ -12,6 +12,7 @@ mod disk;
 mod error;
 mod follow;
 mod health;
+mod origin;
 mod outbox;
 mod query;
 mod reading;
@@ -41,6 +42,7 @@ pub use config::{Config, ConfigError};
 pub use error::Error;
 pub use follow::Follower;
 pub use health::Health;
+pub use origin::Origin;
 pub use outbox::{Attempt, DeadLetter, EndpointRecord, Outcome, Subscription, Waiting};
 pub use query::{Cursor, Filter, Recorded};
 
@@ -164,17 +166,30 @@ impl Journal {
             event: Arc::new(events[k].clone()),
             at,
             now,
+            origin: None,
         })
     }
 
     /// As [`Journal::record`], for events that have their numbers: consecutive and above [`Journal::last_seq`].
     pub fn record_numbered(&self, events: &[Recorded], now: Timestamp) -> Result<u64, Error> {
+        self.record_from(events, |_| None, now)
+    }
+
+    /// As [`Journal::record_numbered`], for events that another journal had first: with each, in the same transaction, how far
+    /// its source has been taken over ([`Journal::origins`]).
+    pub fn record_from(
+        &self,
+        events: &[Recorded],
+        origin: impl Fn(usize) -> Option<Origin>,
+        now: Timestamp,
+    ) -> Result<u64, Error> {
         let first = events.first().map_or(0, |e| e.seq);
         self.shared.push_events(events.len(), first, |k, seq| Write::Event {
             seq,
             event: Arc::new(events[k].event.clone()),
             at: events[k].at,
             now,
+            origin: origin(k),
         })
     }
 
@@ -199,14 +214,22 @@ impl Journal {
         self.shared.heard.subscribe()
     }
 
-    /// Writes outbox rows for these endpoints from the next event on. Rows of others stay.
-    pub fn subscribe(&self, subscriptions: Vec<Subscription>) {
-        self.shared.subscriptions.store(Arc::new(subscriptions));
+    /// Writes outbox rows for these endpoints from the next event on, and no more for those of `before`. Rows stay.
+    pub fn resubscribe(&self, before: &[String], subscriptions: &[Subscription]) {
+        self.shared.subscriptions.rcu(|now| {
+            let kept = now.iter().filter(|s| !before.contains(&s.endpoint));
+            kept.chain(subscriptions).cloned().collect::<Vec<_>>()
+        });
     }
 
     /// The journal's own random name, for ids that stay unique over journals.
     pub fn id(&self) -> &str {
         &self.id
+    }
+
+    /// The id of an event, which receivers recognise a repeat by.
+    pub fn event_id(&self, seq: u64) -> String {
+        format!("msg_{}_{seq}", self.id)
     }
 
     pub fn health(&self) -> Health {
@@ -243,6 +266,12 @@ impl Journal {
     /// disk refuses writes, only 2,000 rows wait for it in memory.
     pub fn audit(&self, entry: AuditEntry, now: Timestamp) -> bool {
         self.shared.push_audit(entry, now)
+    }
+
+    /// Keeps what an operator has set over restarts, or forgets it without a `body`. Never waits for the disk.
+    pub fn keep(&self, kind: &'static str, id: &str, body: Option<String>) {
+        let id = id.to_owned();
+        self.shared.push(Write::Keep { kind, id, body });
     }
 
     /// Removes what is older than `keep_days` or beyond `max_mb`. Where the last event or round is more than a day

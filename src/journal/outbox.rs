@@ -1,4 +1,4 @@
-//! Rows of the webhook outbox and what the journal remembers of each endpoint.
+//! Rows of the outbox of webhooks and exports and what the journal remembers of each endpoint.
 
 use std::sync::Arc;
 
@@ -7,13 +7,15 @@ use jiff::Timestamp;
 
 use crate::monitor::{AlertEvent, AlertKind};
 
-/// Which events one webhook endpoint receives; the outbox gets a row for each event that matches.
+/// Which events one endpoint receives; the outbox gets a row for each event that matches.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Subscription {
     /// The endpoint's name in the journal; stable over restarts.
     pub endpoint: String,
     /// All kinds when `None`.
     pub kinds: Option<Vec<AlertKind>>,
+    /// Whether what an operator does to an alert is an event too; it is no news to most receivers.
+    pub has_operator_acts: bool,
 }
 
 /// The subscriptions in force.
@@ -84,13 +86,19 @@ pub struct EndpointRecord {
     pub disabled_at: Option<Timestamp>,
 }
 
+/// Whether the zone or the maintenance of an alert leaves this endpoint among those that are sent it.
+fn is_named(endpoint: &str, event: &AlertEvent) -> bool {
+    let only = event.alert.webhooks.as_ref();
+    only.is_none_or(|names| names.iter().any(|name| name == endpoint))
+}
+
 impl Subscription {
-    /// An operator's own act is no news to a receiver.
     pub fn wants(&self, event: &AlertEvent) -> bool {
-        !event.event.is_by_operator()
+        (self.has_operator_acts || !event.event.is_by_operator())
             && self
                 .kinds
                 .as_ref()
                 .is_none_or(|kinds| kinds.contains(&event.alert.kind))
+            && (self.has_operator_acts || is_named(&self.endpoint, event))
     }
 }

@@ -1,5 +1,7 @@
 //! SQL reads of one store: alerts, events, deliveries, endpoints.
 
+use std::collections::BTreeMap;
+
 use jiff::Timestamp;
 use rusqlite::types::Value;
 use rusqlite::{OptionalExtension, Row, params};
@@ -63,6 +65,19 @@ impl std::str::FromStr for Cursor {
 }
 
 impl Store {
+    /// Bodies of what operators have set, by id.
+    pub(super) fn kept(&self, kind: &str) -> Result<Vec<String>, rusqlite::Error> {
+        let mut statement = self
+            .db
+            .prepare_cached("SELECT body FROM kept WHERE kind = ?1 ORDER BY id")?;
+        statement.query_map([kind], |row| row.get(0))?.collect()
+    }
+
+    pub(super) fn origins(&self) -> Result<BTreeMap<String, u64>, rusqlite::Error> {
+        let mut rows = self.db.prepare_cached("SELECT source, last_seq FROM origin")?;
+        rows.query_map([], |row| Ok((row.get(0)?, row.get(1)?)))?.collect()
+    }
+
     pub(super) fn alerts(&self, filter: &Filter, limit: usize) -> Result<Vec<Listed>, rusqlite::Error> {
         let mut sql = "SELECT raised_us, first_seq, body FROM alert WHERE 1".to_owned();
         let mut values: Vec<Value> = Vec::new();
@@ -146,13 +161,13 @@ impl Store {
         rows.filter_map(Result::transpose).collect()
     }
 
-    pub(super) fn waiting(&self, endpoint: &str, after: u64) -> Result<Vec<Waiting>, rusqlite::Error> {
+    pub(super) fn waiting(&self, endpoint: &str, after: u64, limit: i64) -> Result<Vec<Waiting>, rusqlite::Error> {
         let mut statement = self.db.prepare_cached(
             "SELECT d.seq, d.endpoint, e.alert, e.recorded_us, d.step, d.attempts, d.next_us
              FROM delivery d JOIN event e USING (seq)
-             WHERE d.endpoint = ?1 AND d.state = 'waiting' AND d.seq > ?2 ORDER BY d.seq",
+             WHERE d.endpoint = ?1 AND d.state = 'waiting' AND d.seq > ?2 ORDER BY d.seq LIMIT ?3",
         )?;
-        let rows = statement.query_map(params![endpoint, after], |row| {
+        let rows = statement.query_map(params![endpoint, after, limit], |row| {
             Ok(Waiting {
                 seq: row.get(0)?,
                 endpoint: row.get(1)?,

@@ -20,6 +20,12 @@ impl Journal {
         Ok(alerts)
     }
 
+    /// What operators have set of this kind, as [`Journal::keep`] got it; by id.
+    pub fn kept(&self, kind: &str) -> Result<Vec<String>, Error> {
+        let (held, disk) = self.read(|store| store.kept(kind))?;
+        Ok(disk.or(held).unwrap_or_default())
+    }
+
     /// Newest raised first.
     pub fn alerts(&self, filter: &Filter, limit: usize) -> Result<Page, Error> {
         let newer = self.held_ids()?;
@@ -65,10 +71,16 @@ impl Journal {
 
     /// Deliveries to an endpoint that are still to be made, for events after a sequence number.
     pub fn waiting(&self, endpoint: &str, after: u64) -> Result<Vec<Waiting>, Error> {
-        let (held, disk) = self.read_after(after, |store| store.waiting(endpoint, after))?;
+        self.first_waiting(endpoint, after, i64::MAX as usize)
+    }
+
+    /// The first `limit` of [`Journal::waiting`].
+    pub fn first_waiting(&self, endpoint: &str, after: u64, limit: usize) -> Result<Vec<Waiting>, Error> {
+        let rows = i64::try_from(limit).unwrap_or(i64::MAX);
+        let (held, disk) = self.read_after(after, |store| store.waiting(endpoint, after, rows))?;
         let all = disk.into_iter().chain(held).flatten();
         let by_seq: BTreeMap<u64, Waiting> = all.map(|w| (w.seq, w)).collect();
-        Ok(by_seq.into_values().collect())
+        Ok(by_seq.into_values().take(limit).collect())
     }
 
     /// Those of [`Journal::waiting`] that memory knows of, without a look at the disk, and whether they are all.
@@ -77,7 +89,7 @@ impl Journal {
         let Some(since) = overlay.since else {
             return Ok((Vec::new(), false));
         };
-        Ok((overlay.store.waiting(endpoint, after)?, since <= after))
+        Ok((overlay.store.waiting(endpoint, after, i64::MAX)?, since <= after))
     }
 
     pub fn dead_letters(&self, endpoint: &str, limit: usize) -> Result<Vec<DeadLetter>, Error> {
@@ -95,6 +107,17 @@ impl Journal {
             .map(|record| (record.id, record))
             .collect();
         Ok(by_id.into_values().rev().take(limit).collect())
+    }
+
+    /// The last event taken over from each other journal, by its name.
+    pub fn origins(&self) -> Result<BTreeMap<String, u64>, Error> {
+        let (held, disk) = self.read(|store| store.origins())?;
+        let mut origins = disk.unwrap_or_default();
+        for (source, seq) in held.into_iter().flatten() {
+            let last = origins.entry(source).or_default();
+            *last = seq.max(*last);
+        }
+        Ok(origins)
     }
 
     pub fn endpoint(&self, id: &str) -> Result<EndpointRecord, Error> {

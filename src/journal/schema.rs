@@ -87,6 +87,20 @@ const MIGRATIONS: &[&str] = &[
         count  INTEGER NOT NULL
     );
 ",
+    "
+    CREATE TABLE origin (
+        source   TEXT PRIMARY KEY,
+        last_seq INTEGER NOT NULL
+    ) WITHOUT ROWID;
+",
+    "
+    CREATE TABLE kept (
+        kind TEXT NOT NULL,
+        id   TEXT NOT NULL,
+        body TEXT NOT NULL,
+        PRIMARY KEY (kind, id)
+    ) WITHOUT ROWID;
+",
 ];
 
 /// Opens a journal for writing, creating or migrating it where needed. `None` is a journal in memory.

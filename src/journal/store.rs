@@ -6,6 +6,7 @@ use std::sync::Arc;
 use jiff::Timestamp;
 use rusqlite::{Connection, TransactionBehavior, params};
 
+use super::origin::Origin;
 use super::outbox::Subscriptions;
 use super::{Attempt, AuditRecord, Error, Outcome, schema};
 use crate::monitor::{AlertEvent, AlertEventKind};
@@ -19,6 +20,8 @@ pub(super) enum Write {
         event: Arc<AlertEvent>,
         at: Timestamp,
         now: Timestamp,
+        /// Where it came from, when another journal had it first.
+        origin: Option<Origin>,
     },
     Attempt(Attempt),
     Disable {
@@ -39,6 +42,12 @@ pub(super) enum Write {
         now: Timestamp,
     },
     Audit(Arc<AuditRecord>),
+    /// What an operator has set, to be read again at the next start; forgotten without a body.
+    Keep {
+        kind: &'static str,
+        id: String,
+        body: Option<String>,
+    },
 }
 
 impl Write {
@@ -48,7 +57,7 @@ impl Write {
             Self::Event { now, .. } | Self::Maintain { now } => Some(*now),
             Self::Attempt(Attempt { at, .. }) | Self::Disable { at, .. } | Self::Replay { at, .. } => Some(*at),
             Self::Audit(record) => Some(record.at),
-            Self::Enable { .. } => None,
+            Self::Enable { .. } | Self::Keep { .. } => None,
         }
     }
 }
@@ -84,8 +93,17 @@ impl Store {
         let tx = self.db.transaction_with_behavior(TransactionBehavior::Immediate)?;
         for write in writes {
             match write {
-                Write::Event { seq, event, at, now } => {
+                Write::Event {
+                    seq,
+                    event,
+                    at,
+                    now,
+                    origin,
+                } => {
                     put_event(&tx, *seq, event, *at, *now)?;
+                    if let Some(origin) = origin {
+                        put_origin(&tx, origin)?;
+                    }
                     for subscription in self.subscriptions.load().iter().filter(|s| s.wants(event)) {
                         tx.prepare_cached(
                             "INSERT OR REPLACE INTO delivery VALUES (?1, ?2, 'waiting', 0, 0, ?3, NULL, NULL)",
@@ -116,6 +134,7 @@ impl Store {
                     )?;
                 }
                 Write::Audit(record) => put_audit(&tx, record)?,
+                Write::Keep { kind, id, body } => put_kept(&tx, kind, id, body.as_deref())?,
                 Write::Maintain { .. } => {}
             }
         }
@@ -159,6 +178,14 @@ fn put_event(
     Ok(())
 }
 
+fn put_origin(tx: &Connection, origin: &Origin) -> Result<(), rusqlite::Error> {
+    tx.prepare_cached(
+        "INSERT INTO origin VALUES (?1, ?2) ON CONFLICT (source) DO UPDATE SET last_seq = max(last_seq, ?2)",
+    )?
+    .execute(params![origin.source.as_ref(), origin.seq])?;
+    Ok(())
+}
+
 fn put_audit(tx: &Connection, record: &AuditRecord) -> Result<(), rusqlite::Error> {
     // A write that is repeated after a failure finds its row in place.
     let entry = &record.entry;
@@ -173,6 +200,18 @@ fn put_audit(tx: &Connection, record: &AuditRecord) -> Result<(), rusqlite::Erro
             entry.detail,
             entry.count,
         ])?;
+    Ok(())
+}
+
+fn put_kept(tx: &Connection, kind: &str, id: &str, body: Option<&str>) -> Result<(), rusqlite::Error> {
+    match body {
+        Some(body) => tx
+            .prepare_cached("INSERT OR REPLACE INTO kept VALUES (?1, ?2, ?3)")?
+            .execute(params![kind, id, body])?,
+        None => tx
+            .prepare_cached("DELETE FROM kept WHERE kind = ?1 AND id = ?2")?
+            .execute(params![kind, id])?,
+    };
     Ok(())
 }
 

@@ -9,6 +9,8 @@ use serde::{Deserialize, Serialize};
 pub(super) const SAME_PLACE_M: f64 = 10.0;
 /// The key of an alert's evidence that names the user in whose spot a second beam is.
 pub(super) const SHARED_SPOT: &str = "shares_the_spot_of";
+/// The key of an alert's evidence that names the known light that changed.
+pub(super) const KNOWN_LIGHT: &str = "known_light";
 /// Age from which an alert is critical, s. Longer delays the escalation, shorter makes every alert critical. Not tuned.
 const ESCALATE_S: f64 = 10.0;
 
@@ -30,10 +32,20 @@ pub enum AlertKind {
     PoseInconsistent,
     /// More is claimed than there is room or time for: claims are refused or shed.
     ClaimsFlooded,
+    /// An approved light is no longer what was approved.
+    KnownLightChanged,
+    /// A user is in a restricted zone that does not list them, or outside of all zones that do.
+    UserOutOfZone,
+    /// A hub hears nothing of one of its access points.
+    StationLost,
+    /// A user is claimed or seen at two access points, too far apart to be one.
+    UserInTwoPlaces,
+    /// No poses come: where the camera looks is known ever less.
+    PoseLost,
 }
 
 impl AlertKind {
-    pub const ALL: [Self; 7] = [
+    pub const ALL: [Self; 12] = [
         Self::UnclaimedEmitter,
         Self::PositionMismatch,
         Self::UserUnseen,
@@ -41,6 +53,11 @@ impl AlertKind {
         Self::ClaimsStale,
         Self::PoseInconsistent,
         Self::ClaimsFlooded,
+        Self::KnownLightChanged,
+        Self::UserOutOfZone,
+        Self::StationLost,
+        Self::UserInTwoPlaces,
+        Self::PoseLost,
     ];
 }
 
@@ -102,9 +119,43 @@ pub struct Alert {
     pub claimed: Option<serde_json::Value>,
     pub evidence: serde_json::Value,
     pub source: AlertSource,
+    /// The watched or restricted zone that its emitter is in.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub zone: Option<String>,
+    /// The only webhooks that are sent it: those of its zone, or none during maintenance. All when left out.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub webhooks: Option<Vec<String>>,
+    /// The maintenance window in which it was raised, until that ends: it is recorded and not sent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub maintenance: Option<String>,
     /// The latest acknowledgement; it stays, marked as withdrawn, when it is undone.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub acknowledgement: Option<Acknowledgement>,
+    /// The access point that it comes from, at a hub of many.
+    #[serde(default, flatten)]
+    #[schema(value_type = StationFields)]
+    pub station: Option<StationName>,
+}
+
+/// How an optional [`StationName`] beside other fields is described: both of these or none.
+#[derive(utoipa::ToSchema)]
+#[allow(dead_code, reason = "a description only")]
+pub struct StationFields {
+    site: Option<String>,
+    station: Option<String>,
+}
+
+/// An access point among all sites.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, utoipa::ToSchema)]
+pub struct StationName {
+    pub site: String,
+    pub station: String,
+}
+
+impl std::fmt::Display for StationName {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{}.{}", self.site, self.station)
+    }
 }
 
 /// That an operator took note of an alert.
@@ -133,7 +184,10 @@ impl Alert {
     /// Whether both alerts have one cause: the same user, the same shared spot or, where neither is named, the same place
     /// to within 10 m.
     pub fn has_cause_of(&self, other: &Self) -> bool {
-        let spot = |alert: &Self| alert.evidence[SHARED_SPOT].as_str().map(str::to_owned);
+        let spot = |alert: &Self| {
+            let name = |key: &str| alert.evidence[key].as_str();
+            name(SHARED_SPOT).or(name(KNOWN_LIGHT)).map(str::to_owned)
+        };
         let is_near = match (self.x_m.zip(self.y_m), other.x_m.zip(other.y_m)) {
             (Some((x, y)), Some((ox, oy))) => (x - ox).hypot(y - oy) < SAME_PLACE_M,
             (here, there) => here == there,
@@ -151,7 +205,7 @@ impl Alert {
     }
 
     /// Takes an operator's note of it. Whether that changes anything: an alert that is acknowledged takes only another note.
-    pub(super) fn acknowledge(&mut self, acknowledgement: Acknowledgement) -> bool {
+    pub fn acknowledge(&mut self, acknowledgement: Acknowledgement) -> bool {
         if self.state == AlertState::Acknowledged && acknowledgement.note.is_none() {
             return false;
         }
@@ -161,7 +215,7 @@ impl Alert {
     }
 
     /// Undoes the acknowledgement, if there is one.
-    pub(super) fn withdraw(&mut self, withdrawal: Withdrawal) -> bool {
+    pub fn withdraw(&mut self, withdrawal: Withdrawal) -> bool {
         if self.state != AlertState::Acknowledged {
             return false;
         }
@@ -227,7 +281,11 @@ mod tests {
                 frame: 0,
                 file: None,
             },
+            zone: None,
+            webhooks: None,
+            maintenance: None,
             acknowledgement: None,
+            station: None,
         }
     }
 

@@ -103,9 +103,10 @@ impl AlertLifecycle {
 
     /// Whether an open alert is about this user: their position, absence or claims, or a second beam in their spot.
     pub fn concerns(&self, user: &str) -> bool {
-        const OF_USERS: [AlertKind; 3] = [
+        const OF_USERS: [AlertKind; 4] = [
             AlertKind::PositionMismatch,
             AlertKind::UserUnseen,
+            AlertKind::UserOutOfZone,
             AlertKind::ClaimsStale,
         ];
         OF_USERS
@@ -184,9 +185,14 @@ impl AlertLifecycle {
             // An alert never becomes milder while its cause lasts.
             let severity = alert.severity.max(content.severity);
             let has_escalated = severity != alert.severity;
+            // What was raised during maintenance and is still there when that ends is sent then.
+            let is_released = alert.maintenance.is_some() && content.maintenance.is_none();
+            if is_released {
+                alert.maintenance = None;
+            }
             content.write_to(alert, open.recurrences);
             alert.severity = severity;
-            if has_escalated {
+            if has_escalated || is_released {
                 alert.source.frame = frame;
                 self.events.push(alert.event(AlertEventKind::Updated));
             }
@@ -216,7 +222,11 @@ impl AlertLifecycle {
                 frame,
                 file: self.source_file.clone(),
             },
+            zone: None,
+            webhooks: None,
+            maintenance: content.maintenance.clone(),
             acknowledgement: None,
+            station: None,
         };
         content.write_to(&mut alert, recurrences);
         self.events.push(alert.event(AlertEventKind::Raised));

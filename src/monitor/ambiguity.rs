@@ -9,7 +9,7 @@ use super::track::beam_track::Track;
 use super::track::detection::{OVERLAP, snr, spot_m};
 use super::track::tracker::Tracker;
 use crate::estimate::Flags;
-use crate::optics::Camera;
+use crate::geo::View;
 
 /// Gain in deviance that a beam must bring over what its neighbours can take of its light. With less it is not resolved from
 /// one neighbour nearer than 0.4 σ, nor from two a σ away on either side (signal-to-noise ratio 200). Larger excuses users
@@ -44,12 +44,12 @@ pub(super) fn mark_unresolvable(
     claims: &mut [ActiveClaim],
     association: &Association,
     tracker: &Tracker,
-    camera: &Camera,
+    view: &View,
     usual_energy_j: impl Fn(&str) -> Option<f64>,
 ) {
     for (i, claim) in claims.iter_mut().enumerate() {
         if association.track_id(i).is_none() {
-            claim.is_unresolvable = is_unresolvable(claim, tracker, camera, &usual_energy_j);
+            claim.is_unresolvable = is_unresolvable(claim, tracker, view, &usual_energy_j);
         }
     }
 }
@@ -58,10 +58,10 @@ pub(super) fn mark_unresolvable(
 fn is_unresolvable(
     claim: &ActiveClaim,
     tracker: &Tracker,
-    camera: &Camera,
+    view: &View,
     usual_energy_j: impl Fn(&str) -> Option<f64>,
 ) -> bool {
-    let spot_m = spot_m(camera);
+    let spot_m = spot_m(view);
     let seen = || tracker.tracks.iter().filter(|t| t.hit).map(|t| &t.detection);
     let mut near: Vec<Vector2<f64>> = seen().map(|d| (d.position - claim.position) / spot_m).collect();
     near.retain(|p| p.norm() < OVERLAP);
@@ -71,7 +71,7 @@ fn is_unresolvable(
         return false;
     };
     let usual = usual_energy_j(&claim.claim.user).or_else(|| median_high(seen().map(|d| d.energy_j)));
-    let snr = snr(camera, usual.unwrap_or(0.0));
+    let snr = snr(&view.camera, usual.unwrap_or(0.0));
     let off = CLAIM_REACH * claim.variance.sqrt() / spot_m;
     [[0.0, 0.0], [off, 0.0], [-off, 0.0], [0.0, off], [0.0, -off]]
         .into_iter()
@@ -188,12 +188,12 @@ mod tests {
 
     #[test]
     fn a_claim_on_top_of_a_seen_beam_cannot_be_resolved() {
-        let camera = optics::Config::default().camera().unwrap();
+        let view = View::level(&optics::Config::default().camera().unwrap());
         let (tracker, _) = two_beams(60.0, Flags::empty());
         let mark = |x: f64| {
             let mut claims = [active_claim("a", x, 0.0)];
             // Half a millijoule: a signal-to-noise ratio of some 66.
-            mark_unresolvable(&mut claims, &Association::none(1), &tracker, &camera, |_| Some(5e-4));
+            mark_unresolvable(&mut claims, &Association::none(1), &tracker, &view, |_| Some(5e-4));
             claims[0].is_unresolvable
         };
         assert!(mark(0.5));

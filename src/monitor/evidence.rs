@@ -16,12 +16,19 @@ const MIN_OTHERS: usize = 2;
 
 /// The claim as an alert carries it.
 pub(super) fn claimed(claim: &ActiveClaim) -> Value {
-    json!({
+    let mut claimed = json!({
         "x_m": claim.claim.x_m,
         "y_m": claim.claim.y_m,
         "sigma_m": claim.claim.sigma_m,
         "time": claim.claim.time,
-    })
+    });
+    if let Some(cov) = claim.claim.cov_m2 {
+        claimed["cov_m2"] = json!(cov);
+    }
+    if let Some(z_m) = claim.claim.z_m {
+        claimed["z_m"] = z_m.into();
+    }
+    claimed
 }
 
 /// The light of the user of claim `i` against the power that they report, by what arrives of each watt of the others: a beam from
@@ -47,8 +54,8 @@ pub(super) fn power_against_reported(frame: &FrameContext, i: usize) -> Option<V
 /// reports none or is not seen.
 fn ln_yield(frame: &FrameContext, i: usize) -> Option<f64> {
     let track = frame.track(i).filter(|t| t.hit)?;
-    let altitude_m = frame.camera.altitude_m;
-    let slant = altitude_m / altitude_m.hypot(track.filter.position().norm());
+    let altitude_m = frame.view.height_m();
+    let slant = altitude_m / altitude_m.hypot((track.filter.position() - frame.view.nadir_m()).norm());
     let yield_j = track.detection.energy_j / (frame.claims[i].claim.power_w? * slant);
     Some(yield_j.ln()).filter(|y| y.is_finite())
 }

@@ -3,7 +3,7 @@
 use nalgebra::{Matrix2, Vector2};
 use serde_json::Value;
 
-use super::alert::{Alert, AlertKind, SHARED_SPOT, Severity};
+use super::alert::{Alert, AlertKind, KNOWN_LIGHT, SHARED_SPOT, Severity};
 
 /// What an alert is about. While an alert is open for a cause, the cause raises no other.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -13,6 +13,8 @@ pub(super) enum Cause {
     Track(u64),
     /// A second beam within this user's spot.
     CoLocated(String),
+    /// This known light is no longer what it was.
+    KnownLight(String),
     /// The whole system: sensor, log, pose, or all users together.
     System(AlertKind),
 }
@@ -23,6 +25,9 @@ impl Cause {
     pub fn of(alert: &Alert, new_track: impl FnOnce() -> u64) -> Self {
         match (alert.kind, &alert.user, alert.evidence[SHARED_SPOT].as_str()) {
             (AlertKind::UnclaimedEmitter, None, Some(shared)) => Self::CoLocated(shared.to_owned()),
+            (AlertKind::KnownLightChanged, ..) => {
+                Self::KnownLight(alert.evidence[KNOWN_LIGHT].as_str().unwrap_or_default().to_owned())
+            }
             (kind, Some(user), _) => Self::User(kind, user.clone()),
             (AlertKind::UnclaimedEmitter, None, None) => Self::Track(new_track()),
             (kind, None, _) => Self::System(kind),
@@ -33,6 +38,7 @@ impl Cause {
         match self {
             Self::User(kind, _) | Self::System(kind) => *kind,
             Self::Track(_) | Self::CoLocated(_) => AlertKind::UnclaimedEmitter,
+            Self::KnownLight(_) => AlertKind::KnownLightChanged,
         }
     }
 
@@ -71,6 +77,10 @@ pub(super) struct Content {
     pub cov_m2: Option<[[f64; 2]; 2]>,
     pub claimed: Option<Value>,
     pub evidence: Value,
+    /// The zone that it is in, the only webhooks that are sent it, and the maintenance window in force.
+    pub zone: Option<String>,
+    pub webhooks: Option<Vec<String>>,
+    pub maintenance: Option<String>,
 }
 
 impl Finding {
@@ -109,6 +119,9 @@ impl Content {
             cov_m2: None,
             claimed: None,
             evidence,
+            zone: None,
+            webhooks: None,
+            maintenance: None,
         }
     }
 
@@ -133,6 +146,8 @@ impl Content {
         alert.cov_m2 = self.cov_m2;
         alert.claimed = self.claimed;
         alert.evidence = self.evidence;
+        alert.zone = self.zone;
+        alert.webhooks = self.webhooks;
     }
 
     /// The claim that the position is compared with.

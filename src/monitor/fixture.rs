@@ -1,5 +1,6 @@
 //! A small scene for the tests of rules: users, beams and a clock, all set by hand.
 
+use std::collections::BTreeSet;
 use std::ops::{Deref, DerefMut};
 
 use jiff::{SignedDuration, Timestamp};
@@ -17,6 +18,9 @@ use super::track::detection::fixture::detection;
 use super::track::eligibility::Eligibility;
 use crate::claims::{self, Store};
 use crate::optics;
+
+/// No track is a known light's.
+static NO_LIGHTS: BTreeSet<u64> = BTreeSet::new();
 
 pub(super) struct Scene {
     pub frame: FrameContext,
@@ -90,7 +94,8 @@ impl Scene {
         let claim = &mut self.claims[i];
         (claim.claim.x_m, claim.claim.y_m) = (x, y);
         (claim.claim.time, claim.made) = (now, now);
-        claim.position = Vector2::new(x, y);
+        claim.claimed = Vector2::new(x, y);
+        claim.position = claim.claimed;
     }
 
     pub fn context(&self) -> &FrameContext {
@@ -104,13 +109,14 @@ impl Scene {
             timing: &self.timing,
             crowding: self.crowding,
             alerts: &self.alerts,
+            of_lights: &NO_LIGHTS,
             store: &self.store,
         }
     }
 
     /// So many names are claimed in view without a beam.
     pub fn crowd(&mut self, names: f64) {
-        self.crowding = Crowding::of_claims(&[], names, &self.camera);
+        self.crowding = Crowding::of_claims(&[], names, &self.view);
     }
 
     /// The log says that `user` is at (`x`, `y`), m, now; gives the claim.

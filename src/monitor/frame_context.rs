@@ -1,34 +1,58 @@
 //! What rules may read: one frame's claims, tracks and their association, our pose, and the alerts as they stand.
 
 use jiff::Timestamp;
-use nalgebra::{Matrix2, Vector2};
+use nalgebra::{Matrix2, Matrix6, Vector2, Vector6};
 
 use super::alert_lifecycle::AlertLifecycle;
 use super::ambiguity;
 use super::config::{Config, Source};
+use super::finding::Content;
 use super::input::claim_state::ActiveClaim;
 use super::input::claim_timing::ClaimTiming;
 use super::input::crowding::Crowding;
 use super::input::sensor_health::SensorHealth;
+use super::known_lights::{KnownLight, KnownLights, LightError, Request};
+use super::light_history::LightHistory;
+use super::maintenance::Maintenance;
+use super::pose::bias::PoseBias;
 use super::pose::consensus::PoseConsensus;
+use super::pose::witness::residuals;
+use super::report::Look;
 use super::stats::error_budget::{ErrorBudget, TestFamily};
+use super::stats::gaussian::largest_eigenvalue;
 use super::track::association::Association;
 use super::track::beam_track::Track;
-use super::track::detection::{OVERLAP, spot_m};
+use super::track::detection::{Detection, OVERLAP, spot_m};
+use super::track::registration::register;
 use super::track::tracker::Tracker;
 use super::track::user_tracks::UserTracks;
+use super::zones::{Zone, ZoneKind, ZoneMap};
 use crate::claims::{Squeeze, seconds};
+use crate::geo::View;
 use crate::optics::Camera;
 
 /// Standard deviation of what is systematic in positions and does not average out, m. Larger delays the alert of a drift, smaller
 /// takes calibration errors for one. Not measured.
 const SYSTEMATIC_M: f64 = 0.05;
 
+/// Share of the pose's variance that is left at a place beside the lasting error: what changes within seconds. Larger delays the
+/// alert of a displaced user, smaller takes such a rest for a displacement. Not measured.
+const UNMODELLED: f64 = 0.05;
+
+/// Time within which tracks follow the poses, s. Longer lets all tracks drift off together, shorter lets them follow a pose that is
+/// late to and fro. Not measured.
+const PULL_S: f64 = 5.0;
+/// Age of a pose up to which it says where tracks are, s.
+const FRESH_S: f64 = 0.3;
+
 /// Largest score of a track in thresholds: beyond it more hits do not outweigh later misses. Not measured.
 const MAX_SCORE: f64 = 1.5;
 /// Time since a user was last seen, beside any blindness, within which they count as visible, s. Longer takes users who have left
 /// for a lost sensor, shorter forgets those whom a few frames missed. Not measured.
 const VISIBLE_S: f64 = 2.0;
+/// Standard deviations of a position within which it may be inside of an ignored zone: who stands at the edge must not flicker. More
+/// widen the ground on which a stranger is ignored by as much.
+const EDGE: f64 = 3.0;
 
 /// Claims that found no room or time, lately, and the room there is.
 #[derive(Clone, Copy, Debug, Default)]
@@ -48,7 +72,8 @@ fn max_score(budget: &ErrorBudget) -> f64 {
 /// What all rules read: the settings, what frames and claims so far have shown, and the newest frame. The monitor alone changes it.
 pub(super) struct FrameContext {
     pub config: Config,
-    pub camera: Camera,
+    /// What the camera sees in this frame.
+    pub view: View,
     pub budget: ErrorBudget,
     /// Standard deviation of claims that state none, m.
     pub default_sigma_m: f64,
@@ -58,8 +83,24 @@ pub(super) struct FrameContext {
     pub timing: ClaimTiming,
     pub tracker: Tracker,
     pub pose: PoseConsensus,
+    /// The pose error that lasts.
+    pub bias: PoseBias,
+    /// The error of this frame's pose that its beams share.
+    pub pose_error: Option<Vector6<f64>>,
+    /// Whether it is known where the camera is.
+    pub is_placed: bool,
+    /// Age of the newest pose, s.
+    pose_age_s: f64,
+    /// Age of the newest pose, where it is older than is tolerated, s.
+    pub pose_lost_s: Option<f64>,
+    /// Covariance of the pose error that all tracks share.
+    track_frame_cov: Option<Matrix6<f64>>,
     pub users: UserTracks,
     pub alerts: AlertLifecycle,
+    pub light: LightHistory,
+    pub lights: KnownLights,
+    pub zones: ZoneMap,
+    pub maintenance: Maintenance,
     /// Time of this frame.
     pub now: Timestamp,
     /// Active claims, by user.
@@ -81,7 +122,7 @@ impl FrameContext {
         let budget = ErrorBudget::new(config, source.rate_hz);
         Self {
             config: config.clone(),
-            camera: camera.clone(),
+            view: View::level(camera),
             budget,
             default_sigma_m: claims.default_sigma_m,
             time: None,
@@ -89,8 +130,18 @@ impl FrameContext {
             timing: ClaimTiming::default(),
             tracker: Tracker::new(max_score(&budget)),
             pose: PoseConsensus::default(),
+            bias: PoseBias::default(),
+            pose_error: None,
+            is_placed: true,
+            pose_age_s: 0.0,
+            pose_lost_s: None,
+            track_frame_cov: None,
             users: UserTracks::default(),
             alerts: AlertLifecycle::new(source.kind, source.file, config.cool_down_s),
+            light: LightHistory::default(),
+            lights: KnownLights::default(),
+            zones: ZoneMap::default(),
+            maintenance: Maintenance::default(),
             now: Timestamp::UNIX_EPOCH,
             claims: Vec::new(),
             association: Association::none(0),
@@ -117,7 +168,58 @@ impl FrameContext {
         self.sensor = SensorHealth::default();
         self.timing = ClaimTiming::default();
         self.pose = PoseConsensus::default();
+        self.bias = PoseBias::default();
+        self.track_frame_cov = None;
         self.users = UserTracks::default();
+        self.lights.forget_tracks();
+        self.light = LightHistory::default();
+    }
+
+    /// Takes where the camera is and looks in this frame.
+    pub fn look(&mut self, look: Look) {
+        self.pose_age_s = match look {
+            Look::From { age_s, .. } => age_s,
+            _ => 0.0,
+        };
+        (self.is_placed, self.pose_lost_s) = match look {
+            Look::Level => (true, None),
+            Look::From { age_s, is_lost, .. } => (true, is_lost.then_some(age_s)),
+            Look::Unknown { waited_s, is_lost } => (false, is_lost.then_some(waited_s)),
+        };
+        self.pose_error = None;
+        self.view.sight = match look {
+            Look::From { sight, .. } => Some(sight.clone()),
+            _ => None,
+        };
+    }
+
+    /// Takes the pose error that all detections share out of them and out of the view. How far off the tracks themselves may be
+    /// is then what the best pose lately left, and what each frame since has added: a pose that grows old moves no track.
+    pub fn register(&mut self, detections: &mut [Detection], dt: f64) {
+        let Some(sight) = &self.view.sight else {
+            return;
+        };
+        let leak = if self.pose_age_s < FRESH_S {
+            (dt / PULL_S).min(1.0)
+        } else {
+            0.0
+        };
+        let Some(found) = register(&self.tracker.tracks, detections, sight.cov(), leak) else {
+            return;
+        };
+        let drifted = self.track_frame_cov.map(|cov| cov + found.cov);
+        let of = |cov: &Matrix6<f64>| {
+            let seen = sight.corrected(&Vector6::zeros(), *cov);
+            let point = seen.apparent([self.view.nadir_m().x, self.view.nadir_m().y, 0.0]);
+            point.map_or(0.0, |p| p.pose_cov(cov).trace())
+        };
+        let cov = match drifted {
+            Some(drifted) if of(&drifted) < of(sight.cov()) => drifted,
+            _ => *sight.cov(),
+        };
+        self.track_frame_cov = Some(cov);
+        self.pose_error = Some(found.error);
+        self.view.sight = Some(sight.corrected(&(-found.error * (1.0 - leak)), cov));
     }
 
     /// Takes the time of a frame.
@@ -158,12 +260,162 @@ impl FrameContext {
 
     /// Covariance of what all residuals of a user at `p` share, m²: our own pose and what is systematic in positions.
     pub fn systematic_cov(&self, p: Vector2<f64>) -> Matrix2<f64> {
-        Matrix2::identity() * (SYSTEMATIC_M.powi(2) + self.pose.variance(p))
+        let systematic = Matrix2::identity() * (SYSTEMATIC_M.powi(2) + self.pose.variance(p));
+        match &self.view.sight {
+            None => systematic,
+            Some(_) => systematic + self.bias_cov(p) + self.view.pose_cov(p) * UNMODELLED,
+        }
+    }
+
+    /// Takes what this frame's beams and claims say of the pose error that lasts, `dt` seconds after the last frame.
+    pub fn update_bias(&mut self, dt: f64, period_s: f64) {
+        if let Some(sight) = &self.view.sight {
+            let residuals = residuals(&self.claims, &self.tracker, &self.view);
+            self.bias.update(&residuals, sight.cov(), dt, period_s);
+        }
+    }
+
+    /// How far the lasting pose error displaces a beam at `p`, m; nowhere for a fixed platform.
+    pub fn bias_at(&self, p: Vector2<f64>) -> Vector2<f64> {
+        match &self.view.sight {
+            None => Vector2::zeros(),
+            Some(_) => self.view.by_pose(p) * self.bias.error(),
+        }
+    }
+
+    /// How far all pose error that is known displaces a beam at `p`, m.
+    pub fn displacement_at(&self, p: Vector2<f64>) -> Vector2<f64> {
+        match &self.view.sight {
+            None => self.pose.displacement().at(p),
+            Some(_) => self.bias_at(p) + self.pose.displacement().at(p),
+        }
+    }
+
+    /// A track's place in the world, m: without the lasting pose error where the platform moves.
+    pub fn position(&self, track: &Track) -> Vector2<f64> {
+        let here = track.filter.position();
+        match &self.view.sight {
+            None => here,
+            Some(_) => here - self.bias_at(here),
+        }
+    }
+
+    fn bias_cov(&self, p: Vector2<f64>) -> Matrix2<f64> {
+        let by_pose = self.view.by_pose(p);
+        by_pose * self.bias.cov() * by_pose.transpose()
+    }
+
+    /// Covariance of a track's position in the world, m²: its own and our pose's.
+    pub fn position_cov(&self, track: &Track) -> Matrix2<f64> {
+        let own = track.filter.position_cov();
+        match &self.view.sight {
+            None => own,
+            Some(_) => own + self.bias_cov(track.filter.position()),
+        }
+    }
+
+    /// Associates known lights with the tracks that are no user's.
+    pub fn associate_lights(&mut self) {
+        if !self.lights.is_empty() {
+            let displacement = self.pose.displacement();
+            self.lights.associate(
+                &self.tracker,
+                &mut self.association,
+                &self.alerts,
+                displacement,
+                self.now,
+            );
+        }
+    }
+
+    /// Approves a place or the emitter of an open alert.
+    pub fn approve(&mut self, request: Request) -> Result<KnownLight, LightError> {
+        self.lights.approve(request, &self.alerts, self.pose.displacement())
+    }
+
+    /// Whether a beam that nobody claims since `since` is a known light that went out; then it is associated with that.
+    pub fn displace_light(&mut self, track: u64, since: Timestamp) -> bool {
+        let is_light = self.lights.displace(track, since, self.now, self.config.cool_down_s);
+        if is_light {
+            self.association.assign_light(track);
+        }
+        is_light
+    }
+
+    /// Where a track is on the ground, our own pose error taken out, m.
+    pub fn world(&self, track: &Track) -> [f64; 2] {
+        self.unmoved(track.filter.position())
+    }
+
+    /// A place that the sensor shows, our own pose error taken out, m.
+    pub fn unmoved(&self, seen: Vector2<f64>) -> [f64; 2] {
+        (seen - self.displacement_at(seen)).into()
+    }
+
+    /// Standard deviation of where a track is, what is systematic included, m.
+    pub fn position_error_m(&self, track: &Track) -> f64 {
+        let here = track.filter.position();
+        largest_eigenvalue(&(track.filter.position_cov() + self.systematic_cov(here))).sqrt()
+    }
+
+    /// The restricted zone that a track is in.
+    pub fn restricted_zone(&self, track: &Track) -> Option<&Zone> {
+        if self.zones.is_empty() {
+            return None;
+        }
+        self.zones.within(self.world(track), ZoneKind::Restricted, 0.0)
+    }
+
+    /// The zone in which a beam that nobody claims raises nothing: by its errors it may be inside. A restricted zone goes before.
+    pub fn ignore_zone(&self, track: &Track) -> Option<&Zone> {
+        if self.zones.is_empty() {
+            return None;
+        }
+        let (here, error_m) = (self.world(track), self.position_error_m(track));
+        let ignored = self.zones.within(here, ZoneKind::Ignore, -EDGE * error_m)?;
+        self.zones
+            .within(here, ZoneKind::Restricted, 0.0)
+            .is_none()
+            .then_some(ignored)
+    }
+
+    /// Distance within which the user of a claim at `p` is where they say, m.
+    pub fn tolerated_distance_m(&self, p: Vector2<f64>) -> f64 {
+        if self.zones.is_empty() {
+            return self.config.tolerated_distance_m;
+        }
+        let near = self.zones.near(self.unmoved(p));
+        let watched = near.filter(|i| i.zone.kind == ZoneKind::Watch && i.depth_m >= 0.0);
+        let own = watched.filter_map(|i| i.zone.tolerated_distance_m);
+        own.reduce(f64::min).unwrap_or(self.config.tolerated_distance_m)
+    }
+
+    /// Adds to an alert what its zone and the maintenance in force say.
+    pub fn mark(&self, content: &mut Content) {
+        content.maintenance = self.maintenance.in_force(self.now).map(|window| window.id.clone());
+        if content.maintenance.is_some() {
+            content.webhooks = Some(Vec::new());
+        }
+        let Some((x, y)) = content.x_m.zip(content.y_m).filter(|_| !self.zones.is_empty()) else {
+            return;
+        };
+        // What lasts of a moving platform's pose error is out of the alert's place already.
+        let place = Vector2::new(x, y);
+        let here = (place - self.pose.displacement().at(place)).into();
+        let of = |kind| self.zones.within(here, kind, 0.0);
+        let Some(zone) = of(ZoneKind::Restricted).or_else(|| of(ZoneKind::Watch)) else {
+            return;
+        };
+        content.zone = Some(zone.name.clone());
+        content.severity = zone.severity.unwrap_or(content.severity);
+        if content.webhooks.is_none() {
+            content.webhooks = zone.webhooks.clone();
+        }
     }
 
     /// σ of a spot on the ground, m.
     pub fn spot_m(&self) -> f64 {
-        spot_m(&self.camera)
+        spot_m(&self.view)
     }
 
     /// Distance within which two beams disturb each other, m.

@@ -2,7 +2,7 @@
 //! raises and clears alerts.
 
 use jiff::Timestamp;
-use nalgebra::Vector2;
+use nalgebra::{Vector2, Vector6};
 
 use super::alert::{Acknowledgement, Alert, AlertEvent, AlertKind, Withdrawal};
 use super::ambiguity::mark_unresolvable;
@@ -14,7 +14,7 @@ use super::input::clock_offset::ClockOffset;
 use super::input::crowding::Crowding;
 use super::pose::witness::witnesses;
 use super::report::{Observation, Report};
-use super::rules::{co_located, inputs, mismatch, pose, unclaimed, unseen};
+use super::rules::{co_located, inputs, known_light, mismatch, pose, unclaimed, unseen, zone};
 use super::summary;
 use super::track::association::{Association, associate};
 use super::track::beam_track::Track;
@@ -32,20 +32,21 @@ const ASSUMED_PERIOD_S: f64 = 1.0;
 
 /// The monitor: frames' estimates and claims in, positions and alert events out.
 pub struct Monitor {
-    frame: FrameContext,
-    memory: Memory,
+    pub(super) frame: FrameContext,
+    pub(super) memory: Memory,
     /// Index of the newest frame.
     index: u64,
 }
 
 /// What each rule, and the estimate of the log's clock, keeps for itself.
 #[derive(Default)]
-struct Memory {
+pub(super) struct Memory {
     clock: ClockOffset,
-    unclaimed: unclaimed::Memory,
+    pub(super) unclaimed: unclaimed::Memory,
     mismatch: mismatch::Memory,
     unseen: unseen::Memory,
-    co_located: co_located::Memory,
+    pub(super) co_located: co_located::Memory,
+    known_light: known_light::Memory,
 }
 
 impl Monitor {
@@ -74,12 +75,16 @@ impl Monitor {
         let dt = self.frame.time.map_or(0.0, |t| seconds(t, now)).max(0.0);
         self.frame.saw_time(now);
         self.index = seen.frame;
+        self.frame.look(seen.look);
+        self.frame.lights.expire(now);
         self.take_claims(now, store);
         let elsewhere = self.frame.overload.left_out as f64 + store.dropped_lately(now) as f64;
-        self.frame.crowding = Crowding::of_claims(&self.frame.claims, elsewhere, &self.frame.camera);
+        self.frame.crowding = Crowding::of_claims(&self.frame.claims, elsewhere, &self.frame.view);
         let visible_users = self.frame.visible_users();
         self.learn_inputs();
-        if let Some(estimate) = self.frame.sensor.usable_estimate(&seen, visible_users) {
+        if let Some(estimate) = self.frame.sensor.usable_estimate(&seen, visible_users)
+            && self.frame.is_placed
+        {
             self.frame.timing.saw_frame(now);
             self.track(estimate, store, dt);
             self.remember();
@@ -89,6 +94,11 @@ impl Monitor {
         }
         self.evaluate_inputs();
         self.report()
+    }
+
+    /// The error of the newest frame's pose that its beams share against their tracks; none where no beams show it.
+    pub fn pose_error(&self) -> Option<&Vector6<f64>> {
+        self.frame.pose_error.as_ref()
     }
 
     /// A frame that the source itself could not deliver whole.
@@ -162,7 +172,7 @@ impl Monitor {
         frame.clock_offset_s = self.memory.clock.offset_s();
         let scope = Scope {
             config: &frame.config,
-            camera: &frame.camera,
+            view: &frame.view,
             default_sigma_m: frame.default_sigma_m,
             clock_offset_s: frame.clock_offset_s,
         };
@@ -203,33 +213,42 @@ impl Monitor {
     /// Detections to tracks, our pose, and which track is associated with which claim.
     fn track(&mut self, estimate: &Estimate, store: &Store, dt: f64) {
         let frame = &mut self.frame;
-        frame
-            .tracker
-            .step(frame.now, &Detection::of(estimate, &frame.camera), dt);
+        let mut detections = Detection::of(estimate, &frame.view);
+        frame.tracker.predict(frame.now);
+        frame.register(&mut detections, dt);
+        frame.tracker.take(frame.now, &detections, dt);
+        frame.light.update(&frame.tracker);
         let hit = frame.tracker.tracks.iter().filter(|t| t.hit);
         let beams: Vec<Vector2<f64>> = hit.map(|t| t.filter.position()).collect();
-        let witnesses = witnesses(&frame.claims, &frame.tracker);
         let period_s = frame.timing.period_s().unwrap_or(ASSUMED_PERIOD_S);
-        frame.pose.update(&beams, &witnesses, dt, period_s);
-        let displacement = frame.pose.displacement();
-        for claim in &mut frame.claims {
-            claim.position += displacement.at(claim.position);
+        frame.update_bias(dt, period_s);
+        let mut witnesses = witnesses(&frame.claims, &frame.tracker);
+        for witness in &mut witnesses {
+            witness.claimed += frame.bias_at(witness.claimed);
         }
+        frame.pose.update(&beams, &witnesses, dt, period_s);
+        let displacements: Vec<_> = (frame.claims.iter().map(|c| frame.displacement_at(c.position))).collect();
+        for (claim, displacement) in frame.claims.iter_mut().zip(displacements) {
+            claim.position += displacement;
+        }
+        let of_lights = frame.lights.tracks();
         let eligibility = Eligibility {
             now: frame.time,
             config: &frame.config,
             timing: &frame.timing,
             crowding: frame.crowding,
             alerts: &frame.alerts,
+            of_lights: &of_lights,
             store,
         };
         frame.association = associate(&frame.claims, &frame.tracker, &eligibility);
+        frame.associate_lights();
         let usual_energy_j = |user: &str| self.memory.co_located.usual_energy_j(user);
         mark_unresolvable(
             &mut frame.claims,
             &frame.association,
             &frame.tracker,
-            &frame.camera,
+            &frame.view,
             usual_energy_j,
         );
     }
@@ -247,6 +266,7 @@ impl Monitor {
         memory.clock.retain(matters);
         memory.mismatch.retain(matters);
         memory.co_located.retain(matters);
+        memory.co_located.retain_lights(|id| frame.lights.get(id).is_some());
     }
 
     /// A beam that is about to be alerted is associated with the user whose beam vanished as it came, if there is one.
@@ -266,6 +286,8 @@ impl Monitor {
                 frame.users.entry(user).found(track);
                 memory.mismatch.displace(user);
                 memory.unclaimed.remove(track);
+            } else if frame.displace_light(track, since) {
+                memory.unclaimed.remove(track);
             }
         }
     }
@@ -278,12 +300,15 @@ impl Monitor {
             let undecided = memory.unclaimed.undecided(&frame.alerts);
             let mut findings = mismatch::evaluate(frame, &mut memory.mismatch);
             findings.extend(unseen::evaluate(frame, &mut memory.unseen, &undecided));
+            findings.extend(zone::evaluate(frame));
             by_user(findings)
         });
         let frame = &mut self.frame;
         let has_claim = |user: &str| has_claim(&frame.claims, user);
         frame.alerts.absent_without_claim(has_claim, frame.now);
         self.apply(|frame, memory| co_located::evaluate(frame, &mut memory.co_located));
+        self.apply(|frame, memory| known_light::evaluate(frame, &mut memory.co_located, &mut memory.known_light));
+        known_light::learn(&mut self.frame, &self.memory.known_light);
     }
 
     /// The rules over what the monitor is given.
@@ -292,6 +317,7 @@ impl Monitor {
             [
                 inputs::sensor_lost(frame),
                 pose::evaluate(frame),
+                pose::lost(frame),
                 inputs::claims_flooded(frame),
                 inputs::claims_stale(frame),
             ]
@@ -300,7 +326,12 @@ impl Monitor {
     }
 
     fn apply(&mut self, rules: impl FnOnce(&FrameContext, &mut Memory) -> Vec<Finding>) {
-        let findings = rules(&self.frame, &mut self.memory);
+        let mut findings = rules(&self.frame, &mut self.memory);
+        for finding in &mut findings {
+            if let Finding::Present(_, content) = finding {
+                self.frame.mark(content);
+            }
+        }
         self.frame.alerts.apply(findings, self.frame.now, self.index);
     }
 

@@ -1,11 +1,12 @@
 //! The input of one step of the monitor and its output.
 
 use jiff::Timestamp;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use crate::claims::Claim;
 use crate::estimate::{Error, Estimate};
-use crate::monitor::alert::AlertEvent;
+use crate::geo::Sight;
+use crate::monitor::alert::{AlertEvent, StationFields, StationName};
 
 /// One frame's estimate, or why there is none.
 #[derive(Clone, Copy, Debug)]
@@ -15,19 +16,40 @@ pub struct Observation<'a> {
     pub result: Result<&'a Estimate, &'a Error>,
     /// Hash of the frame's pixels: an exact repeat is a frozen sensor.
     pub digest: u64,
+    pub look: Look<'a>,
 }
 
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, utoipa::ToSchema)]
+/// Where the camera was and looked at a frame's time.
+#[derive(Clone, Copy, Debug)]
+pub enum Look<'a> {
+    /// Level, over (0, 0) at the camera's altitude.
+    Level,
+    /// As a pose says that is `age_s` seconds old.
+    From {
+        sight: &'a Sight,
+        age_s: f64,
+        /// The pose is older than is tolerated.
+        is_lost: bool,
+    },
+    /// Not known: no pose has come yet, for `waited_s` seconds.
+    Unknown { waited_s: f64, is_lost: bool },
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize, utoipa::ToSchema)]
 #[serde(rename_all = "lowercase")]
 pub enum PositionStatus {
     Verified,
     Mismatch,
     Unclaimed,
     Pending,
+    /// A known light: approved, and tested for change.
+    Known,
+    /// Unclaimed, in a zone in which that raises nothing.
+    Ignored,
 }
 
 /// One beam as the monitor knows it after a frame.
-#[derive(Clone, Debug, Serialize, utoipa::ToSchema)]
+#[derive(Clone, Debug, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct TrackedPosition {
     pub track: u64,
     pub x_m: f64,
@@ -38,6 +60,13 @@ pub struct TrackedPosition {
     pub user: Option<String>,
     pub status: PositionStatus,
     pub flags: Vec<String>,
+    /// The known light that it is, by id.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub known_light: Option<String>,
+    /// The access point that sees it, at a hub of many.
+    #[serde(default, flatten)]
+    #[schema(value_type = StationFields)]
+    pub station: Option<StationName>,
 }
 
 /// Outcome of one step: `GET /v1/positions` and the alert events it caused, in order.

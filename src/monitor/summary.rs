@@ -41,13 +41,16 @@ pub(super) fn report(frame: &FrameContext, index: u64, never_seen: &[String], ev
 }
 
 fn position(frame: &FrameContext, track: &Track, user: Option<&str>, mismatched: &BTreeSet<&str>) -> TrackedPosition {
+    let known_light = frame.lights.of_track(track.id).map(|s| s.light.id.clone());
     let status = match user {
         Some(user) if mismatched.contains(user) => PositionStatus::Mismatch,
         Some(_) if track.confirmed => PositionStatus::Verified,
         None if frame.alerts.is_open(&Cause::Track(track.id)) => PositionStatus::Unclaimed,
+        None if known_light.is_some() => PositionStatus::Known,
+        None if track.confirmed && frame.ignore_zone(track).is_some() => PositionStatus::Ignored,
         _ => PositionStatus::Pending,
     };
-    let (p, c) = (track.filter.position(), track.filter.position_cov());
+    let (p, c) = (frame.position(track), frame.position_cov(track));
     let flags = track.detection.flags;
     TrackedPosition {
         track: track.id,
@@ -61,6 +64,8 @@ fn position(frame: &FrameContext, track: &Track, user: Option<&str>, mismatched:
             true => (flags | Flags::UNRESOLVED).names(),
             false => flags.names(),
         },
+        known_light,
+        station: None,
     }
 }
 

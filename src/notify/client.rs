@@ -1,16 +1,17 @@
-//! One HTTP request to a receiver and how its answer is classified.
+//! A webhook: one signed HTTP request and how its answer is classified.
 
-use std::error::Error as _;
 use std::time::Duration;
 
+use futures_util::future::BoxFuture;
 use jiff::Timestamp;
 use jiff::fmt::rfc2822::DateTimeParser;
-use reqwest::StatusCode;
 use reqwest::header::{CONTENT_TYPE, HeaderMap, RETRY_AFTER};
+use reqwest::{Response, StatusCode};
+use url::Url;
 
-use super::endpoint::Endpoint;
+use super::channel::{Channel, Failure, Message, Verdict};
 use super::payload;
-use crate::journal::{self, Recorded};
+use super::signature::Signer;
 
 /// Read of an answer so that its connection can be used again; a longer one costs the connection.
 const ANSWER: usize = 4 << 10;
@@ -18,120 +19,53 @@ const ANSWER: usize = 4 << 10;
 /// Upper limit of `Retry-After`: no receiver may put off alerts indefinitely.
 const LONGEST_RETRY_AFTER: Duration = Duration::from_secs(3600);
 
-/// How a request ended.
+/// A receiver of signed webhooks.
 #[derive(Debug)]
-pub(super) enum Verdict {
-    Delivered,
-    /// 410: the receiver wants no more.
-    Gone,
-    /// The journal no longer holds the event: it was given up while the endpoint was disabled.
-    Expired,
-    Failed {
-        failure: Failure,
-        retry_after: Option<Duration>,
-    },
+pub(super) struct Webhook {
+    pub(super) url: Url,
+    pub(super) signer: Signer,
+    pub(super) client: reqwest::Client,
 }
 
-/// Why a request was no delivery.
-#[derive(Debug, thiserror::Error)]
-pub(super) enum Failure {
-    #[error("the receiver answered {0}")]
-    Status(StatusCode),
-    #[error("the receiver answered {0}, a redirect, which is not followed; put its new address into the config")]
-    Redirect(StatusCode),
-    #[error("no answer in time")]
-    Timeout,
-    #[error("the journal cannot be read: {0}")]
-    Journal(journal::Error),
-    #[error("the request broke off inside oapwatch")]
-    Broken,
-    #[error("no connection: {0}")]
-    Connect(Cause),
-    #[error("{0}")]
-    Transport(Cause),
-}
-
-/// Prints the innermost causes, which say what happened; the outer ones only say that something did.
-#[derive(Debug)]
-pub(super) struct Cause(reqwest::Error);
-
-impl std::fmt::Display for Cause {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let mut causes = Vec::new();
-        let mut source = self.0.source();
-        while let Some(cause) = source {
-            causes.push(cause.to_string());
-            source = cause.source();
-        }
-        match &causes[..] {
-            [] => self.0.fmt(f),
-            [cause] => f.write_str(cause),
-            [.., outer, inner] => write!(f, "{outer}: {inner}"),
-        }
+impl Channel for Webhook {
+    /// Makes one signed request and judges the answer.
+    fn deliver<'a>(&'a self, message: Message<'a>) -> BoxFuture<'a, Verdict> {
+        Box::pin(async move {
+            let (id, unix_s) = (message.id, message.now.as_second());
+            let body = payload::body(message.event, message.is_test);
+            let request = self
+                .client
+                .post(self.url.clone())
+                .header(CONTENT_TYPE, "application/json")
+                .header("webhook-id", id)
+                .header("webhook-timestamp", unix_s)
+                .header("webhook-signature", self.signer.sign(id, unix_s, &body))
+                .body(body);
+            match request.send().await {
+                Ok(answer) => judge(answer, message.now).await,
+                Err(error) => Failure::from(error).into(),
+            }
+        })
     }
 }
 
-/// What a receiver answered.
-pub(super) struct Answer {
-    pub(super) status: StatusCode,
-    retry_after: Option<Duration>,
-}
-
-impl Answer {
-    /// Why it is no confirmation; `None` where it is one.
-    pub(super) fn failure(&self) -> Option<Failure> {
-        match self.status {
-            status if status.is_success() => None,
-            status if status.is_redirection() => Some(Failure::Redirect(status)),
-            status => Some(Failure::Status(status)),
-        }
-    }
-}
-
-/// Delivers an event and judges the answer.
-pub(super) async fn send(endpoint: &Endpoint, id: &str, event: &Recorded, now: Timestamp) -> Verdict {
-    let (failure, retry_after) = match post(endpoint, id, payload::body(event), now).await {
-        Ok(answer) if answer.status == StatusCode::GONE => return Verdict::Gone,
-        Ok(answer) => match answer.failure() {
-            None => return Verdict::Delivered,
-            Some(failure) => (failure, answer.retry_after),
-        },
-        Err(failure) => (failure, None),
-    };
-    Verdict::Failed { failure, retry_after }
-}
-
-/// Makes one signed request.
-pub(super) async fn post(endpoint: &Endpoint, id: &str, body: Vec<u8>, now: Timestamp) -> Result<Answer, Failure> {
-    let unix_s = now.as_second();
-    let request = endpoint
-        .client
-        .post(endpoint.url.clone())
-        .header(CONTENT_TYPE, "application/json")
-        .header("webhook-id", id)
-        .header("webhook-timestamp", unix_s)
-        .header("webhook-signature", endpoint.signer.sign(id, unix_s, &body))
-        .body(body);
-    let mut answer = request.send().await.map_err(|error| describe(error.without_url()))?;
+/// What an HTTP answer means for the delivery.
+pub async fn judge(mut answer: Response, now: Timestamp) -> Verdict {
     let mut read = 0;
     while read < ANSWER
         && let Ok(Some(chunk)) = answer.chunk().await
     {
         read += chunk.len();
     }
-    Ok(Answer {
-        status: answer.status(),
+    let failure = match answer.status() {
+        StatusCode::GONE => return Verdict::Gone,
+        status if status.is_success() => return Verdict::Delivered(Some(status)),
+        status if status.is_redirection() => Failure::Redirect(status),
+        status => Failure::Status(status),
+    };
+    Verdict::Failed {
+        failure,
         retry_after: retry_after(answer.headers(), now),
-    })
-}
-
-fn describe(error: reqwest::Error) -> Failure {
-    if error.is_timeout() {
-        Failure::Timeout
-    } else if error.is_connect() {
-        Failure::Connect(Cause(error))
-    } else {
-        Failure::Transport(Cause(error))
     }
 }
 

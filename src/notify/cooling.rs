@@ -81,7 +81,13 @@ impl CoolDown {
             AlertEventKind::Raised => self.raised(delivery, alert, now),
             AlertEventKind::Updated => self.updated(delivery, alert, now),
             AlertEventKind::Cleared => self.cleared(delivery, alert, now),
-            AlertEventKind::Acknowledged | AlertEventKind::Unacknowledged => Ruling::Send(vec![delivery]),
+            AlertEventKind::Acknowledged | AlertEventKind::Unacknowledged => match self.held.get_mut(&alert.id) {
+                Some(held) => {
+                    held.deliveries.push(delivery);
+                    Ruling::Hold
+                }
+                None => Ruling::Send(vec![delivery]),
+            },
         }
     }
 
@@ -242,7 +248,11 @@ mod tests {
                     frame: 0,
                     file: None,
                 },
+                zone: None,
+                webhooks: None,
+                maintenance: None,
                 acknowledgement: None,
+                station: None,
             };
             let numbers = |rows: Vec<Waiting>| rows.iter().map(|r| r.seq.to_string()).collect::<Vec<_>>().join(" ");
             match self.cool_down.judge(delivery, &AlertEvent { event, alert }, s(now)) {

@@ -35,18 +35,25 @@ pub enum Error {
         path: PathBuf,
         cause: AuthorityError,
     },
-    #[error("[[webhook]] {index}: timeout_s: expected 1 to 120, found {found}")]
-    Timeout { index: usize, found: f64 },
-    #[error("[[webhook]] {index}: cool_down_s: expected 0 to 86400, found {found}")]
-    CoolDown { index: usize, found: f64 },
-    #[error("[[webhook]] {index}: name: expected 1 to 64 letters, digits, '-' or '_', found `{found}`")]
-    Name { index: usize, found: String },
     #[error("[[webhook]] {index}: `{name}` is taken by [[webhook]] {earlier}; give one of them another name")]
     Twice { index: usize, earlier: usize, name: String },
-    #[error("[[webhook]] {index}: kinds: an empty list would send nothing; leave it out to send all")]
-    NoKinds { index: usize },
+    #[error("[[webhook]] {index}: {cause}")]
+    Common { index: usize, cause: CommonError },
     #[error("[[webhook]] {index}: {cause}")]
     Client { index: usize, cause: reqwest::Error },
+}
+
+/// Why keys that `[[webhook]]` and `[[export]]` have in common cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum CommonError {
+    #[error("timeout_s: expected 1 to 120, found {0}")]
+    Timeout(f64),
+    #[error("cool_down_s: expected 0 to 86400, found {0}")]
+    CoolDown(f64),
+    #[error("name: expected 1 to 64 letters, digits, '-' or '_', found `{0}`")]
+    Name(String),
+    #[error("kinds: an empty list would send nothing; leave it out to send all")]
+    NoKinds,
 }
 
 /// Why a `ca_file` cannot be used.

@@ -1,4 +1,4 @@
-//! The HTTP client of one endpoint: time limit, private authority, no redirects.
+//! The HTTP client of one webhook: private authority, no redirects.
 
 use std::time::Duration;
 
@@ -8,15 +8,14 @@ use super::Config;
 use super::error::{AuthorityError, Error};
 
 /// `loopback`: the receiver is on this host, so that no proxy lies between.
-pub(super) fn build(index: usize, config: &Config, timeout: Duration, loopback: bool) -> Result<Client, Error> {
+pub(super) fn build(index: usize, config: &Config, loopback: bool) -> Result<Client, Error> {
     // Any earlier choice of the process stands.
     let _ = rustls::crypto::ring::default_provider().install_default();
     let mut builder = Client::builder()
         .user_agent(concat!("oapwatch/", env!("CARGO_PKG_VERSION")))
         .redirect(redirect::Policy::none())
         .referer(false)
-        .connect_timeout(timeout.min(Duration::from_secs(10)))
-        .timeout(timeout)
+        .connect_timeout(Duration::from_secs(10))
         .pool_idle_timeout(Duration::from_secs(60));
     if loopback {
         builder = builder.no_proxy();

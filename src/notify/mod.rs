@@ -1,8 +1,10 @@
-//! Layer 4: signed webhooks, at least once, in order per alert, from a durable outbox.
+//! Layer 4: alert events to receivers, at least once, in order per alert, from a durable outbox. Signed webhooks are one form of
+//! delivery; `export/` adds other systems' as further [`Channel`]s.
 //!
 //! The journal writes an outbox row with each alert event, in the same transaction; [`spawn`]'s worker sends
 //! what waits there until the receiver has confirmed it. docs/webhooks.md is the receiver's side of it.
 
+mod channel;
 mod client;
 #[allow(clippy::disallowed_methods, reason = "the clock of deliveries, which tests speed up")]
 mod clock;
@@ -29,11 +31,15 @@ use tokio::task::JoinHandle;
 use crate::journal::{DeadLetter, Journal};
 use worker::{Command, Worker};
 
+pub use channel::{Cause, Channel, Failure, Message, Verdict};
+pub use client::judge;
 pub use clock::Clock;
 pub use config::Config;
-pub use endpoint::{Endpoint, load};
-pub use error::{AskError, Error};
+pub use endpoint::{Endpoint, check_common, is_loopback, load, name_of, names, shown_url};
+pub use error::{AskError, CommonError, Error};
+pub use payload::test_event;
 pub use status::{EndpointState, EndpointStatus, TestOutcome};
+pub use worker::send_test;
 
 /// How long a replay waits for a busy disk, and how often it looks.
 const REPLAY_TIMEOUT: Duration = Duration::from_secs(3);

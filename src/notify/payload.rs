@@ -4,7 +4,7 @@ use jiff::Timestamp;
 use serde::Serialize;
 
 use crate::journal::Recorded;
-use crate::monitor::{Alert, AlertKind, AlertSource, AlertState, Severity};
+use crate::monitor::{Alert, AlertEvent, AlertEventKind, AlertKind, AlertSource, AlertState, Severity};
 
 /// The body of a webhook: Standard Webhooks' `type`, `timestamp` and `data`, and beside them `event` and `alert`
 /// as every other outlet of alert events has them, so that one reader serves all.
@@ -20,13 +20,16 @@ struct Payload<'a, E> {
 /// The type of the event that an operator sends to try a receiver.
 const TEST: &str = "webhook.test";
 
-pub(super) fn body(recorded: &Recorded) -> Vec<u8> {
+pub(super) fn body(recorded: &Recorded, is_test: bool) -> Vec<u8> {
     let event = &recorded.event;
-    json(event.event, recorded.at, &event.alert)
+    match is_test {
+        true => json(TEST, recorded.at, &event.alert),
+        false => json(event.event, recorded.at, &event.alert),
+    }
 }
 
-/// An event that no alert stands behind: its type says so, and so does its alert.
-pub(super) fn test_body(now: Timestamp) -> Vec<u8> {
+/// An event that no alert stands behind: its alert says so.
+pub fn test_event(now: Timestamp) -> Recorded {
     let alert = Alert {
         id: "test".to_owned(),
         kind: AlertKind::UnclaimedEmitter,
@@ -45,9 +48,20 @@ pub(super) fn test_body(now: Timestamp) -> Vec<u8> {
             frame: 0,
             file: None,
         },
+        zone: None,
+        webhooks: None,
+        maintenance: None,
         acknowledgement: None,
+        station: None,
     };
-    json(TEST, now, &alert)
+    Recorded {
+        seq: 0,
+        at: now,
+        event: AlertEvent {
+            event: AlertEventKind::Cleared,
+            alert,
+        },
+    }
 }
 
 fn json<E: Serialize + Copy>(event: E, timestamp: Timestamp, alert: &Alert) -> Vec<u8> {

@@ -5,10 +5,12 @@ use jiff::Timestamp;
 use super::Endpoint;
 use crate::monitor::AlertKind;
 
-/// How one endpoint fares. Holds no secret, and of the URL neither query nor credentials.
+/// How one webhook or export fares. Holds no secret, and of the URL neither query nor credentials.
 #[derive(Clone, Debug, PartialEq, serde::Serialize, utoipa::ToSchema)]
 pub struct EndpointStatus {
     pub name: String,
+    /// "webhook", or the kind of the export.
+    pub kind: &'static str,
     pub url: String,
     /// `null` is all.
     pub kinds: Option<Vec<AlertKind>>,
@@ -46,9 +48,10 @@ pub enum EndpointState {
 impl EndpointStatus {
     pub(super) fn new(endpoint: &Endpoint) -> Self {
         Self {
-            name: endpoint.name().to_owned(),
-            url: endpoint.shown_url(),
-            kinds: endpoint.subscription().kinds,
+            name: endpoint.name.clone(),
+            kind: endpoint.kind,
+            url: endpoint.shown_url.clone(),
+            kinds: endpoint.kinds.clone(),
             state: EndpointState::Working,
             queued: 0,
             sent: 0,

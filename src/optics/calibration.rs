@@ -6,6 +6,7 @@ use super::camera::Camera;
 use super::distortion::Distortion;
 use super::error::CalibrationError;
 use super::pixel_maps::PixelMaps;
+use super::spot::SpotShape;
 use crate::toml_file::Key;
 
 /// One device's measured geometry, spot and pixels; written by `oapwatch calibrate`.
@@ -16,6 +17,10 @@ pub struct Calibration {
     pub spot_sigma_m: f64,
     /// Relative growth of σ_eff from the optical axis to the sensor's corner.
     pub spot_growth: f64,
+    /// The spot's shape where one was learned.
+    pub spot_shape: Option<Arc<SpotShape>>,
+    /// Measured share of a spot's light by which it differs from its model.
+    pub spot_error: Option<f64>,
     pub noise_std_j: f64,
     pub pixels: Option<Arc<PixelMaps>>,
 }
@@ -27,6 +32,8 @@ impl Calibration {
             distortion: camera.distortion,
             spot_sigma_m: camera.spot_sigma_m,
             spot_growth: camera.spot_growth,
+            spot_shape: camera.spot_shape.clone(),
+            spot_error: camera.spot_error,
             noise_std_j: camera.noise_std_j,
             pixels: camera.pixels.clone(),
         }
@@ -39,6 +46,9 @@ impl Calibration {
             distortion: self.distortion,
             spot_sigma_m: self.spot_sigma_m,
             spot_growth: self.spot_growth,
+            spot_shape: self.spot_shape.clone(),
+            // What the config fixes holds.
+            spot_error: camera.spot_error.or(self.spot_error),
             noise_std_j: self.noise_std_j,
             pixels: self.pixels.clone(),
             ..camera.clone()
@@ -65,6 +75,14 @@ impl Calibration {
             self.spot_sigma_m > 0.0,
         )?;
         within("spot_growth", "more than -1", self.spot_growth, self.spot_growth > -1.0)?;
+        let error = self.spot_error.unwrap_or_default();
+        let range = "0 to 0.5, the share of a spot's light";
+        within(
+            "spot.error",
+            range,
+            error,
+            (0.0..=Camera::LARGEST_SPOT_ERROR).contains(&error),
+        )?;
         within(
             "noise_std_j",
             "a positive number",

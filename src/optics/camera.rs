@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use super::distortion::Distortion;
 use super::pixel_maps::PixelMaps;
+use super::spot::SpotShape;
 
 /// One axis of the photodetector array: `n` pixels of equal pitch from `min_m` upwards.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -51,6 +52,11 @@ pub struct Camera {
     pub spot_sigma_m: f64,
     /// Relative growth of σ_eff from the optical axis to the sensor's corner, with the square of the radius.
     pub spot_growth: f64,
+    /// The spot as a calibration measured it; without one it is a Gaussian of σ_eff. With one, σ_eff is the width of the
+    /// Gaussian nearest to it.
+    pub spot_shape: Option<Arc<SpotShape>>,
+    /// Share of a spot's light by which its shape may differ from the model, anywhere in its halo; none: not known.
+    pub spot_error: Option<f64>,
     /// Standard deviation of the additive noise of one pixel.
     pub noise_std_j: f64,
     pub joules_per_count: Option<f64>,
@@ -62,6 +68,9 @@ pub struct Camera {
 }
 
 impl Camera {
+    /// Largest `spot_error`: beyond half of the light there is no model.
+    pub const LARGEST_SPOT_ERROR: f64 = 0.5;
+
     /// A pixel at or above this, J, is saturated; infinite where no level is known.
     pub fn saturation_limit_j(&self) -> f64 {
         self.saturation_j.unwrap_or(f64::INFINITY)
@@ -111,6 +120,17 @@ impl Camera {
         let half: [[f64; 2]; 2] = j.map(|row| std::array::from_fn(|k| row[0] * cov[0][k] + row[1] * cov[1][k]));
         let entry = |r: usize, k: usize| half[r][0] * j[k][0] + half[r][1] * j[k][1];
         // The two off-diagonal entries would be rounded apart.
+        let off = entry(0, 1);
+        [[entry(0, 0), off], [off, entry(1, 1)]]
+    }
+
+    /// The inverse of [`Camera::cov_to_ground`].
+    pub fn cov_to_sensor(&self, sensor: [f64; 2], cov: [[f64; 2]; 2]) -> [[f64; 2]; 2] {
+        let tangents = self.distortion.unproject(self.plane_distance_m, sensor);
+        let jacobian = self.distortion.project_jacobian(self.plane_distance_m, tangents);
+        let j = jacobian.map(|row| row.map(|v| v / self.altitude_m));
+        let half: [[f64; 2]; 2] = j.map(|row| std::array::from_fn(|k| row[0] * cov[0][k] + row[1] * cov[1][k]));
+        let entry = |r: usize, k: usize| half[r][0] * j[k][0] + half[r][1] * j[k][1];
         let off = entry(0, 1);
         [[entry(0, 0), off], [off, entry(1, 1)]]
     }

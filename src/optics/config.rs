@@ -29,6 +29,9 @@ pub struct Config {
     pub joules_per_count: Option<f64>,
     /// A pixel at or above this is saturated and carries no more than that.
     pub saturation_j: Option<f64>,
+    /// Share of a spot's light by which its shape may differ from the model. Left out: the calibration's figure, and without one
+    /// what the frames show.
+    pub spot_error: Option<f64>,
     /// A file written by `oapwatch calibrate`.
     pub calibration: Option<PathBuf>,
     /// The content of that file, filled in by the reader of the config.
@@ -58,6 +61,7 @@ impl Default for Config {
             noise_std_j: 1e-6,
             joules_per_count: None,
             saturation_j: None,
+            spot_error: None,
             calibration: None,
             calibrated: None,
         }
@@ -176,6 +180,11 @@ impl Config {
         if let Some(level) = self.saturation_j {
             positive("saturation_j", level)?;
         }
+        if let Some(share) = self.spot_error {
+            let reason = "the share of a spot's light; beyond half of it there is no model";
+            key.at("spot_error")
+                .within(share, 0.0..=Camera::LARGEST_SPOT_ERROR, reason)?;
+        }
         let camera = Camera {
             altitude_m: positive("altitude_m", self.altitude_m)?,
             lens_radius_m,
@@ -187,6 +196,8 @@ impl Config {
             joules_per_count: self.joules_per_count,
             saturation_j: self.saturation_j,
             spot_growth: 0.0,
+            spot_shape: None,
+            spot_error: self.spot_error,
             distortion: Distortion::default(),
             pixels: None,
         };

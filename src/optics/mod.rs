@@ -11,6 +11,8 @@ pub mod geometry;
 mod pixel_maps;
 pub mod psf;
 pub mod radiometry;
+pub mod spot;
+mod spot_pixels;
 
 pub use calibration::Calibration;
 pub use camera::{Axis, Camera};
@@ -18,3 +20,5 @@ pub use config::{BlurConfig, Config};
 pub use distortion::Distortion;
 pub use error::{CalibrationError, Error};
 pub use pixel_maps::PixelMaps;
+pub use spot::SpotShape;
+pub use spot_pixels::add_spot;

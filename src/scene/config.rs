@@ -6,7 +6,7 @@ use std::path::Path;
 use serde::{Deserialize, Serialize};
 
 use super::effect::Effect;
-use super::effects::Effects;
+use super::effects::{Effects, SpotEffect};
 use super::error::Error;
 use super::motion::{Motion, Schedule};
 use crate::toml_file::{Key, OutOfRange};
@@ -157,7 +157,10 @@ impl Scene {
     /// The file cannot be read, is not TOML, has an unknown key (the nearest known one is named), or a field is out of
     /// range (the field is named).
     pub fn load(path: &Path) -> Result<Self, Error> {
-        let scene: Self = toml_file::read(path)?;
+        let mut scene: Self = toml_file::read(path)?;
+        if let (Some(SpotEffect::Template { file, .. }), Some(folder)) = (&mut scene.effects.spot, path.parent()) {
+            *file = folder.join(&*file);
+        }
         match scene.validate() {
             Ok(()) => Ok(scene),
             Err(e) => Err(Error::Scene {
@@ -200,7 +203,12 @@ impl Scene {
         for (k, intruder) in self.intruder.iter().enumerate() {
             self.validate_intruder(intruder, &root.item("intruder", k))?;
         }
-        Ok(self.effects.validate(&root.at("effects"))?)
+        let effects = root.at("effects");
+        if let (Some(spot), Some(_)) = (&self.effects.spot, &self.effects.aberrations) {
+            let expected = "no [effects.aberrations] beside it: a spot has one shape";
+            return Err(effects.at("spot").refuse(expected, spot.kind()).into());
+        }
+        Ok(self.effects.validate(&effects)?)
     }
 
     fn validate_names(&self, root: &Key) -> Result<(), OutOfRange> {

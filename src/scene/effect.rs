@@ -25,6 +25,7 @@ macro_rules! effect_list {
             28 Quantisation quantisation: Quantisation,
             29 FrameLoss frame_loss: FrameLoss,
             30 Aberrations aberrations: Aberrations,
+            31 Spot spot: SpotEffect,
         }
     };
 }
@@ -72,5 +73,5 @@ effect_list!(declare_effect);
 
 impl Effect {
     /// Length of an array indexed by effect number.
-    pub(super) const SLOTS: usize = 31;
+    pub(super) const SLOTS: usize = 32;
 }

@@ -4,7 +4,7 @@ use super::average::Average;
 use super::config::Scene;
 use super::effect::Effect;
 use super::effects::{Attenuation, Vignetting};
-use super::effects::{Pose, Rays, attitude};
+use super::effects::{Pose, Rays, SpotImages, attitude};
 use super::error::Error;
 use super::exposure::Exposure;
 use super::moment::Moment;
@@ -13,6 +13,7 @@ use super::render::Spot;
 use super::report::{Decisions, Status};
 use super::stream::{Ledger, Streams};
 use crate::optics::{Camera, geometry, psf};
+use crate::toml_file::Key;
 
 /// The optical path between a beam and its spots.
 #[derive(Debug)]
@@ -26,6 +27,8 @@ pub(super) struct Light {
     pose: Option<Pose>,
     vignetting: Option<Vignetting>,
     rays: Option<Rays>,
+    /// Images of the spots where they are not Gaussian.
+    pub images: Option<SpotImages>,
     exposure: Exposure,
 }
 
@@ -142,9 +145,24 @@ impl Light {
         if let Some(rays) = &rays {
             decisions.note(Effect::Aberrations, Status::On, format!("{} rays a spot", rays.count()));
         }
+        let spot = decisions.weigh(Effect::Spot, &effects.spot, |_| peak);
+        let images = match spot {
+            Some(spot) => {
+                let images = spot.images(camera, &Key::new("effects.spot"))?;
+                let (places, numbers) = images.size();
+                let reason = format!(
+                    "{}: {places} image(s) of {numbers} numbers, computed once; 16 of them a pixel",
+                    spot.kind()
+                );
+                decisions.note(Effect::Spot, Status::On, reason);
+                Some(images)
+            }
+            None => None,
+        };
         Ok(Self {
             lens,
             rays,
+            images,
             straight_j_per_w: straight_j_per_w(scene, camera),
             attenuation,
             average,

@@ -109,6 +109,8 @@ impl Plan {
             distortion: lens.distortion,
             spot_sigma_m: lens.spot_sigma_m,
             spot_growth: lens.spot_growth,
+            spot_shape: None,
+            spot_error: None,
             noise_std_j: self.detector.noise_std_j().unwrap_or(lens.noise_std_j),
             pixels: self.detector.maps(lens.shape()).map(Arc::new),
         }
@@ -171,7 +173,9 @@ impl Plan {
             user: self.population.actors[s.actor].name.clone(),
             x_m: s.at_m[0],
             y_m: s.at_m[1],
+            z_m: None,
             sigma_m: self.network.sigma_m(),
+            cov_m2: None,
             power_w: None,
             state: s.state,
         };
@@ -251,7 +255,10 @@ impl Maker<'_> {
         let emitters = self.cast(k);
         let plan = self.plan;
         for spot in &self.spots {
-            self.renderer.add(&plan.light.lens, spot, pixels);
+            match &plan.light.images {
+                Some(images) => images.add(&plan.light.lens, spot, pixels),
+                None => self.renderer.add(&plan.light.lens, spot, pixels),
+            }
         }
         let at = Moment {
             k,

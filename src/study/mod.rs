@@ -2,6 +2,7 @@
 
 pub mod ablation;
 pub mod device;
+pub mod formats;
 pub mod golden;
 pub mod measurements;
 pub mod samples;

@@ -9,13 +9,13 @@ use std::time::Duration;
 
 use jiff::Timestamp;
 use ndarray::Array2;
-use oapwatch::api::{self, Acknowledged, Command, Config, Feed, Listen, Listener, Server, State};
+use oapwatch::api::{self, Acknowledged, Command, Config, Feed, Listen, Listener, Server, State, ZonesRefused};
 use oapwatch::claim::Claim;
 use oapwatch::frame::Frame;
 use oapwatch::journal::{self, AuditRecord, Journal};
 use oapwatch::monitor::{
-    Acknowledgement, Alert, AlertEvent, AlertEventKind, AlertKind, AlertSource, AlertState, PositionStatus, Report,
-    Severity, TrackedPosition, Withdrawal,
+    Acknowledgement, Alert, AlertEvent, AlertEventKind, AlertKind, AlertSource, AlertState, Monitor, PositionStatus,
+    Report, Severity, Source, TrackedPosition, Window, Withdrawal,
 };
 use oapwatch::optics;
 use reqwest::{Client, Response, header};
@@ -185,6 +185,13 @@ async fn publish(feed: &Feed, journal: &Journal, event: AlertEventKind, alert: A
 }
 
 async fn answer(mut received: mpsc::Receiver<Command>, feed: Arc<Feed>, journal: Journal) {
+    let source = Source {
+        kind: "replay".into(),
+        file: None,
+        rate_hz: 10.0,
+    };
+    let camera = oapwatch::optics::Config::default().camera().unwrap();
+    let mut monitor = Monitor::new(&Default::default(), &Default::default(), &camera, source);
     while let Some(command) = received.recv().await {
         match command {
             Command::Claims { claims, reply } => {
@@ -216,7 +223,53 @@ async fn answer(mut received: mpsc::Receiver<Command>, feed: Arc<Feed>, journal:
                 };
                 let _ = reply.send(changed(&feed, &journal, &id, change).await);
             }
+            places => place(&mut monitor, places),
         }
+    }
+}
+
+/// Zones, known lights and maintenance by a monitor that sees nothing.
+fn place(monitor: &mut Monitor, command: Command) {
+    match command {
+        Command::KnownLights { reply } => drop(reply.send(monitor.known_lights())),
+        Command::Approve { mut request, reply } => {
+            request.at = at(0);
+            drop(reply.send(monitor.approve(request)));
+        }
+        Command::Revoke { id, reply } => drop(reply.send(monitor.revoke(&id))),
+        Command::Zones { reply } => drop(reply.send(monitor.zones())),
+        Command::PutZones {
+            zones,
+            unless_changed,
+            reply,
+        } => {
+            let is_changed = unless_changed.is_some_and(|digest| digest != monitor.zones().digest());
+            let put = match is_changed {
+                true => Err(ZonesRefused::Changed),
+                false => monitor.set_zones(zones).map_err(ZonesRefused::Bad),
+            };
+            drop(reply.send(put.map(|()| monitor.zones())));
+        }
+        Command::Maintenance { reply } => drop(reply.send(monitor.maintenance().to_vec())),
+        Command::BeginMaintenance {
+            from,
+            until,
+            by,
+            note,
+            reply,
+        } => {
+            let window = Window {
+                id: "maintenance-1".into(),
+                from: from.unwrap_or(at(0)),
+                until,
+                by,
+                note,
+                is_fixed: false,
+            };
+            drop(reply.send(monitor.add_maintenance(window.clone(), at(0)).map(|()| window)));
+        }
+        Command::EndMaintenance { id, reply } => drop(reply.send(monitor.end_maintenance(&id))),
+        _ => {}
     }
 }
 
@@ -256,7 +309,11 @@ pub fn alert(id: &str, second: i64) -> Alert {
             frame: 10,
             file: None,
         },
+        zone: None,
+        webhooks: None,
+        maintenance: None,
         acknowledgement: None,
+        station: None,
     }
 }
 
@@ -270,6 +327,8 @@ fn beam(track: u64, x_m: f64, y_m: f64, user: Option<&str>, status: PositionStat
         user: user.map(str::to_owned),
         status,
         flags: Vec::new(),
+        known_light: None,
+        station: None,
     }
 }
 
@@ -305,6 +364,12 @@ pub fn snapshot(number: u64) -> api::Snapshot {
     api::Snapshot {
         report,
         frame: Some(Arc::new(frame)),
+        pose: Some(api::PoseStatus {
+            source: "fixed",
+            time,
+            is_lost: false,
+            pose: None,
+        }),
         status: api::Status {
             version: "0",
             started_at: at(0),
@@ -327,6 +392,7 @@ pub fn snapshot(number: u64) -> api::Snapshot {
             estimator: "fit".into(),
             alerts_open: BTreeMap::new(),
             field_of_view_m: [125.0, 125.0],
+            stations: Vec::new(),
         },
         camera,
     }

@@ -1,9 +1,12 @@
 //! The daemon as an operator meets it: a process, an address, signals.
 
+mod fleet;
 mod over_http;
+mod places;
 mod process;
 mod reload;
 mod siege;
+mod telemetry;
 
 use std::path::Path;
 use std::process::Command;
@@ -78,6 +81,18 @@ fn a_bad_config_ends_the_program_before_a_port_is_bound() {
             "optics.altitude_m: expected a positive finite number, found -3",
         ),
         ("[estimator]\nname = \"grredy-fit\"\n", "did you mean"),
+        (
+            "[platform]\nkind = \"mavlink\"\nendpoint = \"serial:/dev/ttyS0:57600\"\n",
+            "platform.endpoint: expected udpin:ADDR:PORT",
+        ),
+        (
+            "[platform]\nkind = \"mavlink\"\nendpoint = \"tcp:[::1]:5760\"\nsigning_key_file = \"missing.key\"\n",
+            "platform.signing_key_file:",
+        ),
+        (
+            "[platform]\nkind = \"replay\"\nposes = \"missing.ulg\"\n",
+            "missing.ulg",
+        ),
         ("[api]\nlisten = \"0.0.0.0:0\"\n", "api.token_file is needed"),
         ("[source]\nkind = \"replay\"\n", "source.frames"),
         (

@@ -17,13 +17,18 @@ pub struct Daemon {
 
 impl Daemon {
     pub fn start(dir: &Path, config: &str) -> Self {
+        Self::start_as(dir, "run", config)
+    }
+
+    /// As another command than `run`.
+    pub fn start_as(dir: &Path, command: &str, config: &str) -> Self {
         let port = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
         let file = dir.join("oapwatch.toml");
         std::fs::write(&file, config).unwrap();
         // Figures are to be of the program as it is shipped, whatever the test was built as.
         let program = std::env::var_os("OAPWATCH_PROGRAM").unwrap_or_else(|| env!("CARGO_BIN_EXE_oapwatch").into());
         let child = Command::new(program)
-            .args(["run", "--config"])
+            .args([command, "--config"])
             .arg(&file)
             .args(["--listen", &format!("127.0.0.1:{port}")])
             .stderr(Stdio::piped())
@@ -82,6 +87,11 @@ impl Daemon {
 
     pub fn post(&self, path: &str, body: &str) -> (u16, String) {
         request(&self.url, "POST", path, "", body).expect("an answer")
+    }
+
+    /// Any request; `header` lines end with CRLF.
+    pub fn send(&self, method: &str, path: &str, header: &str, body: &str) -> (u16, String) {
+        request(&self.url, method, path, header, body).expect("an answer")
     }
 
     pub fn signal(&self, name: &str) {

@@ -111,6 +111,16 @@ fn claims() {
 }
 
 #[test]
+fn mavlink() {
+    try_seeds("fuzz/seeds/mavlink", 3000, targets::mavlink);
+}
+
+#[test]
+fn ulg() {
+    try_seeds("fuzz/seeds/ulg", 1000, targets::ulg);
+}
+
+#[test]
 fn v4l2() {
     try_seeds("fuzz/seeds/v4l2", 1000, targets::v4l2);
 }

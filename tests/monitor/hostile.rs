@@ -13,7 +13,9 @@ pub fn forged(user: &str, made: f64, x_m: f64, y_m: f64) -> Claim {
         user: user.into(),
         x_m,
         y_m,
+        z_m: None,
         sigma_m: Some(0.3),
+        cov_m2: None,
         power_w: None,
         state: ClaimState::Active,
     }

@@ -17,7 +17,7 @@ fn a_webhook_that_cannot_work_is_a_clear_config_error() {
     let dir = tempfile::tempdir().unwrap();
     let good = webhook(dir.path(), "https://hooks.example.org/in?token=hunter2");
     assert_eq!(
-        notify::load(std::slice::from_ref(&good)).unwrap()[0].shown_url(),
+        notify::load(std::slice::from_ref(&good)).unwrap()[0].shown_url,
         "https://hooks.example.org/in"
     );
     let message = |config: notify::Config| notify::load(&[config]).unwrap_err().to_string();

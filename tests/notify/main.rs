@@ -1,7 +1,10 @@
 //! Webhooks against real receivers on the loopback address. The worker's clock runs fast where a test spans hours.
 
 mod config;
+mod counterparts;
 mod disk;
+mod exports;
+mod positions;
 mod receiver;
 mod sender;
 mod trouble;

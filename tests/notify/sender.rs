@@ -41,7 +41,11 @@ pub fn event(event: AlertEventKind, id: &str, kind: AlertKind) -> AlertEvent {
             frame: 7,
             file: None,
         },
+        zone: None,
+        webhooks: None,
+        maintenance: None,
         acknowledgement: None,
+        station: None,
     };
     AlertEvent { event, alert }
 }
@@ -60,7 +64,10 @@ pub struct Daemon {
 
 impl Daemon {
     pub fn start(journal: &journal::Config, webhooks: &[notify::Config], clock: Clock) -> Self {
-        let endpoints = notify::load(webhooks).unwrap();
+        Self::sending_to(journal, notify::load(webhooks).unwrap(), clock)
+    }
+
+    pub fn sending_to(journal: &journal::Config, endpoints: Vec<Endpoint>, clock: Clock) -> Self {
         let journal = Journal::open(journal, endpoints.iter().map(Endpoint::subscription).collect()).unwrap();
         let (stop, stopped) = oneshot::channel::<()>();
         let (notifier, task) = notify::spawn(endpoints, journal.clone(), clock, 42, async {

@@ -103,7 +103,7 @@ fn log() -> String {
 fn configure(joules_per_count: f64, more: &str) -> Outcome {
     let _ = fs::remove_dir_all(FOLDER);
     fs::create_dir_all(FOLDER)?;
-    let [x, y] = corner(false);
+    let [x, y] = corner(1);
     Ok(fs::write(
         config(),
         format!(
@@ -153,8 +153,8 @@ fn agreement() -> Outcome {
     let images: Vec<_> = made
         .iter()
         .map(|m| {
-            let counts = quantised(&m.frame.pixels, joules_per_count, PixelFormat::Y16, false);
-            image(&counts, PixelFormat::Y16, false)
+            let counts = quantised(&m.frame.pixels, joules_per_count, PixelFormat::Y16, 1);
+            image(&counts, PixelFormat::Y16, 1)
         })
         .collect();
     // The default estimator takes a second a frame where floating point is emulated.
@@ -164,7 +164,7 @@ fn agreement() -> Outcome {
     )?;
     let mut claims = fs::File::create(format!("{FOLDER}/claims.ndjson"))?;
 
-    let mut output = Output::open(OUTPUT)?;
+    let mut output = Output::open(OUTPUT, false)?;
     output.show(&images[0])?;
     let daemon = Daemon::start()?;
     let ready = Instant::now();

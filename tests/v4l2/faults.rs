@@ -43,6 +43,7 @@ fn devices_are_listed() -> Outcome {
     let text = String::from_utf8(done.stdout)?;
     let expected = [
         "/dev/video0: vivid",
+        "best: Y16 ",
         "Y16_BE",
         "Y10 ",
         "GREY ",

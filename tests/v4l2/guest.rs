@@ -5,6 +5,7 @@
 mod bit_exact;
 mod daemon;
 mod faults;
+mod first_camera;
 mod output;
 
 use std::os::unix::fs::PermissionsExt;
@@ -35,7 +36,13 @@ fn main() -> ExitCode {
         .without_time()
         .init();
 
-    let scenarios: Vec<Scenario> = [bit_exact::SCENARIOS, faults::SCENARIOS, daemon::SCENARIOS].concat();
+    let scenarios: Vec<Scenario> = [
+        bit_exact::SCENARIOS,
+        faults::SCENARIOS,
+        first_camera::SCENARIOS,
+        daemon::SCENARIOS,
+    ]
+    .concat();
     let chosen: Vec<String> = std::env::args().skip(1).collect();
     let (mut passed, mut failed) = (0, 0);
     for (name, run) in scenarios {

@@ -6,10 +6,10 @@ mount -t proc proc /proc
 mount -t sysfs sys /sys
 mount -t tmpfs tmp /tmp
 ip link set lo up
-# One capture node and one output node, joined by a loop.
+# Two cameras, with the single-planar and the multi-planar interface: each a capture node and an output node, joined by a loop.
 for module in /modules/*; do
     case $module in
-        *vivid.ko) insmod "$module" n_devs=1 node_types=0x101 num_inputs=1 input_types=3 num_outputs=1 output_types=1 multiplanar=1 ;;
+        *vivid.ko) insmod "$module" n_devs=2 node_types=0x101,0x101 num_inputs=1,1 input_types=3,3 num_outputs=1,1 output_types=1,1 multiplanar=1,2 ;;
         *) insmod "$module" ;;
     esac
 done

@@ -34,7 +34,7 @@ pack "$root" "$work/initramfs"
 
 # isa-debug-exit turns a value written to its port into QEMU's exit code, (value << 1) | 1.
 set +e
-timeout 300 qemu-system-x86_64 -accel tcg -cpu qemu64 -smp 1 -m "${MEMORY_MB:-512}" -nodefaults -no-user-config -display none \
+timeout 500 qemu-system-x86_64 -accel tcg -cpu qemu64 -smp 1 -m "${MEMORY_MB:-1024}" -nodefaults -no-user-config -display none \
     -serial stdio -monitor none -no-reboot -icount shift=1,sleep=off \
     -device isa-debug-exit,iobase=0xf4,iosize=0x04 \
     -kernel "$vmlinux" -initrd "$work/initramfs" \
@@ -44,6 +44,6 @@ code=$?
 set -e
 case $code in
     1) echo "tests/v4l2: all scenarios passed" ;;
-    124) echo "tests/v4l2: the machine did not come to an end in 300 s"; exit 1 ;;
+    124) echo "tests/v4l2: the machine did not come to an end in 500 s"; exit 1 ;;
     *) echo "tests/v4l2: failed (QEMU ended with $code)"; exit 1 ;;
 esac

@@ -5,7 +5,7 @@ import { claimIcon, icon } from "./marks.js";
 import { sentences } from "./sentences.js";
 import { Thumbnails } from "./thumbnails.js";
 
-const ICON = { unclaimed_emitter: "unclaimed", position_mismatch: "mismatch" };
+const ICON = { unclaimed_emitter: "unclaimed", position_mismatch: "mismatch", known_light_changed: "known", user_out_of_zone: "mismatch" };
 const AT_ONCE = 4;
 // Sentences on a card; the others, and the numbers, are one click away.
 const SENTENCES = 2;
@@ -13,7 +13,7 @@ const SENTENCES = 2;
 export class Alerts {
   constructor(link, on) {
     this.link = link;
-    this.on = on; // { pick(place, alert), changed(), raised(alert) }
+    this.on = on; // { pick(place, alert), changed(), raised(alert), approve(alert, note, until) }
     this.known = new Map();
     this.cards = new Map();
     this.fresh = new Set(); // raised just now
@@ -134,7 +134,7 @@ export class Alerts {
   shown() {
     const { text, kind, severity, sort } = this.tools;
     const words = text.value.trim().toLowerCase().split(/\s+/).filter(Boolean);
-    const said = (a) => `${a.id} ${kindName(a.kind)} ${a.user ?? ""} ${a.severity} ${a.state} ${a.acknowledgement?.note ?? ""} ${a.acknowledgement?.by ?? ""}`.toLowerCase();
+    const said = (a) => `${a.id} ${kindName(a.kind)} ${a.user ?? ""} ${a.site ?? ""} ${a.station ?? ""} ${a.severity} ${a.state} ${a.acknowledgement?.note ?? ""} ${a.acknowledgement?.by ?? ""}`.toLowerCase();
     const fits = (a) =>
       (this.all && this.at === null ? true : this.stood(a)) &&
       (!kind.value || a.kind === kind.value) &&
@@ -231,10 +231,14 @@ export class Alerts {
     const known = this.cards.get(alert.id);
     const said = JSON.stringify(alert);
     if (known && known.said === said) return known;
+    // While an approval is being written the card stays as it is; clearing alone ends it.
+    const approving = known?.node.querySelector(".approve[open]");
+    if (approving && approving.contains(document.activeElement) && alert.state === known.alert.state) return known;
     const openParts = known ? [...known.node.querySelectorAll("details")].filter((d) => d.open).map((d) => d.className) : [];
     const mark = ICON[alert.kind] ? icon(ICON[alert.kind]) : alert.kind === "user_unseen" ? claimIcon(true) : icon("pending");
     const when = el("span", { title: fullStamp(Date.parse(alert.raised_at)) }, this.when(alert));
     const where = alert.user ? [el("strong", {}, named(alert.user))] : [];
+    if (alert.station) where.unshift(...[el("bdi", {}, `${shown(alert.site)}.${shown(alert.station)}`), " "]);
     if (alert.x_m !== null) where.push(`${alert.user ? " " : ""}at ${metres(alert.x_m)}, ${metres(alert.y_m)} m`);
     if (alert.claimed?.x_m !== undefined) where.push(`${where.length > 1 ? "," : ""} claims ${metres(alert.claimed.x_m)}, ${metres(alert.claimed.y_m)} m`);
     const error = el("p", { className: "error", hidden: true });
@@ -294,8 +298,27 @@ export class Alerts {
       acts.append(button("Undo", (node) => this.undo(alert.id, node, error)));
     }
     const place = alert.x_m !== null ? [alert.x_m, alert.y_m] : alert.claimed?.x_m !== undefined ? [alert.claimed.x_m, alert.claimed.y_m] : null;
+    const isEmitter = alert.kind === "known_light_changed" || (alert.kind === "unclaimed_emitter" && !alert.evidence?.shares_the_spot_of);
+    if (isEmitter && alert.state !== "cleared") acts.append(this.approval(alert, error));
     if (place) acts.append(button("Show", () => this.on.pick(place, alert)));
     return acts;
+  }
+
+  // Approves the emitter as a known light, with a reason and an end.
+  approval(alert, error) {
+    const note = el("input", { placeholder: "What is it?", maxLength: 1000, "aria-label": "What the light is", required: true });
+    const until = el("input", { type: "datetime-local", "aria-label": "End of the approval; none when left empty", title: "End of the approval; none when left empty" });
+    const form = el("form", { className: "approval" }, note, until, el("button", { type: "submit" }, "Approve as known light"));
+    form.addEventListener("submit", async (e) => {
+      e.preventDefault();
+      try {
+        await this.on.approve(alert, note.value, until.value ? new Date(until.value).toISOString() : null);
+      } catch (failure) {
+        error.textContent = `Not approved: ${failure.message}`;
+        error.hidden = false;
+      }
+    });
+    return el("details", { className: "approve" }, el("summary", {}, "A known light?"), form);
   }
 
   details(alert, more, isOpen) {

@@ -3,7 +3,7 @@
 import { STATUS, el, metres, named } from "./words.js";
 
 const EVERY_MS = 400;
-const ORDER = { unclaimed: 0, mismatch: 1, pending: 3, verified: 4 };
+const ORDER = { unclaimed: 0, mismatch: 1, pending: 3, verified: 4, ignored: 5, known: 6 };
 const UNSEEN = 2;
 
 export class Beams {
@@ -36,7 +36,7 @@ export class Beams {
       const claim = said.get(e.user);
       const off = claim ? metres(Math.hypot(claim.x_m - e.x_m, claim.y_m - e.y_m)) : "";
       const sigma = e.cov_m2 ? metres(Math.sqrt(e.cov_m2[0][0] + e.cov_m2[1][1])) : "";
-      return { key: `b${e.track}`, order: ORDER[e.status], name: e.user, place: [e.x_m, e.y_m], kind: e.status, texts: [`${e.track}`, e.user ?? "nobody", STATUS[e.status], metres(e.x_m), metres(e.y_m), sigma, off] };
+      return { key: `b${e.track}`, order: ORDER[e.status], name: e.user, place: [e.x_m, e.y_m], kind: e.status, texts: [e.station ? `${e.station} ${e.track}` : `${e.track}`, e.user ?? "nobody", STATUS[e.status], metres(e.x_m), metres(e.y_m), sigma, off] };
     });
     for (const user of scene.unseen) {
       const claim = said.get(user);

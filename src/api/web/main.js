@@ -6,6 +6,8 @@ import { Bell } from "./bell.js";
 import { Link } from "./link.js";
 import { GroundMap } from "./map.js";
 import { claimIcon, icon } from "./marks.js";
+import { Places } from "./places.js";
+import { showStations } from "./stations.js";
 import { Timeline } from "./timeline.js";
 import { el, fullStamp, lasting, micros, shown, zone } from "./words.js";
 
@@ -31,6 +33,7 @@ const link = new Link({ state: onState, message: onMessage, ask });
 const alerts = new Alerts(link, {
   changed: redraw,
   raised: (alert) => bell.raised(alert),
+  approve: (alert, note, until) => places.approve(alert, note, until),
   pick(place, alert) {
     const raised = Date.parse(alert.raised_at);
     if (alert.cleared_at && timeline.moments.length && raised >= Date.parse(timeline.moments[0].time)) timeline.go(raised + 1000);
@@ -38,6 +41,8 @@ const alerts = new Alerts(link, {
     $("map").scrollIntoView({ block: "nearest", behavior: "smooth" });
   },
 });
+
+const places = new Places(link, map);
 
 legend();
 for (const [id, act] of [["zoom-in", () => map.zoomBy(1.5)], ["zoom-out", () => map.zoomBy(1 / 1.5)], ["zoom-all", () => map.all()]]) {
@@ -158,6 +163,7 @@ function draw() {
   const time = Date.parse(moment.time);
   $("clock").textContent = `${fullStamp(time)}${live ? "" : " · the past"}`;
   $("clock").title = zone(time);
+  places.tick(Date.parse(latest.time), latest.status.field_of_view_m);
   timeline.render(alerts.known.values());
   beams.show(scene);
   past(live ? null : time);
@@ -179,6 +185,7 @@ function notices() {
   const { source, journal } = latest.status;
   const texts = [];
   if (source.kind === "simulator") texts.push("Simulation: these frames are computed, no camera is watched.");
+  if (source.kind === "fleet" && !latest.status.stations?.length) texts.push("No access point has said anything yet.");
   if (source.kind === "replay") texts.push("Replay: these frames come from a recording.");
   if (journal.place === "memory") texts.push("Journal in memory: a restart of the monitor forgets all alerts. [journal] path in its config keeps them.");
   const list = $("notices");
@@ -195,7 +202,7 @@ function facts() {
   const queued = s.webhooks.reduce((n, w) => n + w.queued, 0);
   const failing = s.webhooks.filter((w) => w.state !== "working").length;
   const rows = [
-    ["Source", `${s.source.kind}, ${stalled() ? "silent" : s.source.state}`, s.source.state !== "running" || stalled() ? "bad" : s.source.kind === "v4l2" ? "" : "warn"],
+    ["Source", `${s.source.kind}, ${stalled() ? "silent" : s.source.state}`, s.source.state !== "running" || stalled() ? "bad" : ["v4l2", "fleet"].includes(s.source.kind) ? "" : "warn"],
     ["Frames", `${s.source.rate_hz.toFixed(1)} /s`],
     ["Latency", `${micros(s.latency.median_us)}`, "", `99 % within ${micros(s.latency.p99_us)}`],
     ["Dropped", `${s.frames.dropped}`, "", `${s.frames.captured} captured, ${s.frames.unusable} unusable`],
@@ -204,6 +211,7 @@ function facts() {
     ["Webhooks", s.webhooks.length ? (failing ? `${failing} failing, ${queued} queued` : `${queued} queued`) : "none", failing ? "warn" : ""],
   ];
   $("facts").replaceChildren(...rows.map(([name, value, tone = "", title = ""]) => el("div", { title }, el("dt", {}, name), el("dd", { className: tone }, value))));
+  showStations(s.stations ?? [], s.source.kind === "fleet");
   $("webhooks").hidden = !s.webhooks.length;
   $("endpoints").replaceChildren(...s.webhooks.map((w) => {
     const tone = w.state === "working" ? "quiet" : "warn";
@@ -256,6 +264,7 @@ function legend() {
     [icon("mismatch"), "not where they say"],
     [icon("unclaimed"), "nobody claims it"],
     [icon("pending"), "not decided yet"],
+    [icon("known"), "known light, or ignored"],
     [claimIcon(false), "claimed position"],
     [claimIcon(true), "claimed, not seen"],
   ];

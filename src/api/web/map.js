@@ -21,11 +21,16 @@ export class GroundMap {
     this.scene = null;
     this.picked = null;
     this.back = svg("g");
+    this.places = svg("g");
+    this.handles = svg("g");
+    this.zones = [];
+    this.lights = [];
+    this.corners = null; // of a zone that is being drawn
     this.trails = svg("g");
     this.claims = svg("g");
     this.marks = svg("g");
     this.names = svg("g");
-    node.append(this.back, this.trails, this.claims, this.marks, this.names);
+    node.append(this.back, this.places, this.trails, this.claims, this.marks, this.names, this.handles);
     new ResizeObserver(() => this.redraw()).observe(node);
     this.listen();
   }
@@ -42,13 +47,17 @@ export class GroundMap {
       moved = 0;
       node.setPointerCapture(e.pointerId);
       pointers.set(e.pointerId, [e.clientX, e.clientY]);
+      this.held = this.cornerAt(e);
       node.classList.add("drag");
     });
     node.addEventListener("pointermove", (e) => {
       const before = pointers.get(e.pointerId);
       if (!before) return;
       const others = [...pointers].filter(([id]) => id !== e.pointerId).map(([, p]) => p);
-      if (others.length) {
+      if (this.held !== null) {
+        moved = 4;
+        this.corners[this.held] = this.place(e).map((v) => +v.toFixed(2));
+      } else if (others.length) {
         const gap = (p) => Math.hypot(p[0] - others[0][0], p[1] - others[0][1]);
         const now = [e.clientX, e.clientY];
         this.zoomBy(gap(now) / Math.max(1, gap(before)), this.place(e));
@@ -62,6 +71,7 @@ export class GroundMap {
     });
     const end = (e) => {
       pointers.delete(e.pointerId);
+      this.held = null;
       if (!pointers.size) node.classList.remove("drag");
     };
     node.addEventListener("pointerup", (e) => {
@@ -81,9 +91,14 @@ export class GroundMap {
     });
   }
 
-  // A beam or an unseen user was clicked, or the ground beside them.
+  // A beam or an unseen user was clicked, or the ground beside them; while a zone is drawn, a corner of it.
   touch(e) {
     if (!this.scene) return;
+    if (this.corners) {
+      this.corners.push(this.place(e).map((v) => +v.toFixed(2)));
+      this.redraw();
+      return;
+    }
     const box = this.node.getBoundingClientRect();
     const at = [e.clientX - box.left, e.clientY - box.top];
     const claims = new Map(this.scene.claims.map((c) => [c.user, c]));
@@ -97,6 +112,58 @@ export class GroundMap {
     this.picked = null;
     this.on.pick(this.pickedKey);
     this.redraw();
+  }
+
+  // Zones as GeoJSON features, and known lights.
+  showPlaces(zones, lights) {
+    [this.zones, this.lights] = [zones, lights];
+    this.redraw();
+  }
+
+  // Begins to draw a zone with these corners; null ends it.
+  draft(corners) {
+    this.corners = corners;
+    this.node.classList.toggle("drawing", corners !== null);
+    this.redraw();
+  }
+
+  undoCorner() {
+    this.corners?.pop();
+    this.redraw();
+  }
+
+  // Index of the corner under a pointer.
+  cornerAt(e) {
+    if (!this.corners) return null;
+    const box = this.node.getBoundingClientRect();
+    const far = (c) => Math.hypot(this.px(c)[0] - (e.clientX - box.left), this.px(c)[1] - (e.clientY - box.top));
+    const k = this.corners.findIndex((c) => far(c) < 14);
+    return k < 0 ? null : k;
+  }
+
+  path(rings) {
+    return rings.map((ring) => `M${ring.map((c) => this.px(c).map((v) => v.toFixed(1)).join(" ")).join("L")}Z`).join("");
+  }
+
+  drawPlaces() {
+    const nodes = this.zones.flatMap(({ properties: p, geometry: g }) => {
+      const polygons = g.type === "Polygon" ? [g.coordinates] : g.coordinates;
+      const [x, y] = this.px(polygons[0][0].reduce((top, c) => (c[1] > top[1] ? c : top)));
+      return [
+        svg("path", { class: `zone ${p.kind}`, d: polygons.map((rings) => this.path(rings)).join(""), "fill-rule": "evenodd" }, svg("title", {}, `${shown(p.name)}: ${p.kind}`)),
+        svg("text", { class: `zone-name ${p.kind}`, x: x + 4, y: y + 14 }, `${shown(p.name)} · ${p.kind}`),
+      ];
+    });
+    for (const light of this.lights) {
+      const [x, y] = this.px([light.x_m, light.y_m]);
+      nodes.push(svg("circle", { class: "known-area", cx: x, cy: y, r: Math.max(3, light.radius_m * this.scale) }, svg("title", {}, `Known light${light.note ? `: ${shown(light.note)}` : ""}`)));
+    }
+    this.places.replaceChildren(...nodes);
+    const corners = this.corners ?? [];
+    const marks = corners.map((c) => svg("circle", { class: "handle", cx: this.px(c)[0], cy: this.px(c)[1], r: 6 }));
+    if (corners.length > 1) marks.unshift(svg("path", { class: "zone draft", d: this.path([corners]) }));
+    this.handles.replaceChildren(...marks);
+    if (this.corners) this.on.corners?.(corners);
   }
 
   // The beam or user `key` is pointed at; null when none is any more.
@@ -156,6 +223,7 @@ export class GroundMap {
     const room = Math.min(width / (2.16 * this.half[0]), height / (2.16 * this.half[1]));
     this.scale = room * this.zoom;
     this.drawBack();
+    this.drawPlaces();
     this.drawTrails();
     this.labels = [];
     this.drawClaims();
@@ -259,10 +327,12 @@ export class GroundMap {
         mismatch: [e.user, off === null ? "" : ` · ${metres(off)} m off`],
         pending: [e.user, e.user ? "" : `beam ${e.track}`],
         verified: [e.user, ""],
+        known: [null, "known light"],
+        ignored: [null, `beam ${e.track}, ignored`],
       }[e.status];
       const short = { unclaimed: [null, `beam ${e.track}`], mismatch: [e.user, ""] }[e.status];
       const found = this.isFound(`${e.user ?? ""} ${e.track}`);
-      this.labels.push({ short, x, y, key: `b${e.track}`, rank: { unclaimed: 0, mismatch: 1, pending: 3, verified: 4 }[e.status], parts, className: `beam-name ${e.status}`, found, left: Boolean(claim) && claim.x_m > e.x_m });
+      this.labels.push({ short, x, y, key: `b${e.track}`, rank: { unclaimed: 0, mismatch: 1, pending: 3, verified: 4, known: 5, ignored: 5 }[e.status], parts, className: `beam-name ${e.status}`, found, left: Boolean(claim) && claim.x_m > e.x_m });
       g.node.classList.toggle("found", found);
     }
     for (const track of gone) {

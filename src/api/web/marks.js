@@ -13,6 +13,9 @@ export function shape(status) {
         svg("rect", { class: "shape fill", x: -10, y: -10, width: 20, height: 20, rx: 3 }),
         svg("path", { class: "cross", d: "M-5-5 5 5M5-5-5 5" }),
       ];
+    case "known":
+    case "ignored":
+      return [svg("path", { class: "shape fill", d: "M0-8 8 6H-8Z" })];
     default:
       return [svg("circle", { class: "edge", r: 7, "stroke-dasharray": "4 3" })];
   }

@@ -1,6 +1,6 @@
 // The evidence of an alert in sentences; the numbers behind them stand in a table of their own.
 
-import { lasting, named, roughly, stamp } from "./words.js";
+import { el, lasting, metres, named, roughly, shown, stamp } from "./words.js";
 
 const seconds = (s) => lasting(s * 1000);
 const isNumber = (v) => typeof v === "number" && Number.isFinite(v);
@@ -64,11 +64,33 @@ const TELL = {
       !alert.user && ["Users cannot be held against their claims meanwhile; beams that are new are still alerted."],
     ];
   },
+  known_light_changed(e) {
+    const changes = { second_beam: "there is a second light in its spot", energy: `it has ${+(e.energy_over_the_learned?.ratio ?? 1).toPrecision(2)} times the light it had`, scintillation: "it scintillates otherwise than it did", place: `it is ${roughly(e.place?.away_m ?? 0)} from its place` };
+    const found = (e.changed ?? []).map((c) => changes[c]).filter(Boolean);
+    return [
+      e.note && ["The known light ", el("q", {}, named(e.note)), e.approved_by ? ", approved by " : "", ...(e.approved_by ? [named(e.approved_by)] : []), "."],
+      e.came_on_elsewhere && ["It went out, and a beam came on elsewhere."],
+      found.length && [`What has changed: ${found.join("; ")}.`],
+      strength(e.surprise, e.threshold),
+    ];
+  },
+  user_out_of_zone(e, alert) {
+    const zones = (e.zones ?? []).flatMap((zone, k) => [k ? ", " : "", named(zone)]);
+    return [[alert.user ? named(alert.user) : "The user", e.is_restricted ? " is in the restricted zone " : " is outside of all zones they may be in: ", ...zones, "."]];
+  },
   pose_inconsistent(e) {
     return [
       isNumber(e.largest_in_view_m) && [`${e.users_agreeing} of ${e.users} users are shifted alike, by up to ${roughly(e.largest_in_view_m)} within the view; ${roughly(e.limit_m)} are tolerated.`],
       ["Our own position, attitude or calibration is off, and all positions with it."],
     ];
+  },
+  station_lost(e, alert) {
+    return [[`Nothing has been heard of ${shown(`${alert.site}.${alert.station}`)}${e.last_seen_at ? ` since ${stamp(Date.parse(e.last_seen_at))}` : ""}: nobody is watched there, or the link to it is gone.`]];
+  },
+  user_in_two_places(e, alert) {
+    const places = (e.places ?? []).slice(0, 2);
+    const place = (p) => `${shown(`${p.site}.${p.station}`)} ${p.by === "claim" ? "has a claim" : "sees a beam"} at ${metres(p.x_m)}, ${metres(p.y_m)} m`;
+    return [[named(alert.user ?? "The user"), ` is in two places, ${roughly(e.distance_m)} apart: ${places.map(place).join("; ")}.`]];
   },
 };
 

@@ -1,6 +1,6 @@
 // How values are said.
 
-export const STATUS = { verified: "verified", mismatch: "mismatch", unclaimed: "unclaimed", pending: "pending" };
+export const STATUS = { verified: "verified", mismatch: "mismatch", unclaimed: "unclaimed", pending: "pending", known: "known light", ignored: "ignored" };
 
 export const KIND = {
   unclaimed_emitter: "A beam nobody claims",
@@ -10,6 +10,10 @@ export const KIND = {
   claims_stale: "The claims log is quiet",
   claims_flooded: "The claims log is flooded",
   pose_inconsistent: "Our own pose is off",
+  known_light_changed: "A known light has changed",
+  user_out_of_zone: "A user is where they may not be",
+  station_lost: "An access point is silent",
+  user_in_two_places: "A user is in two places",
 };
 
 export const SEVERITIES = ["critical", "warning", "info"];

@@ -31,6 +31,8 @@ pub(crate) struct MatchedFilter {
     strides: [usize; 2],
     /// Response over its standard deviation, (grid y, grid x).
     map: Vec<f64>,
+    /// Factor on each response that made its standard deviation one; empty where all pixels have the same weight.
+    scale: Vec<f64>,
     strip: Vec<f64>,
     peaks: Vec<Peak>,
 }
@@ -69,6 +71,7 @@ impl MatchedFilter {
             spans: [sx, sy],
             strides: [bx.stride, by.stride],
             map: Vec::new(),
+            scale: Vec::new(),
             strip: Vec::new(),
             peaks: Vec::new(),
         }
@@ -91,10 +94,70 @@ impl MatchedFilter {
             => (): matched_filter.filter(residual, mx, my));
     }
 
+    /// Peaks of `residual` where pixels have the inverse variances `weights`, (my, mx), which the residual already carries: each response is
+    /// divided by its own standard deviation. Only in the pixel bases.
+    pub fn weighted_peaks(
+        &mut self,
+        residual: &[f64],
+        weights: &[f64],
+        [mx, my]: [usize; 2],
+        threshold: f64,
+        radius: f64,
+    ) -> &[Peak] {
+        self.respond(residual, mx, my);
+        self.normalise(weights, mx, my);
+        self.find(threshold, radius)
+    }
+
+    /// Divides the map by the standard deviation of each response under `weights`.
+    fn normalise(&mut self, weights: &[f64], mx: usize, my: usize) {
+        let nx = self.grid[0].len();
+        let squares = self
+            .templates
+            .each_ref()
+            .map(|t| t.iter().map(|v| v * v).collect::<Vec<f64>>());
+        self.scale.resize(self.map.len(), 0.0);
+        let rows = self.map.chunks_exact_mut(nx).zip(self.scale.chunks_exact_mut(nx));
+        for (j, (out, scale)) in rows.enumerate() {
+            let row = &squares[1][j * self.strides[1]..(j + 1) * self.strides[1]];
+            let [lo, hi] = self.spans[1][j];
+            self.strip.fill(0.0);
+            for c in lo..hi.min(my) {
+                axpy(row[c], &weights[c * mx..(c + 1) * mx], &mut self.strip);
+            }
+            for (i, (o, s)) in out.iter_mut().zip(scale).enumerate() {
+                let column = &squares[0][i * self.strides[0]..(i + 1) * self.strides[0]];
+                let [lo, hi] = self.spans[0][i];
+                let variance = dot(&self.strip[lo..hi.min(mx)], &column[lo..hi.min(mx)]);
+                *s = if variance > 0.0 { 1.0 / variance.sqrt() } else { 0.0 };
+                *o *= *s;
+            }
+        }
+    }
+
+    /// Response at a position, σ, by bilinear interpolation of the map; `None` outside the grid.
+    pub fn response_at(&self, u: [f64; 2]) -> Option<f64> {
+        let mut cell = [(0, 0.0); 2];
+        for k in 0..2 {
+            let grid = &self.grid[k];
+            let position = (u[k] - grid[0]) / (grid[1] - grid[0]);
+            if !(position >= 0.0 && position <= (grid.len() - 1) as f64) {
+                return None;
+            }
+            let index = (position as usize).min(grid.len() - 2);
+            cell[k] = (index, position - index as f64);
+        }
+        let [(i, s), (j, t)] = cell;
+        let at = |i: usize, j: usize| self.map[j * self.grid[0].len() + i];
+        let along = |j: usize| at(i, j) * (1.0 - s) + at(i + 1, j) * s;
+        Some(along(j) * (1.0 - t) + along(j + 1) * t)
+    }
+
     #[inline(always)]
     fn filter(&mut self, residual: &[f64], mx: usize, my: usize) {
         let (nx, ny) = (self.grid[0].len(), self.grid[1].len());
         self.map.resize(nx * ny, 0.0);
+        self.scale.clear();
         self.strip.resize(mx, 0.0);
         for (j, out) in self.map.chunks_exact_mut(nx).enumerate() {
             let row = &self.templates[1][j * self.strides[1]..(j + 1) * self.strides[1]];
@@ -110,6 +173,22 @@ impl MatchedFilter {
                 *o = dot(&self.strip[lo..hi], &column[lo..hi]);
             }
         }
+    }
+
+    /// Response over its standard deviation at every grid point.
+    pub fn map(&self) -> &[f64] {
+        &self.map
+    }
+
+    /// Points of the grid along x.
+    pub fn width(&self) -> usize {
+        self.grid[0].len()
+    }
+
+    /// Position of a point of the map, σ.
+    pub fn position(&self, index: usize) -> [f64; 2] {
+        let nx = self.width();
+        [self.grid[0][index % nx], self.grid[1][index / nx]]
     }
 
     /// Peaks of the map as it is; see `peaks`.
@@ -146,7 +225,7 @@ impl MatchedFilter {
                         self.grid[1][j] + dy * step(&self.grid[1]),
                     ],
                     significance: value,
-                    a: value / (self.norms[0][i] * self.norms[1][j]),
+                    a: value * self.scale.get(j * nx + i).unwrap_or(&1.0) / (self.norms[0][i] * self.norms[1][j]),
                 });
             }
         }

@@ -19,6 +19,7 @@ use crate::estimate::model_order::power_prior::PowerPrior;
 use crate::estimate::model_order::refine::shrink;
 use crate::estimate::model_order::reweighting::Reweighting;
 use crate::estimate::model_order::search::{Search, SearchSpace};
+use crate::estimate::model_order::spot_error::{Shape, drop_halo, inspect_shape, search_with_spot_error};
 use crate::estimate::preprocess::noise_variance::VarianceFunction;
 use crate::estimate::preprocess::outliers::NoiseInspection;
 use crate::estimate::preprocess::screening::PreprocessedFrame;
@@ -37,12 +38,17 @@ const TRY_WORK: f64 = 0.03;
 
 /// Share of a frame's work for the search with isolated pixels kept.
 const KEPT_OUTLIERS_WORK: f64 = 0.1;
+/// Share of a frame's work after which it is asked whether the spots differ from the PSF: hardly a frame that can be explained takes more.
+const MISFIT_WORK: f64 = 0.1;
 /// Passes over a frame for isolated outliers.
 const OUTLIER_PASSES: usize = 3;
 
 /// The bases to search in, and where these span the whole frame, others that leave a part to measure the noise.
 pub(crate) fn bases(camera: &Camera) -> ([Basis; 2], Option<[Basis; 2]>) {
     let sigma = camera.spot_sigma_m;
+    if camera.spot_shape.is_some() {
+        return ([&camera.x, &camera.y].map(|axis| Basis::pixels(axis, sigma)), None);
+    }
     let [bx, by] = [&camera.x, &camera.y].map(|axis| Basis::new(axis, sigma));
     let window = |b: &Basis| (2.0 * REACH / b.pitch()).min(b.n as f64);
     let data_count = (bx.rank(TYPICAL_TAIL) * by.rank(TYPICAL_TAIL)) as f64;
@@ -92,7 +98,7 @@ struct Found {
 impl AnalyticEstimator {
     pub fn new(spec: &'static EstimatorSpec, camera: &Camera, known: Option<&KnownPower>, rules: Rules) -> Self {
         let (bases, noise_bases) = bases(camera);
-        let pencil = if rules.pencil_start && spec.chooses_order() {
+        let pencil = if rules.pencil_start && spec.chooses_order() && camera.spot_shape.is_none() {
             SearchSpace::for_pencil_start(noise_bases.as_ref().unwrap_or(&bases).clone(), rules)
         } else {
             None
@@ -104,8 +110,8 @@ impl AnalyticEstimator {
             inspection: NoiseInspection::default(),
             noise_bases: noise_bases.map(|bases| (bases, CompressedFrame::default())),
             pencil,
-            space: SearchSpace::new(bases, rules),
-            compressed: CompressedFrame::default(),
+            space: SearchSpace::new(bases, rules).with_shape(camera),
+            compressed: CompressedFrame::of_camera(camera),
             reweighting: Reweighting::new(camera, rules),
             prior: known
                 .filter(|_| spec.method == Method::MaximumPosterior)
@@ -159,15 +165,23 @@ impl AnalyticEstimator {
                 candidate.into_hypothesis()
             }
             Method::Pencil { steps } => initialise(&mut search, Nuisances::default(), steps).into_hypothesis(),
-            Method::MaximumLikelihood | Method::MaximumPosterior => {
+            Method::MaximumLikelihood | Method::MaximumPosterior | Method::Sequence => {
                 let initial = initial_hypothesis(&mut search);
+                if self.camera.spot_error.is_some_and(|e| e > 0.0) && self.space.bases.are_pixels() {
+                    // The search with the spot error is the only one.
+                    return Found {
+                        hypothesis: initial,
+                        is_by_pencil: false,
+                        suspected_variance: None,
+                    };
+                }
                 let is_explained = self.compressed.is_explained_by(&initial);
                 let by_pencil = if is_explained {
                     None
                 } else {
                     self.try_pencil(&mut budgets.pencil)
                 };
-                return by_pencil.unwrap_or_else(|| self.search_with_outliers(initial, &mut budgets.search));
+                return by_pencil.unwrap_or_else(|| self.search_unless_misfit(initial, &mut budgets.search));
             }
         };
         Found {
@@ -175,6 +189,32 @@ impl AnalyticEstimator {
             is_by_pencil: false,
             suspected_variance: None,
         }
+    }
+
+    /// A search that ends early where the spots differ from the PSF in the same way: the frame is then searched again with that allowed for.
+    /// Every other frame is searched in full. Only where spots stand apart; elsewhere they show their shape in the end, if at all.
+    fn search_unless_misfit(&mut self, initial: Hypothesis, budget: &mut WorkBudget) -> Found {
+        if self.camera.spot_error.is_some() || !self.space.bases.are_pixels() {
+            return self.search_with_outliers(initial, budget);
+        }
+        let kept = (self.frame.clone(), self.compressed.clone());
+        let limit = budget.limit(MISFIT_WORK);
+        let found = self.search_with_outliers(initial.clone(), budget);
+        let is_complete = budget.was_ample();
+        budget.restore_limit(limit);
+        if is_complete {
+            return found;
+        }
+        if !self.compressed.is_explained_by(&found.hypothesis) {
+            let Reweighting { space, compressed } = &mut self.reweighting;
+            let shape = inspect_shape(space, compressed, &self.frame, &found.hypothesis, false, budget);
+            if matches!(shape, Shape::Different(..)) {
+                return found;
+            }
+        }
+        (self.frame, self.compressed) = kept;
+        budget.restart();
+        self.search_with_outliers(initial, budget)
     }
 
     /// The hypothesis from the pencil's positions, if it explains the frame within little work.
@@ -266,8 +306,25 @@ impl Estimator for AnalyticEstimator {
     }
 
     fn estimate_until(&mut self, frame: &Frame, is_over: &dyn Fn() -> bool) -> Result<Estimate, Error> {
+        let scale = self.load(frame)?;
+        Ok(self.estimate_loaded(scale, is_over))
+    }
+}
+
+impl AnalyticEstimator {
+    /// Validates and compresses a frame; returns the measured noise in units of the configured noise.
+    pub fn load(&mut self, frame: &Frame) -> Result<f64, Error> {
         self.frame.load(frame, &self.camera)?;
-        let scale = self.inspect();
+        Ok(self.inspect())
+    }
+
+    /// The loaded frame, with the space to search it in.
+    pub fn loaded(&mut self) -> (&mut SearchSpace, &CompressedFrame, &PreprocessedFrame) {
+        (&mut self.space, &self.compressed, &self.frame)
+    }
+
+    /// The emitters of the loaded frame, whose noise is `scale` times the configured noise.
+    pub fn estimate_loaded(&mut self, scale: f64, is_over: &dyn Fn() -> bool) -> Estimate {
         let mut budgets = Budgets {
             search: WorkBudget::new(is_over),
             pencil: WorkBudget::new(is_over),
@@ -285,13 +342,44 @@ impl Estimator for AnalyticEstimator {
             }
             _ => (&mut self.space, &self.compressed, &mut budgets.search),
         };
+        let mut spot_error = 0.0;
+        let mut is_simpler = false;
+        if self.spec.chooses_order() {
+            let is_explained = compressed.is_explained_by(&hypothesis);
+            let Reweighting { space, compressed } = &mut self.reweighting;
+            let (frame, budget) = (&self.frame, &mut budgets.reweighting);
+            let shape = match self.camera.spot_error {
+                Some(0.0) => Shape::AsModelled,
+                Some(error) => Shape::of_spot_error(error, &hypothesis),
+                None => inspect_shape(space, compressed, frame, &hypothesis, is_explained, budget),
+            };
+            match shape {
+                Shape::AsModelled => {}
+                Shape::Simpler(simpler) => {
+                    hypothesis = simpler;
+                    is_simpler = true;
+                }
+                Shape::Different(error, bright) => {
+                    let next = search_with_spot_error(space, compressed, frame, error, bright, budget);
+                    let is_simpler = next.sources.len() < hypothesis.sources.len() && compressed.is_explained_by(&next);
+                    if !is_explained || is_simpler || self.camera.spot_error.is_some() {
+                        hypothesis = next;
+                        spot_error = error;
+                    }
+                }
+            }
+        } else if let Some(error) = self.camera.spot_error.filter(|e| *e > 0.0) {
+            drop_halo(&space.bases, error, space.source_penalty, &mut hypothesis.sources);
+            spot_error = error;
+        }
         let variance = suspected_variance.or((!compressed.variance.is_constant()).then_some(compressed.variance));
-        let is_weighted = self.rules.reweighting
-            && self.spec.chooses_order()
-            && (variance.is_some() || !compressed.is_explained_by(&hypothesis))
-            && self
-                .reweighting
-                .run(&self.frame, variance, &mut hypothesis, &mut budgets.reweighting);
+        let is_weighted = self.spec.chooses_order() && (spot_error > 0.0 || is_simpler)
+            || self.rules.reweighting
+                && self.spec.chooses_order()
+                && (variance.is_some() || !compressed.is_explained_by(&hypothesis))
+                && self
+                    .reweighting
+                    .run(&self.frame, variance, &mut hypothesis, &mut budgets.reweighting);
         let (space, compressed, budget) = if is_weighted {
             let Reweighting { space, compressed } = &mut self.reweighting;
             (space, &*compressed, &mut budgets.reweighting)
@@ -319,21 +407,23 @@ impl Estimator for AnalyticEstimator {
             &self.camera,
             noise_j,
             moments.as_deref(),
+            None,
         );
         if is_cut_short {
             for emitter in &mut found.emitters {
                 emitter.flags |= Flags::OUT_OF_TIME;
             }
         }
-        Ok(Estimate {
+        Estimate {
             emitters: found.emitters,
             estimator: self.spec.name,
             is_cut_short,
             reduced_chi2: found.reduced_chi2,
+            spot_error,
             saturated_share: self.frame.saturated_share(),
             condition: found.condition,
             steps: budgets.search.steps + budgets.pencil.steps + budgets.reweighting.steps,
-        })
+        }
     }
 }
 

@@ -6,6 +6,7 @@ use crate::estimate::estimators::analytic::AnalyticEstimator;
 use crate::estimate::estimators::list::{DEFAULT, Learned, find};
 use crate::estimate::estimators::network::NetworkEstimator;
 use crate::estimate::estimators::pixel_correction::PixelCorrected;
+use crate::estimate::sequence::SequenceEstimator;
 use crate::optics::Camera;
 
 /// Builds the configured estimator for a camera.
@@ -22,6 +23,13 @@ pub fn build(config: &Config, camera: &Camera) -> Result<Box<dyn Estimator>, Con
             found: budget,
         });
     }
+    if !(0.1..=3600.0).contains(&config.memory_s()) {
+        return Err(ConfigError::OutOfRange {
+            field: "memory_s",
+            expected: "0.1 to 3600 (seconds; nobody walks straight on for an hour)",
+            found: config.memory_s(),
+        });
+    }
     if let Some(known) = &config.known_power {
         known.validate()?;
     }
@@ -32,12 +40,20 @@ pub fn build(config: &Config, camera: &Camera) -> Result<Box<dyn Estimator>, Con
             camera,
             config.rules,
         )?),
-        None => Box::new(AnalyticEstimator::new(
-            find(name)?,
-            camera,
-            config.known_power.as_ref(),
-            config.rules,
-        )),
+        None => {
+            let spec = find(name)?;
+            let single = AnalyticEstimator::new(spec, camera, config.known_power.as_ref(), config.rules);
+            match spec.remembers() {
+                true => Box::new(SequenceEstimator::new(
+                    spec,
+                    single,
+                    camera,
+                    config.memory_s(),
+                    config.rules,
+                )),
+                false => Box::new(single),
+            }
+        }
     };
     Ok(match &camera.pixels {
         Some(maps) => Box::new(PixelCorrected::new(estimator, maps.clone(), camera.saturation_j)),

@@ -18,12 +18,21 @@ pub(crate) enum Method {
     Pencil { steps: usize },
     MaximumLikelihood,
     MaximumPosterior,
+    Sequence,
 }
 
 impl EstimatorSpec {
     /// Whether the number of emitters is chosen by the frame's likelihood.
     pub(crate) fn chooses_order(&self) -> bool {
-        matches!(self.method, Method::MaximumLikelihood | Method::MaximumPosterior)
+        matches!(
+            self.method,
+            Method::MaximumLikelihood | Method::MaximumPosterior | Method::Sequence
+        )
+    }
+
+    /// Whether an answer depends on the frames before.
+    pub fn remembers(&self) -> bool {
+        self.method == Method::Sequence
     }
 }
 
@@ -63,6 +72,11 @@ pub const ESTIMATORS: &[EstimatorSpec] = &[
         name: "map",
         summary: "the same, then the most probable hypothesis where users' power is known (`[estimator.known_power]`)",
         method: Method::MaximumPosterior,
+    },
+    EstimatorSpec {
+        name: "sequence",
+        summary: "`ml` over this frame and those before: positions and velocities shared, energies free in each frame",
+        method: Method::Sequence,
     },
 ];
 

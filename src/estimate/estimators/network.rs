@@ -93,12 +93,14 @@ impl Estimator for NetworkEstimator {
             camera,
             camera.noise_std_j,
             None,
+            None,
         );
         Ok(Estimate {
             emitters: found.emitters,
             estimator: self.name(),
             is_cut_short: false,
             reduced_chi2: found.reduced_chi2,
+            spot_error: 0.0,
             saturated_share: self.frame.saturated_share(),
             condition: found.condition,
             steps: budget.steps,

@@ -121,7 +121,7 @@ pub(crate) fn solve_amplitudes(
             row += 1;
             if i >= n {
                 model.background[i - n] = a;
-            } else if a < floor(i) {
+            } else if a < floor(i) && !model.has_signed_energies {
                 is_free[i] = false;
                 clipped = true;
             } else {

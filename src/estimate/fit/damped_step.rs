@@ -121,6 +121,7 @@ impl Step {
             to.width[w] = (from.width[w] * d.exp()).clamp(0.5, 2.0);
         }
         to.covariance_xy = from.covariance_xy;
+        to.has_signed_energies = from.has_signed_energies;
         if widths > 2 {
             let room = MAX_CORRELATION * to.width[0].min(to.width[1]).powi(2);
             to.covariance_xy = (to.covariance_xy + delta(p - 1).clamp(-0.1, 0.1)).clamp(-room, room);

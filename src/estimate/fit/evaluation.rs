@@ -22,6 +22,7 @@ impl Evaluation {
         model.background = hypothesis.background;
         model.width = hypothesis.width;
         model.covariance_xy = hypothesis.covariance_xy;
+        model.has_signed_energies = hypothesis.has_signed_energies;
         let (bx, by) = (&problem.bases.x, &problem.bases.y);
         for s in &mut model.sources {
             s.u[0] = s.u[0].clamp(bx.min_position(), bx.max_position());

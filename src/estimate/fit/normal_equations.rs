@@ -43,6 +43,19 @@ impl NormalEquations {
     /// Sets gradient and information of an evaluated hypothesis.
     #[inline(always)]
     pub fn compute(&mut self, problem: Problem, nuisances: Nuisances, at: &Evaluation, scratch: &mut Scratch) {
+        self.compute_weighted(problem, &problem.compressed.weights, nuisances, at, scratch);
+    }
+
+    /// The same with other weights in the information of sources and background.
+    #[inline(always)]
+    pub fn compute_weighted(
+        &mut self,
+        problem: Problem,
+        weights: &[f64],
+        nuisances: Nuisances,
+        at: &Evaluation,
+        scratch: &mut Scratch,
+    ) {
         let (compressed, model) = (problem.compressed, &at.model);
         let (mx, my) = (compressed.mx, compressed.my);
         let n = model.sources.len();
@@ -59,7 +72,7 @@ impl NormalEquations {
             let ai = model.amplitude(i);
             for j in i..components {
                 let aj = model.amplitude(j);
-                let mut c = model.gram_block(i, j, &compressed.weights, &mut scratch.strip);
+                let mut c = model.gram_block(i, j, weights, &mut scratch.strip);
                 if !runs.is_empty() {
                     let taken = model.gram_block_over_runs(i, j, runs, &mut scratch.strip);
                     for k in 0..9 {

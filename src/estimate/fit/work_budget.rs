@@ -18,12 +18,16 @@ const OVERRUN: f64 = 1.2;
 pub(crate) struct WorkBudget<'a> {
     /// Multiplications spent.
     spent: f64,
+    /// Factor on the allowance.
+    frames: f64,
     /// Limit of the work, whatever the hypotheses.
     limit: f64,
     /// Components of the largest hypothesis.
     max_components: f64,
     /// Steps of fits taken.
     pub steps: u64,
+    /// Whether a reserve has forgiven work.
+    is_forgiven: bool,
     is_over: &'a dyn Fn() -> bool,
 }
 
@@ -32,10 +36,20 @@ impl<'a> WorkBudget<'a> {
     pub fn new(is_over: &'a dyn Fn() -> bool) -> Self {
         Self {
             spent: 0.0,
+            frames: 1.0,
             limit: f64::INFINITY,
             max_components: 0.0,
             steps: 0,
+            is_forgiven: false,
             is_over,
+        }
+    }
+
+    /// The budget of as many frames together.
+    pub fn of_frames(frames: f64, is_over: &'a dyn Fn() -> bool) -> Self {
+        Self {
+            frames,
+            ..Self::new(is_over)
         }
     }
 
@@ -52,7 +66,9 @@ impl<'a> WorkBudget<'a> {
 
     /// Leaves at least this share of the allowance for what follows.
     pub fn reserve(&mut self, share: f64) {
-        self.spent = self.spent.min((1.0 - share) * self.allowance());
+        let most = (1.0 - share) * self.allowance();
+        self.is_forgiven |= self.spent > most;
+        self.spent = self.spent.min(most);
     }
 
     /// Limits what follows to this share of `MAX_WORK`. Returns the limit before, for [`WorkBudget::restore_limit`].
@@ -65,8 +81,21 @@ impl<'a> WorkBudget<'a> {
         self.limit = limit;
     }
 
+    /// Grants the whole allowance again, as for a new frame.
+    pub fn restart(&mut self) {
+        self.spent = 0.0;
+        self.max_components = 0.0;
+        self.is_forgiven = false;
+    }
+
+    /// Whether the allowance has never ended anything, so that more would have changed nothing.
+    pub fn was_ample(&self) -> bool {
+        !self.is_forgiven && !self.is_exhausted()
+    }
+
     fn allowance(&self) -> f64 {
-        (MAX_WORK * (self.max_components / MANY_SOURCES).clamp(1.0, MAX_WORK_FACTOR).powi(2)).min(self.limit)
+        (self.frames * MAX_WORK * (self.max_components / MANY_SOURCES).clamp(1.0, MAX_WORK_FACTOR).powi(2))
+            .min(self.limit)
     }
 
     /// Whether the frame's work is spent, or its time is up.

@@ -1,6 +1,8 @@
 //! The bases of both axes, with the background's profiles in them.
 
+use crate::estimate::model::measured_components::MeasuredShape;
 use crate::estimate::model::svd_basis::Basis;
+use crate::optics::Camera;
 
 /// What a frame is compressed into and predicted in.
 pub(crate) struct Bases {
@@ -8,15 +10,25 @@ pub(crate) struct Bases {
     pub y: Basis,
     /// Constant and sloped profiles along each axis.
     pub backgrounds: [[Vec<f64>; 2]; 2],
+    /// The PSF where it is measured; without one it is a Gaussian. Only in the pixel bases.
+    pub shape: Option<MeasuredShape>,
 }
 
 impl Bases {
     pub fn new([x, y]: [Basis; 2]) -> Self {
         Self {
             backgrounds: [background(&x), background(&y)],
+            shape: None,
             x,
             y,
         }
+    }
+
+    /// Pixel bases with the PSF that the camera was measured to have, if it was.
+    pub fn with_shape(mut self, camera: &Camera) -> Self {
+        let shape = camera.spot_shape.as_ref().filter(|_| self.are_pixels());
+        self.shape = shape.map(|shape| MeasuredShape::new(shape.clone(), camera.spot_sigma_m));
+        self
     }
 
     pub fn axes(&self) -> [&Basis; 2] {

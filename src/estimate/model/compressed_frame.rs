@@ -7,6 +7,7 @@ use crate::estimate::model::svd_basis::Basis;
 use crate::estimate::preprocess::masked_pixels::{MaskedPixel, MaskedPixels};
 use crate::estimate::preprocess::noise_variance::VarianceFunction;
 use crate::estimate::preprocess::screening::PreprocessedFrame;
+use crate::optics::Camera;
 
 /// Largest part of the brightest spot that may be left outside the basis, in units of the noise: less costs columns, more biases
 /// positions by 2 % of their standard deviation and more.
@@ -27,6 +28,11 @@ pub(crate) struct CompressedFrame {
     /// Inverse variances (my, mx) where pixels differ in them, and Σ ln of the variances. Only in the pixel bases.
     pub weights: Vec<f64>,
     pub log_det: f64,
+    /// Where the weights allow for an inexact PSF: the square of each weight times the variance that the pixel adds to positions. A spot's
+    /// own halo is left out, since what is symmetric about it does not move it.
+    pub position_weights: Vec<f64>,
+    /// Whether every pixel has a weight, as a measured PSF needs it: masked pixels then weigh nothing, and there is nothing to downdate.
+    pub is_weighted: bool,
     weighted: Vec<f64>,
     /// Beyond this many of its widths a spot is below the noise.
     pub reach: f64,
@@ -42,6 +48,14 @@ pub(crate) struct CompressedFrame {
 }
 
 impl CompressedFrame {
+    /// For frames of a camera whose PSF may be measured.
+    pub fn of_camera(camera: &Camera) -> Self {
+        Self {
+            is_weighted: camera.spot_shape.is_some(),
+            ..Self::default()
+        }
+    }
+
     /// Compresses `frame`, Z = Uᵧᵀ Y Uₓ.
     pub fn load(&mut self, frame: &PreprocessedFrame, bx: &Basis, by: &Basis) {
         dispatch!(<'a>
@@ -73,6 +87,7 @@ impl CompressedFrame {
         self.rank = [self.mx.min(bx.columns()), self.my.min(by.columns())];
         let (mx, my) = (self.mx, self.my);
         self.weights.clear();
+        self.position_weights.clear();
         self.log_det = 0.0;
         if bx.is_pixels && by.is_pixels {
             self.coefficients.clear();
@@ -102,6 +117,9 @@ impl CompressedFrame {
             square(&frame.pixels) + self.masked.pixels.iter().map(filled).sum::<f64>() - square(&self.coefficients);
         self.outside = (energy.max(0.0) / left.max(1.0), left);
         (self.variance, self.mean_variance, self.light_weighted_variance) = (VarianceFunction::default(), 1.0, 1.0);
+        if self.is_weighted {
+            self.set_weights(frame, [bx, by], |_| 1.0);
+        }
     }
 
     #[inline(always)]
@@ -131,6 +149,11 @@ impl CompressedFrame {
         }
         self.masked.clear();
         self.update_weighted(axes);
+    }
+
+    /// Whether the weights allow for an inexact PSF.
+    pub fn has_spot_error(&self) -> bool {
+        !self.position_weights.is_empty()
     }
 
     /// Updates the weighted coefficients after a change of coefficients, weights or masked pixels.

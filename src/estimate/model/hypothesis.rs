@@ -82,6 +82,8 @@ pub(crate) struct Hypothesis {
     pub width: [f64; 2],
     /// The PSF's covariance between the axes, σ².
     pub covariance_xy: f64,
+    /// Whether energies may be negative. One frame's may not; over many frames the bound would bias positions.
+    pub has_signed_energies: bool,
     /// Squared residual over the usable data, in units of the noise.
     pub deviance: f64,
     /// −2 ln of the Occam factor and the prior of the number of sources; 0 without a power prior.
@@ -97,6 +99,7 @@ impl Hypothesis {
             background: [0.0; 3],
             width: [1.0; 2],
             covariance_xy: 0.0,
+            has_signed_energies: false,
             deviance: f64::INFINITY,
             log_evidence_term: 0.0,
             converged: false,

@@ -2,7 +2,9 @@
 
 pub mod bases;
 pub mod compressed_frame;
+pub mod halo;
 pub mod hypothesis;
+pub mod measured_components;
 pub mod psf_table;
 pub mod separable_model;
 pub mod separable_terms;

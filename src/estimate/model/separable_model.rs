@@ -1,11 +1,13 @@
 //! The predicted frame of a hypothesis: components (sources, then background terms), each a sum of separable terms.
 //!
 //! A source whose PSF is aligned with the axes is one term. A rotated ellipse is no product of profiles: it is an aligned PSF smeared
-//! along a diagonal, which Gauss–Hermite quadrature (Abramowitz and Stegun, 1964, 25.4.46) turns into a sum of five.
+//! along a diagonal, which Gauss–Hermite quadrature (Abramowitz and Stegun, 1964, 25.4.46) turns into a sum of five. A measured PSF is a sum
+//! of terms whose weights vary over the field, kept as one patch of pixels per source.
 
 use crate::estimate::model::bases::Bases;
 use crate::estimate::model::compressed_frame::CompressedFrame;
 use crate::estimate::model::hypothesis::{Nuisances, PointSource};
+use crate::estimate::model::measured_components::MeasuredComponents;
 use crate::estimate::model::separable_terms::SeparableTerms;
 use crate::estimate::preprocess::masked_pixels::Run;
 
@@ -58,8 +60,13 @@ pub(crate) struct SeparableModel {
     pub width: [f64; 2],
     /// The sources' covariance between the axes, σ².
     pub covariance_xy: f64,
+    /// Whether the sources' amplitudes may be negative.
+    pub has_signed_energies: bool,
     components: usize,
     terms: SeparableTerms,
+    /// Takes the place of `terms` where the PSF is measured.
+    measured: Option<MeasuredComponents>,
+    terms_per_source: usize,
 }
 
 impl SeparableModel {
@@ -69,7 +76,10 @@ impl SeparableModel {
 
     /// Numbers within all components' spans together: the cost of one pass over them.
     pub fn footprint(&self) -> f64 {
-        self.terms.footprint()
+        match &self.measured {
+            None => self.terms.footprint(),
+            Some(m) => self.terms_per_source as f64 * m.footprint(),
+        }
     }
 
     /// Separable terms of a source.
@@ -96,6 +106,20 @@ impl SeparableModel {
         let n = self.sources.len();
         let quadrature = self.quadrature(0);
         self.components = n + nuisances.background_terms();
+        if let Some(shape) = &bases.shape {
+            self.terms_per_source = shape.terms();
+            let measured = self.measured.get_or_insert_default();
+            measured.clear(compressed.mx);
+            for s in &self.sources {
+                measured.push(shape, axes, s.u);
+            }
+            for b in 0..nuisances.background_terms() {
+                let kinds = [usize::from(b == 1), usize::from(b == 2)];
+                measured.push_profiles(axes, [0, 1].map(|k| bases.backgrounds[k][kinds[k]].as_slice()));
+            }
+            return;
+        }
+        self.measured = None;
         let count = n * quadrature.len() + nuisances.background_terms();
         self.terms.clear(count, compressed.mx, compressed.my);
         let along = self.covariance_xy.abs().sqrt();
@@ -155,6 +179,9 @@ impl SeparableModel {
     /// Adds `scale`·f_y⁽ᵇ⁾⊗f_x⁽ᵃ⁾ of component `i` to a matrix (my, mx).
     #[inline(always)]
     pub fn accumulate(&self, i: usize, a: usize, b: usize, scale: f64, matrix: &mut [f64]) {
+        if let Some(m) = &self.measured {
+            return m.accumulate(i, a, b, scale, matrix);
+        }
         let (first, shares) = self.terms(i);
         for (k, (_, share)) in shares.iter().enumerate() {
             self.terms.accumulate(first + k, a, b, share * scale, matrix);
@@ -172,6 +199,14 @@ impl SeparableModel {
         scratch: &mut Vec<f64>,
         matrix: &mut [f64],
     ) {
+        if let Some(m) = &self.measured {
+            m.accumulate(i, 2, 0, q0[0], matrix);
+            m.accumulate(i, 1, 0, q0[1], matrix);
+            m.accumulate(i, 1, 1, q1[0], matrix);
+            m.accumulate(i, 0, 1, q1[1], matrix);
+            m.accumulate(i, 0, 2, q2, matrix);
+            return;
+        }
         let (first, shares) = self.terms(i);
         for (k, (_, share)) in shares.iter().enumerate() {
             let (q0, q1) = ([share * q0[0], share * q0[1]], [share * q1[0], share * q1[1]]);
@@ -183,6 +218,9 @@ impl SeparableModel {
     /// Inner products of a matrix (my, mx) with f_y⊗f_x, f_y⊗f′_x and f′_y⊗f_x of component `i`.
     #[inline(always)]
     pub fn project(&self, i: usize, matrix: &[f64], scratch: &mut Vec<f64>) -> [f64; 3] {
+        if let Some(m) = &self.measured {
+            return m.project(i, SLOPES, matrix);
+        }
         sum_terms!(self, i, |k| self.terms.project(k, matrix, scratch))
     }
 
@@ -216,6 +254,9 @@ impl SeparableModel {
     /// The first value of [`Self::project`] alone.
     #[inline(always)]
     pub fn project_value(&self, i: usize, matrix: &[f64], scratch: &mut Vec<f64>) -> f64 {
+        if let Some(m) = &self.measured {
+            return m.project(i, [[0, 0]], matrix)[0];
+        }
         let [value] = sum_terms!(self, i, |k| [self.terms.project_value(k, matrix, scratch)]);
         value
     }
@@ -223,6 +264,9 @@ impl SeparableModel {
     /// Inner products with the second derivatives: xx, xy, yy.
     #[inline(always)]
     pub fn project_second_derivatives(&self, i: usize, matrix: &[f64], scratch: &mut Vec<f64>) -> [f64; 3] {
+        if let Some(m) = &self.measured {
+            return m.project(i, [[2, 0], [1, 1], [0, 2]], matrix);
+        }
         sum_terms!(self, i, |k| self.terms.project_second_derivatives(k, matrix, scratch))
     }
 
@@ -238,6 +282,9 @@ impl SeparableModel {
         weights: &[f64],
         scratch: &mut Vec<f64>,
     ) -> f64 {
+        if let Some(m) = &self.measured {
+            return m.inner_product(i, a, j, b, weights);
+        }
         let [sum] = sum_pairs!(self, i, j, |k, l| [self
             .terms
             .inner_product(k, a, l, b, weights, scratch)]);
@@ -248,12 +295,16 @@ impl SeparableModel {
     /// Only of sources that are upright.
     #[inline(always)]
     pub fn axis_inner_products(&self, i: usize, j: usize) -> Option<[[[f64; 2]; 3]; 2]> {
+        debug_assert!(self.measured.is_none(), "a measured PSF is fitted with weights");
         self.terms.axis_inner_products(i, j)
     }
 
     /// Inner products of (f′_x f_y, f_x f′_y, f_x f_y) of component `i` with those of component `j`, 3 × 3 row-major.
     #[inline(always)]
     pub fn gram_block(&self, i: usize, j: usize, weights: &[f64], scratch: &mut Vec<f64>) -> [f64; 9] {
+        if let Some(m) = &self.measured {
+            return m.gram_block(i, j, weights);
+        }
         sum_pairs!(self, i, j, |k, l| self.terms.gram_block(k, l, weights, scratch))
     }
 }

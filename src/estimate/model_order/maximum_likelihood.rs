@@ -44,7 +44,7 @@ pub(crate) fn maximum_likelihood(search: &mut Search, initial: Hypothesis) -> Hy
         || candidate.nuisances != plain
         || has_unequal_energies(search, &candidate) && nuisances_can_replace_sources(search, &candidate)
     {
-        if rules.select_nuisances {
+        if rules.select_nuisances && !search.is_measured() {
             select_nuisances(search, &mut candidate);
         }
         is_settled = false;
@@ -59,7 +59,7 @@ pub(crate) fn maximum_likelihood(search: &mut Search, initial: Hypothesis) -> Hy
         }
     };
     let is_unexplained = !is_settled && !search.is_explained_by(&candidate);
-    if rules.rotated_ellipse && (may_be_turned || is_unexplained) {
+    if rules.rotated_ellipse && !search.is_measured() && (may_be_turned || is_unexplained) {
         try_rotated_ellipse(search, first, &mut candidate);
         is_settled = false;
     }

@@ -1,6 +1,7 @@
 //! The number of emitters: hypotheses are proposed, fitted and compared.
 
 pub mod candidate;
+pub mod common_misfit;
 pub mod criterion;
 pub mod evidence;
 pub mod initialise;
@@ -16,3 +17,4 @@ pub mod pruning;
 pub mod refine;
 pub mod reweighting;
 pub mod search;
+pub mod spot_error;

@@ -25,7 +25,7 @@ pub(crate) fn with_more_nuisances(
             background: true,
             width,
         };
-        if nuisances.count() <= hypothesis.nuisances.count() {
+        if nuisances.count() <= hypothesis.nuisances.count() || search.is_measured() && width != Width::Known {
             continue;
         }
         let mut next = best.as_ref().unwrap_or(hypothesis).clone();

@@ -29,8 +29,8 @@ impl Reweighting {
     pub fn new(camera: &Camera, rules: Rules) -> Self {
         let basis = |axis| Basis::pixels(axis, camera.spot_sigma_m);
         Self {
-            space: SearchSpace::new([&camera.x, &camera.y].map(basis), rules),
-            compressed: CompressedFrame::default(),
+            space: SearchSpace::new([&camera.x, &camera.y].map(basis), rules).with_shape(camera),
+            compressed: CompressedFrame::of_camera(camera),
         }
     }
 

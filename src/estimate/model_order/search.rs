@@ -18,6 +18,7 @@ use crate::estimate::model_order::power_prior::PowerPrior;
 use crate::estimate::preprocess::noise_variance::VarianceFunction;
 use crate::estimate::preprocess::screening::PreprocessedFrame;
 use crate::estimate::rules::Rules;
+use crate::optics::Camera;
 
 /// Steps of a candidate's fit before it is compared: few, as most candidates are rejected; those accepted converge later.
 pub(crate) const TRIAL_STEPS: usize = 30;
@@ -46,6 +47,12 @@ impl SearchSpace {
     pub fn new([bx, by]: [Basis; 2], rules: Rules) -> Self {
         let pencil = PencilSampler::new(&bx, &by);
         Self::with(pencil, [bx, by], rules)
+    }
+
+    /// The same with the PSF that the camera was measured to have, if it was; in pixel bases.
+    pub fn with_shape(mut self, camera: &Camera) -> Self {
+        self.bases = self.bases.with_shape(camera);
+        self
     }
 
     /// For a first try by the pencil where [`SearchSpace::new`] begins with residual peaks.
@@ -133,6 +140,11 @@ impl<'a> Search<'a, '_> {
         self.compressed().is_explained_by(hypothesis)
     }
 
+    /// Whether the PSF is measured: then it has no width to be fitted.
+    pub fn is_measured(&self) -> bool {
+        self.context.bases.shape.is_some()
+    }
+
     /// Whether too many pixels are masked for the matrix pencil and for rotated ellipses.
     pub fn is_heavily_masked(&self) -> bool {
         let pixels = self.context.bases.x.n * self.context.bases.y.n;
@@ -187,7 +199,14 @@ impl<'a> Search<'a, '_> {
     pub fn residual_peaks(&mut self, candidate: &mut Candidate) -> Vec<Peak> {
         let (mx, my) = (self.compressed().mx, self.compressed().my);
         let threshold = 0.7 * self.criterion.threshold().sqrt();
+        let compressed = self.compressed();
         let residual = &candidate.evaluation(&mut self.context).residual;
+        if compressed.has_spot_error() {
+            let size = [mx, my];
+            return (self.matched_filter)
+                .weighted_peaks(residual, &compressed.weights, size, threshold, OVERLAPPING)
+                .to_vec();
+        }
         self.matched_filter
             .peaks(residual, mx, my, threshold, OVERLAPPING)
             .to_vec()

@@ -3,6 +3,7 @@
 //! The mean square out there is the noise's variance, a single pixel that exceeds it is hot or dead, and where it grows with the
 //! signal the noise is shot noise or gain scatter.
 
+use crate::estimate::dense_linalg::largest;
 use crate::estimate::model::compressed_frame::CompressedFrame;
 use crate::estimate::model::svd_basis::Basis;
 use crate::estimate::preprocess::noise_variance::VarianceFunction;
@@ -12,6 +13,8 @@ use crate::estimate::preprocess::screening::PreprocessedFrame;
 const FEWEST: f64 = 100.0;
 /// Standard deviations by which the measured noise must differ from the configured noise to replace it: one frame in 16,000 by chance.
 const DIFFERENT: f64 = 4.0;
+/// Least measured noise, in units of the brightest pixel, where it is below the configured noise: fits converge up to this ratio.
+const LEAST_NOISE: f64 = 1e-5;
 /// Standard deviations from which a single pixel is hot or dead: one pixel in 5·10⁸ by chance.
 const OUTLIER: f64 = 6.0;
 /// Passes of rejection; each reloads the frame without the pixels found. With [`SHARE`] they reach from 2¹⁴ times the threshold down to it.
@@ -70,6 +73,9 @@ impl NoiseInspection {
         } else {
             floor
         };
+        // A frame without noise would otherwise be fitted to its rounding.
+        let least = (LEAST_NOISE * largest(0.0, &frame.pixels)).min(1.0);
+        let floor = floor.max(least * least);
         let scale = floor.sqrt();
         for p in &mut frame.pixels {
             *p /= scale;

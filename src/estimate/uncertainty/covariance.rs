@@ -1,5 +1,7 @@
 //! The covariance, condition number and determinant of normal equations.
 
+use nalgebra::DMatrix;
+
 use crate::estimate::dense_linalg::{cholesky, dispatch, invert};
 use crate::estimate::fit::normal_equations::NormalEquations;
 
@@ -16,11 +18,24 @@ pub(crate) struct Covariance {
 impl Covariance {
     /// `None` where the information is singular. `prior` is a precision added to the sources' positions.
     pub fn new(equations: &NormalEquations, prior: f64) -> Option<Self> {
+        Self::with_known(equations, prior, None)
+    }
+
+    /// The same with further information on the positions, over x and y of each source.
+    pub fn with_known(equations: &NormalEquations, prior: f64, known: Option<&DMatrix<f64>>) -> Option<Self> {
         let n = equations.parameters;
         let mut factor = equations.information.clone();
         for i in 0..equations.sources {
             factor[3 * i * n + 3 * i] += prior;
             factor[(3 * i + 1) * n + 3 * i + 1] += prior;
+        }
+        if let Some(known) = known {
+            let at = |k: usize| 3 * (k / 2) + k % 2;
+            for r in 0..known.nrows() {
+                for c in r..known.ncols() {
+                    factor[at(r) * n + at(c)] += known[(r, c)];
+                }
+            }
         }
         for i in 0..n {
             factor[i * n + i] *= 1.0 + RIDGE;
@@ -35,6 +50,28 @@ impl Covariance {
             true
         });
         is_regular.then_some(Self { parameters: n, matrix })
+    }
+
+    /// C M C for the information M of other weights: the covariance of a fit whose weights are not its data's inverse variances (White,
+    /// 1980).
+    pub fn sandwich(&self, equations: &NormalEquations) -> Self {
+        let n = self.parameters;
+        let m = |i: usize, j: usize| equations.information[i.min(j) * n + i.max(j)];
+        let mut half = vec![0.0; n * n];
+        let mut matrix = vec![0.0; n * n];
+        for i in 0..n {
+            for j in 0..n {
+                half[i * n + j] = (0..n).map(|k| self.matrix[i * n + k] * m(k, j)).sum();
+            }
+        }
+        for i in 0..n {
+            for j in i..n {
+                let value = (0..n).map(|k| half[i * n + k] * self.matrix[k * n + j]).sum();
+                matrix[i * n + j] = value;
+                matrix[j * n + i] = value;
+            }
+        }
+        Self { parameters: n, matrix }
     }
 
     /// Covariance of parameter `r` of source `i` with parameter `c` of source `j`: 0 and 1 are the position, 2 the energy.

@@ -3,7 +3,7 @@
 use faer::{Mat, Side};
 
 use crate::optics::psf::PixelResponse;
-use crate::optics::{Camera, psf};
+use crate::optics::{Camera, add_spot, psf};
 
 /// What the bound assumes beside unknown positions and energies: further parameters, masked pixels, prior knowledge.
 #[derive(Clone, Copy, Debug, Default)]
@@ -92,9 +92,17 @@ fn jacobian(camera: &Camera, positions: &[[f64; 2]], energies: &[f64], assumptio
     };
     let background = if assumptions.background { 3 } else { 0 };
     let mut jacobian = Mat::<f64>::zeros(camera.x.n * camera.y.n, 3 * n + shape + background);
-    let (mut row, mut column) = (vec![DARK; camera.x.n], vec![DARK; camera.y.n]);
     let is_usable = |pixel: usize| assumptions.masked.is_none_or(|bad| !bad[pixel]);
-    for (i, &p) in positions.iter().enumerate() {
+    if camera.spot_shape.is_some() {
+        measured_columns(camera, positions, energies, &is_usable, &mut jacobian);
+    }
+    let (mut row, mut column) = (vec![DARK; camera.x.n], vec![DARK; camera.y.n]);
+    let of_gaussian = if camera.spot_shape.is_some() {
+        &[][..]
+    } else {
+        positions
+    };
+    for (i, &p) in of_gaussian.iter().enumerate() {
         let [x, y] = camera.to_sensor(p);
         psf::profile_response(&camera.x, x, sigma, &mut row);
         psf::profile_response(&camera.y, y, sigma, &mut column);
@@ -130,6 +138,43 @@ fn jacobian(camera: &Camera, positions: &[[f64; 2]], energies: &[f64], assumptio
         }
     }
     jacobian
+}
+
+/// The columns of positions and energies where the spot is measured, by central differences.
+fn measured_columns(
+    camera: &Camera,
+    positions: &[[f64; 2]],
+    energies: &[f64],
+    is_usable: &dyn Fn(usize) -> bool,
+    jacobian: &mut Mat<f64>,
+) {
+    // A thousandth of the spot's width: truncation 1e-6, cancellation 1e-13.
+    const STEP: f64 = 1e-3;
+    let sigma = camera.spot_sigma_m;
+    let spot = |at: [f64; 2], energy_j: f64| {
+        let mut pixels = vec![0.0; camera.x.n * camera.y.n];
+        add_spot(camera, at, energy_j, &mut pixels);
+        pixels
+    };
+    for (i, &position) in positions.iter().enumerate() {
+        let at = camera.to_sensor(position);
+        let signal = energies[i] / camera.noise_std_j;
+        for k in 0..2 {
+            let moved = |sign: f64| {
+                let mut place = at;
+                place[k] += sign * STEP * sigma;
+                spot(place, signal)
+            };
+            let (up, down) = (moved(1.0), moved(-1.0));
+            for pixel in (0..up.len()).filter(|&p| is_usable(p)) {
+                jacobian[(pixel, 3 * i + k)] = (up[pixel] - down[pixel]) / (2.0 * STEP);
+            }
+        }
+        let one = spot(at, 1.0);
+        for pixel in (0..one.len()).filter(|&p| is_usable(p)) {
+            jacobian[(pixel, 3 * i + 2)] = one[pixel];
+        }
+    }
 }
 
 #[cfg(test)]

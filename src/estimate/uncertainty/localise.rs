@@ -1,8 +1,11 @@
 //! From a fitted hypothesis to positions on the ground, each with its covariance and flags.
 
+use nalgebra::DMatrix;
+
 use crate::estimate::emitter::{Emitter, Flags, SecondMomentScore};
 use crate::estimate::fit::context::FitContext;
 use crate::estimate::fit::levenberg_marquardt::linearise;
+use crate::estimate::fit::normal_equations::NormalEquations;
 use crate::estimate::model::hypothesis::{Hypothesis, OVERLAPPING};
 use crate::estimate::preprocess::screening::PreprocessedFrame;
 use crate::estimate::uncertainty::covariance::{Covariance, RIDGE, condition_number};
@@ -33,7 +36,8 @@ pub(crate) struct Localised {
     pub condition: f64,
 }
 
-/// Turns `hypothesis` into emitters with covariance and flags.
+/// Turns `hypothesis` into emitters with covariance and flags. `known` is the information on the positions (x, y of each source, 1/σ²)
+/// that does not come from this frame.
 pub(crate) fn localise(
     context: &mut FitContext,
     hypothesis: &mut Hypothesis,
@@ -41,6 +45,7 @@ pub(crate) fn localise(
     camera: &Camera,
     noise_j: f64,
     posterior_moments: Option<&[PosteriorMoments]>,
+    known: Option<&DMatrix<f64>>,
 ) -> Localised {
     let n = hypothesis.sources.len();
     let p = hypothesis.parameters();
@@ -54,8 +59,18 @@ pub(crate) fn localise(
     let prior = 12.0 / (extent * extent);
     let problem = context.problem();
     let mut at = linearise(problem, hypothesis, context.budget, context.workspace);
-    let covariance = Covariance::new(at.equations, prior);
+    let covariance = Covariance::with_known(at.equations, prior, known);
     let condition = (covariance.as_ref()).map_or(f64::INFINITY, |c| condition_number(at.equations, c));
+    // Where the weights allow for an inexact PSF, what pixels add to positions is not the inverse of their weights.
+    let (p_weights, evaluation) = (&compressed.position_weights, at.evaluation);
+    let sandwiched = covariance.as_ref().filter(|_| compressed.has_spot_error()).map(|c| {
+        let mut equations = NormalEquations::default();
+        equations.compute_weighted(problem, p_weights, hypothesis.nuisances, evaluation, at.scratch);
+        c.sandwich(&equations)
+    });
+    // An ill-conditioned fit leaves a sandwich that is no covariance; the inverse of the weights then stands.
+    let is_covariance = |[[a, b], [_, c]]: [[f64; 2]; 2]| a > 0.0 && a * c > b * b;
+    let sandwiched = sandwiched.filter(|s| (0..n).all(|i| is_covariance(s.block(i, i))));
     let scores = match &covariance {
         Some(c) => second_moment_scores(problem, &mut at, c, context.budget),
         None => vec![SecondMomentScore::default(); n],
@@ -74,7 +89,7 @@ pub(crate) fn localise(
                 let v = if i == j { extent * extent / 12.0 } else { 0.0 };
                 [[v, 0.0], [0.0, v]]
             },
-            |c| c.block(i, j),
+            |c| sandwiched.as_ref().unwrap_or(c).block(i, j),
         )
     };
     let is_regular = covariance.is_some();
@@ -130,7 +145,7 @@ pub(crate) fn localise(
             flags.set(Flags::UNRESOLVED, (0..n).any(|j| is_doubtful[j] && is_near(i, j)));
             flags.set(Flags::NON_GAUSSIAN, !is_quadratic[i]);
             let (mut u, mut own) = (source.u, own);
-            for k in 0..if is_regular { 2 } else { 0 } {
+            for k in 0..if is_regular && known.is_none() { 2 } else { 0 } {
                 if let Some(s) = pixel_posterior::pixel_posterior([bx, by], k, &source) {
                     u[k] += s.shift;
                     // Neighbours and nuisances widen this variance as they widen the information matrix's.
@@ -156,6 +171,7 @@ pub(crate) fn localise(
                 y_m,
                 cov_m2: camera.cov_to_ground(sensor_m, own.map(|r| r.map(|c| c * scale))),
                 energy_j: source.a * noise_j,
+                velocity: None,
                 // Two square roots: the product of the variances may overflow.
                 energy_std_j: energy_variance.max(0.0).sqrt() * inflation.sqrt() * noise_j,
                 sensor_m,

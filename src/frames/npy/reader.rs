@@ -57,6 +57,11 @@ impl Reader {
         })
     }
 
+    /// Whether the file holds counts rather than joules.
+    pub fn is_counts(&self) -> bool {
+        self.header.dtype.is_counts()
+    }
+
     pub fn path(&self) -> &Path {
         &self.path
     }

@@ -9,7 +9,7 @@ use ndarray::ArrayView2;
 use super::header::WRITTEN_HEADER;
 use super::{Dtype, Error, Header};
 
-/// Writes joules frame by frame. The file is a valid npy at every moment: a frame's bytes go out before the
+/// Writes joules, or counts of 16 bits, frame by frame. The file is a valid npy at every moment: a frame's bytes go out before the
 /// header counts them, so that a killed process loses at most the frame it was writing.
 #[derive(Debug)]
 pub struct Writer {
@@ -25,11 +25,26 @@ impl Writer {
         Self::create_with(File::create(&path), path.as_ref(), shape)
     }
 
+    /// Creates (or replaces) a file of counts from 0 to 65535.
+    pub fn create_counts(path: impl AsRef<Path>, shape: (usize, usize)) -> Result<Self, Error> {
+        let counts = Dtype::U2 { big: false };
+        Self::create_of(counts, File::create(&path), path.as_ref(), shape)
+    }
+
     /// Writes to a file just opened, empty, at `path`.
-    pub fn create_with(file: std::io::Result<File>, path: &Path, (ny, nx): (usize, usize)) -> Result<Self, Error> {
+    pub fn create_with(file: std::io::Result<File>, path: &Path, shape: (usize, usize)) -> Result<Self, Error> {
+        Self::create_of(Dtype::JOULES, file, path, shape)
+    }
+
+    fn create_of(
+        dtype: Dtype,
+        file: std::io::Result<File>,
+        path: &Path,
+        (ny, nx): (usize, usize),
+    ) -> Result<Self, Error> {
         let path = path.to_owned();
         let header = Header {
-            dtype: Dtype::JOULES,
+            dtype,
             frames: 0,
             ny,
             nx,
@@ -77,7 +92,12 @@ impl Writer {
             });
         }
         self.bytes.clear();
-        self.bytes.extend(pixels.iter().flat_map(|v| v.to_le_bytes()));
+        match self.header.dtype {
+            Dtype::U2 { .. } => self
+                .bytes
+                .extend(pixels.iter().flat_map(|v| (v.round() as u16).to_le_bytes())),
+            _ => self.bytes.extend(pixels.iter().flat_map(|v| v.to_le_bytes())),
+        }
         self.append().map_err(|source| {
             // A partial frame that cannot be truncated is harmless: the header does not count it.
             let _ = self.file.set_len(self.end_of(self.header.frames));

@@ -12,6 +12,7 @@ mod tape;
 pub use config::Config;
 pub use evidence::{Evidence, EvidenceFrame, file_name as evidence_file_name, frame_at};
 pub(super) use player::Player;
+pub use ring::frame_files;
 pub(super) use ring::recordings;
 pub(super) use tape::index_of;
 

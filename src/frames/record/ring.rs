@@ -18,6 +18,14 @@ pub(in crate::frames) fn recordings(folder: &Path) -> io::Result<Vec<PathBuf>> {
     Ok(found)
 }
 
+/// The frame files behind a path: the recordings of a folder, oldest first, or the file itself.
+pub fn frame_files(path: &Path) -> io::Result<Vec<PathBuf>> {
+    match path.is_dir() {
+        true => recordings(path),
+        false => Ok(vec![path.to_owned()]),
+    }
+}
+
 /// The number of the next file in a folder.
 pub(super) fn next_number(folder: &Path) -> io::Result<u64> {
     let number = |path: &PathBuf| path.file_name()?.to_str()?.split_once('-')?.0.parse::<u64>().ok();

@@ -2,7 +2,9 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::image::{PixelFormat, Region};
+use super::format::PixelFormat;
+use super::image::{Bayer, Decoding, Region};
+use super::response::{Response, Transfer};
 use crate::frames::Error;
 use crate::toml_file::Key;
 
@@ -10,9 +12,10 @@ use crate::toml_file::Key;
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Config {
-    /// "GREY", "Y10", "Y12", "Y16" or "Y16_BE"; the deepest on offer when left out.
+    /// A name that `oapwatch devices` lists; the best on offer when left out.
     pub pixel_format: Option<PixelFormat>,
-    /// [width, height] of the camera's image.
+    /// [width, height] of the camera's image. When left out: with `roi` as the camera stands, otherwise the best size that
+    /// is a whole multiple of `optics.pixels`, or as the camera stands where it lists none.
     pub size: Option<[u32; 2]>,
     /// [x, y, width, height] of the part that is the photodetector array, in camera pixels; the whole image when
     /// left out. Its size must be a whole multiple of `optics.pixels`: blocks of camera pixels are summed.
@@ -23,10 +26,21 @@ pub struct Config {
     pub flip_y: bool,
     /// Exposure time; automatic exposure is switched off.
     pub exposure_us: Option<f64>,
+    /// Our own control of the exposure, between a sixteenth of `exposure_us` and all of it: the brightest beam stays below saturation.
+    /// Energies are those of `exposure_us`.
+    pub auto_exposure: bool,
     /// Gain in the driver's own unit; automatic gain is switched off.
     pub gain: Option<i64>,
     /// A camera pixel at or above this count is saturated; the format's largest count when left out.
     pub saturation_counts: Option<u16>,
+    /// Counts of a camera pixel without light, taken off each (after `transfer`).
+    pub black_counts: f64,
+    /// Pixels behind a Bayer filter: summed 2 × 2, or each a sample.
+    pub bayer: Bayer,
+    /// Curve of a video signal's counts, undone before pixels are summed.
+    pub transfer: Transfer,
+    /// A video signal with black at 16 and white at 235 of 255.
+    pub limited_range: bool,
     /// Frames to skip after each start, until the settings take effect.
     pub settle_frames: u32,
     /// Without a usable frame for this long the device is reopened, s.
@@ -44,6 +58,10 @@ impl Config {
                 "V4L2 counts in 100 µs; no camera exposes for minutes",
             )?;
         }
+        if self.auto_exposure && self.exposure_us.is_none() {
+            let expected = "a number of µs with auto_exposure = true: the longest exposure, to which energies refer";
+            return Err(key.at("exposure_us").refuse(expected, "nothing").into());
+        }
         let reason = "more would skip minutes of frames";
         key.at("settle_frames")
             .within(self.settle_frames.into(), 0.0..=10_000.0, reason)?;
@@ -55,13 +73,31 @@ impl Config {
         if let Some(size) = self.size.filter(|size| size.contains(&0)) {
             return Err(key.at("size").refuse("a width and a height of at least 1", size).into());
         }
+        key.at("black_counts")
+            .within(self.black_counts, 0.0..=65535.0, "a level that 16 bits hold")?;
         if self.saturation_counts == Some(0) {
             return Err(key.at("saturation_counts").refuse("1 to 65535", 0).into());
         }
         Ok(())
     }
 
-    pub(super) fn region(&self) -> Option<Region> {
+    /// How an image becomes an array of (Ny, Nx) pixels.
+    pub(super) fn decoding(&self, shape: (usize, usize)) -> Decoding {
+        Decoding {
+            region: self.region(),
+            shape,
+            flip: [self.flip_x, self.flip_y],
+            saturation: self.saturation_counts,
+            response: Response {
+                transfer: self.transfer,
+                limited_range: self.limited_range,
+            },
+            black: self.black_counts,
+            bayer: self.bayer,
+        }
+    }
+
+    fn region(&self) -> Option<Region> {
         self.roi.map(|[x, y, width, height]| Region { x, y, width, height })
     }
 }
@@ -75,8 +111,13 @@ impl Default for Config {
             flip_x: false,
             flip_y: false,
             exposure_us: None,
+            auto_exposure: false,
             gain: None,
             saturation_counts: None,
+            black_counts: 0.0,
+            bayer: Bayer::default(),
+            transfer: Transfer::default(),
+            limited_range: false,
             settle_frames: 2,
             stall_s: 3.0,
         }

@@ -12,6 +12,8 @@ pub enum Fault {
     /// The driver flags the frame as corrupt.
     ErrorFlag,
     ShortFrame,
+    /// A JPEG image that is truncated, damaged or of another size.
+    DamagedImage,
     /// A frame from before the stream was started, or from before the settings took effect.
     StaleFrame,
     /// A time stamp on an unknown clock; the time of arrival is used.
@@ -39,10 +41,11 @@ pub enum Fault {
 }
 
 impl Fault {
-    const ALL: [Self; 16] = [
+    const ALL: [Self; 17] = [
         Self::SequenceGap,
         Self::ErrorFlag,
         Self::ShortFrame,
+        Self::DamagedImage,
         Self::StaleFrame,
         Self::TimestampUnknown,
         Self::TimestampImplausible,
@@ -63,6 +66,7 @@ impl Fault {
             Self::SequenceGap => "sequence_gap",
             Self::ErrorFlag => "error_flag",
             Self::ShortFrame => "short_frame",
+            Self::DamagedImage => "damaged_image",
             Self::StaleFrame => "stale_frame",
             Self::TimestampUnknown => "timestamp_unknown",
             Self::TimestampImplausible => "timestamp_implausible",

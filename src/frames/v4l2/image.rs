@@ -1,70 +1,13 @@
 //! Decodes a camera image into the photodetector array: pure functions.
 
+use std::sync::Arc;
+
 use ndarray::Array2;
 use serde::{Deserialize, Serialize};
 
-/// Grey formats of one value a pixel.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub enum PixelFormat {
-    GREY,
-    Y10,
-    Y12,
-    Y16,
-    #[serde(rename = "Y16_BE")]
-    Y16Be,
-}
-
-impl PixelFormat {
-    /// Deepest first: the order of preference when none is configured.
-    pub const ALL: [Self; 5] = [Self::Y16, Self::Y16Be, Self::Y12, Self::Y10, Self::GREY];
-
-    /// The kernel's code. Big-endian formats carry bit 31.
-    pub fn fourcc(self) -> u32 {
-        let code = |name: [u8; 4]| u32::from_le_bytes(name);
-        match self {
-            Self::GREY => code(*b"GREY"),
-            Self::Y10 => code(*b"Y10 "),
-            Self::Y12 => code(*b"Y12 "),
-            Self::Y16 => code(*b"Y16 "),
-            Self::Y16Be => code(*b"Y16 ") | 1 << 31,
-        }
-    }
-
-    pub fn from_fourcc(fourcc: u32) -> Option<Self> {
-        Self::ALL.into_iter().find(|f| f.fourcc() == fourcc)
-    }
-
-    pub fn bytes_per_pixel(self) -> usize {
-        match self {
-            Self::GREY => 1,
-            Self::Y10 | Self::Y12 | Self::Y16 | Self::Y16Be => 2,
-        }
-    }
-
-    /// The largest count a pixel can hold.
-    pub fn full_scale(self) -> u16 {
-        match self {
-            Self::GREY => 0xff,
-            Self::Y10 => 0x3ff,
-            Self::Y12 => 0xfff,
-            Self::Y16 | Self::Y16Be => 0xffff,
-        }
-    }
-}
-
-/// A four-character code as text.
-pub fn fourcc_name(fourcc: u32) -> String {
-    let bytes = (fourcc & !(1 << 31)).to_le_bytes();
-    let name: String = bytes
-        .iter()
-        .map(|b| char::from(*b))
-        .filter(|c| c.is_ascii_graphic())
-        .collect();
-    match fourcc >> 31 {
-        0 => name,
-        _ => name + "_BE",
-    }
-}
+use super::format::{Encoding, Light, PixelFormat};
+use super::response::Response;
+use super::{jpeg, unpack};
 
 /// Part of a camera image, in camera pixels.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -75,16 +18,67 @@ pub struct Region {
     pub height: usize,
 }
 
+/// What becomes of the pixels behind a Bayer filter.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Bayer {
+    /// Sums of 2 × 2, one of each colour and two green: the same for light of every wavelength.
+    #[default]
+    Binned,
+    /// Each pixel as a sample of its own: twice as fine. Right for near infrared, to which the colours are alike, and after a
+    /// calibration with the light in use.
+    Sites,
+}
+
 /// How a camera image becomes the array: a region, cut into Ny × Nx equal blocks whose counts are summed.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Debug)]
 pub struct Layout {
-    format: PixelFormat,
-    stride: usize,
+    granted: Granted,
     region: Region,
     shape: (usize, usize),
     flip: [bool; 2],
     /// A camera pixel at or above this count is saturated.
     saturation: u16,
+    /// Counts in proportion to light, where the camera's are not.
+    linear: Option<Arc<[f64]>>,
+    /// Of an array pixel without light.
+    black: f64,
+}
+
+/// How to cut and count an image.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Decoding {
+    /// The whole image when left out.
+    pub region: Option<Region>,
+    /// The array's (Ny, Nx).
+    pub shape: (usize, usize),
+    /// Mirrors x and y, for a camera whose first column or row is not the array's minimum.
+    pub flip: [bool; 2],
+    /// White of the format when left out.
+    pub saturation: Option<u16>,
+    pub response: Response,
+    /// Counts of a camera pixel without light, taken off.
+    pub black: f64,
+    pub bayer: Bayer,
+}
+
+/// The array's counts, shape (Ny, Nx).
+#[derive(Clone, Debug, PartialEq)]
+pub struct Counts {
+    pub counts: Array2<f64>,
+    /// Where at least one of the camera pixels was saturated.
+    pub saturated: Option<Array2<bool>>,
+    /// The brightest camera pixel, as a share of saturation.
+    pub brightest: f64,
+}
+
+/// Why an image gives no counts.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum DecodeError {
+    #[error("{found} bytes, expected {needed}")]
+    Short { found: usize, needed: usize },
+    #[error("{0}")]
+    Jpeg(String),
 }
 
 /// Why a camera image cannot become the array.
@@ -108,8 +102,13 @@ pub enum LayoutError {
         nx: usize,
         ny: usize,
     },
-    #[error("the driver reports rows of {stride} bytes for {width} pixels of {bytes} bytes")]
-    Stride { stride: usize, width: usize, bytes: usize },
+    #[error(
+        "a Bayer image is summed 2 × 2 by 2 × 2, and {bin_x} × {bin_y} camera pixels make one of the array: set an even multiple in \
+         source.v4l2.roi, or source.v4l2.bayer = \"sites\""
+    )]
+    SplitsBayer { bin_x: usize, bin_y: usize },
+    #[error("the driver reports rows of {stride} bytes for {width} pixels, which take {needed}")]
+    Stride { stride: usize, width: usize, needed: usize },
 }
 
 /// The granted image format, as far as decoding needs it.
@@ -123,31 +122,22 @@ pub struct Granted {
 }
 
 impl Layout {
-    /// `shape` is the array's (Ny, Nx); without a region the whole image is used. `flip` mirrors x and y, for a
-    /// camera whose first column or row is not the array's minimum.
-    pub fn new(
-        granted: Granted,
-        region: Option<Region>,
-        shape: (usize, usize),
-        flip: [bool; 2],
-        saturation: Option<u16>,
-    ) -> Result<Self, LayoutError> {
+    /// # Errors
+    /// The image cannot be cut as asked.
+    pub fn new(granted: Granted, decoding: &Decoding) -> Result<Self, LayoutError> {
         let Granted {
-            format,
-            width,
-            height,
-            stride,
+            format, width, height, ..
         } = granted;
-        let row = width * format.bytes_per_pixel();
-        let stride = if stride == 0 { row } else { stride };
-        if stride < row {
-            return Err(LayoutError::Stride {
-                stride,
-                width,
-                bytes: format.bytes_per_pixel(),
-            });
+        let needed = format.encoding().bytes_for(width);
+        // A JPEG image has no rows of its own.
+        let stride = match granted.stride {
+            stride if stride == 0 || format.is_compressed() => needed,
+            stride => stride,
+        };
+        if stride < needed {
+            return Err(LayoutError::Stride { stride, width, needed });
         }
-        let region = region.unwrap_or(Region {
+        let region = decoding.region.unwrap_or(Region {
             x: 0,
             y: 0,
             width,
@@ -170,7 +160,7 @@ impl Layout {
                 of_y: height,
             });
         }
-        let (ny, nx) = shape;
+        let (ny, nx) = decoding.shape;
         if w == 0 || h == 0 || w % nx != 0 || h % ny != 0 {
             return Err(LayoutError::NotDivisible {
                 width: w,
@@ -179,20 +169,33 @@ impl Layout {
                 ny,
             });
         }
+        // Any 2 × 2 pixels hold each colour, wherever they begin.
+        let (bin_x, bin_y) = (w / nx, h / ny);
+        if format.light() == Light::Bayer && decoding.bayer == Bayer::Binned && (bin_x % 2 != 0 || bin_y % 2 != 0) {
+            return Err(LayoutError::SplitsBayer { bin_x, bin_y });
+        }
+        let full_scale = format.full_scale();
+        let (_, white) = decoding.response.range(full_scale);
         Ok(Self {
-            format,
-            stride,
+            granted: Granted { stride, ..granted },
             region,
-            shape,
-            flip,
-            saturation: saturation.unwrap_or(u16::MAX).min(format.full_scale()),
+            shape: decoding.shape,
+            flip: decoding.flip,
+            saturation: decoding.saturation.unwrap_or(white as u16).min(full_scale),
+            linear: decoding.response.table(full_scale).map(Arc::from),
+            black: decoding.black * (bin_x * bin_y) as f64,
         })
     }
 
     /// Bytes that an image must have at least.
     pub fn bytes_needed(&self) -> usize {
         let Region { x, y, width, height } = self.region;
-        (y + height - 1) * self.stride + (x + width) * self.format.bytes_per_pixel()
+        let encoding = self.granted.format.encoding();
+        (y + height - 1) * self.granted.stride + encoding.bytes_for(x + width)
+    }
+
+    pub fn region(&self) -> Region {
+        self.region
     }
 
     /// Camera pixels summed into one pixel of the array.
@@ -200,51 +203,62 @@ impl Layout {
         (self.region.width / self.shape.1) * (self.region.height / self.shape.0)
     }
 
-    /// Counts of the array, shape (Ny, Nx), and where at least one of the camera pixels was saturated. `None`
-    /// when the image is too short. The sums are exact: at most 2²⁴ pixels of 16 bits fit f64's 53.
-    pub fn decode(&self, image: &[u8]) -> Option<(Array2<f64>, Option<Array2<bool>>)> {
-        if image.len() < self.bytes_needed() {
-            return None;
+    /// The array's counts. Sums of counts that are not linearised are exact: at most 2²⁴ pixels of 16 bits fit f64's 53.
+    ///
+    /// # Errors
+    /// The image is too short, or no JPEG image of the granted size.
+    pub fn decode(&self, image: &[u8]) -> Result<Counts, DecodeError> {
+        let Granted {
+            format, width, height, ..
+        } = self.granted;
+        if format.is_compressed() {
+            let luma = jpeg::luma(image, width, height).map_err(DecodeError::Jpeg)?;
+            return Ok(self.bin(format.encoding(), &luma));
         }
-        match self.format {
-            PixelFormat::GREY => Some(self.bin(image, |[b]: [u8; 1]| b.into())),
-            PixelFormat::Y10 | PixelFormat::Y12 => {
-                // The bits above the format's depth are undefined.
-                let mask = self.format.full_scale();
-                Some(self.bin(image, |b| u16::from_le_bytes(b) & mask))
-            }
-            PixelFormat::Y16 => Some(self.bin(image, u16::from_le_bytes)),
-            PixelFormat::Y16Be => Some(self.bin(image, u16::from_be_bytes)),
+        let (found, needed) = (image.len(), self.bytes_needed());
+        match found < needed {
+            true => Err(DecodeError::Short { found, needed }),
+            false => Ok(self.bin(format.encoding(), image)),
         }
     }
 
-    fn bin<const N: usize>(&self, image: &[u8], count: impl Fn([u8; N]) -> u16) -> (Array2<f64>, Option<Array2<bool>>) {
+    fn bin(&self, encoding: Encoding, image: &[u8]) -> Counts {
         let (ny, nx) = self.shape;
         let Region { x, y, width, height } = self.region;
         let (bin_x, bin_y) = (width / nx, height / ny);
-        let mut sums = Array2::zeros(self.shape);
+        let mut counts = Array2::zeros(self.shape);
         let mut saturated: Option<Array2<bool>> = None;
+        let mut brightest = 0;
+        let mut samples = Vec::with_capacity(width + 4);
         for row in 0..height {
-            let start = (y + row) * self.stride + x * N;
-            let pixels = image[start..start + width * N].as_chunks::<N>().0;
+            let line = &image[(y + row) * self.granted.stride..];
+            unpack::unpack(encoding, line, x, width, &mut samples);
             let to_y = match self.flip[1] {
                 false => row / bin_y,
                 true => ny - 1 - row / bin_y,
             };
-            for (bin, block) in pixels.chunks_exact(bin_x).enumerate() {
+            for (bin, block) in samples.chunks_exact(bin_x).enumerate() {
                 let to_x = if self.flip[0] { nx - 1 - bin } else { bin };
-                let mut sum = 0u64;
-                for pixel in block {
-                    let value = count(*pixel);
-                    sum += u64::from(value);
-                    if value >= self.saturation {
-                        saturated.get_or_insert_with(|| Array2::from_elem(self.shape, false))[[to_y, to_x]] = true;
-                    }
+                counts[[to_y, to_x]] += match &self.linear {
+                    None => block.iter().map(|s| u64::from(*s)).sum::<u64>() as f64,
+                    Some(table) => block.iter().map(|s| table[usize::from(*s)]).sum::<f64>(),
+                };
+                let most = block.iter().copied().max().unwrap_or_default();
+                brightest = brightest.max(most);
+                if most >= self.saturation {
+                    saturated.get_or_insert_with(|| Array2::from_elem(self.shape, false))[[to_y, to_x]] = true;
                 }
-                sums[[to_y, to_x]] += sum as f64;
             }
         }
-        (sums, saturated)
+        if self.black != 0.0 {
+            counts -= self.black;
+        }
+        let brightest = f64::from(brightest) / f64::from(self.saturation);
+        Counts {
+            counts,
+            saturated,
+            brightest,
+        }
     }
 }
 
@@ -272,6 +286,7 @@ mod tests {
     use ndarray::array;
 
     use super::*;
+    use crate::frames::v4l2::Transfer;
 
     fn granted(format: PixelFormat, width: usize, height: usize, stride: usize) -> Granted {
         Granted {
@@ -282,28 +297,15 @@ mod tests {
         }
     }
 
-    fn whole(format: PixelFormat, shape: (usize, usize)) -> Layout {
-        Layout::new(granted(format, shape.1, shape.0, 0), None, shape, [false; 2], None).unwrap()
+    fn whole(shape: (usize, usize)) -> Decoding {
+        Decoding {
+            shape,
+            ..Decoding::default()
+        }
     }
 
-    #[test]
-    fn every_format_decodes_its_counts() {
-        let le = [0x34, 0xf2, 0x01, 0x00];
-        let cases = [
-            (PixelFormat::GREY, &le[..2], array![[52.0, 242.0]]),
-            (PixelFormat::Y10, &le[..], array![[564.0, 1.0]]),
-            (PixelFormat::Y12, &le[..], array![[564.0, 1.0]]),
-            (PixelFormat::Y16, &le[..], array![[62004.0, 1.0]]),
-            (PixelFormat::Y16Be, &le[..], array![[13554.0, 256.0]]),
-        ];
-        for (format, bytes, expected) in cases {
-            let (counts, saturated) = whole(format, (1, 2)).decode(bytes).unwrap();
-            assert_eq!(counts, expected, "{format:?}");
-            assert!(saturated.is_none());
-            assert_eq!(PixelFormat::from_fourcc(format.fourcc()), Some(format));
-        }
-        assert_eq!(fourcc_name(PixelFormat::Y16Be.fourcc()), "Y16_BE");
-        assert_eq!(fourcc_name(PixelFormat::Y10.fourcc()), "Y10");
+    fn counts(granted: Granted, decoding: &Decoding, image: &[u8]) -> Counts {
+        Layout::new(granted, decoding).unwrap().decode(image).unwrap()
     }
 
     #[test]
@@ -315,30 +317,35 @@ mod tests {
                 image[7 * y + x] = (10 * y + x) as u8;
             }
         }
-        let roi = Region {
+        let region = Some(Region {
             x: 1,
             y: 2,
             width: 4,
             height: 2,
+        });
+        let decoding = Decoding {
+            region,
+            ..whole((1, 2))
         };
-        let layout = Layout::new(granted(PixelFormat::GREY, 5, 4, 7), Some(roi), (1, 2), [false; 2], None).unwrap();
+        let layout = Layout::new(granted(PixelFormat::GREY, 5, 4, 7), &decoding).unwrap();
+        let darker = Decoding { black: 2.5, ..decoding };
+        let darker = counts(granted(PixelFormat::GREY, 5, 4, 7), &darker, &image).counts;
+        assert_eq!(layout.decode(&image).unwrap().counts - darker, array![[10.0, 10.0]]);
         assert_eq!(layout.binned(), 4);
-        let (counts, _) = layout.decode(&image).unwrap();
-        assert_eq!(counts, array![[21.0 + 22.0 + 31.0 + 32.0, 23.0 + 24.0 + 33.0 + 34.0]]);
+        let expected = array![[21.0 + 22.0 + 31.0 + 32.0, 23.0 + 24.0 + 33.0 + 34.0]];
+        assert_eq!(layout.decode(&image).unwrap().counts, expected);
         assert_eq!(layout.bytes_needed(), 3 * 7 + 5);
-        assert!(layout.decode(&image[..25]).is_none());
-        assert!(layout.decode(&image[..26]).is_some());
+        let short = DecodeError::Short { found: 25, needed: 26 };
+        assert_eq!(layout.decode(&image[..25]), Err(short));
+        assert!(layout.decode(&image[..26]).is_ok());
     }
 
     #[test]
     fn flips_mirror_the_array() {
         let granted = granted(PixelFormat::GREY, 2, 2, 2);
         let flipped = |flip| {
-            Layout::new(granted, None, (2, 2), flip, None)
-                .unwrap()
-                .decode(&[1, 2, 3, 4])
-                .unwrap()
-                .0
+            let decoding = Decoding { flip, ..whole((2, 2)) };
+            counts(granted, &decoding, &[1, 2, 3, 4]).counts
         };
         assert_eq!(flipped([true, false]), array![[2.0, 1.0], [4.0, 3.0]]);
         assert_eq!(flipped([false, true]), array![[3.0, 4.0], [1.0, 2.0]]);
@@ -346,8 +353,10 @@ mod tests {
 
     #[test]
     fn one_saturated_camera_pixel_saturates_its_array_pixel() {
-        let layout = Layout::new(granted(PixelFormat::GREY, 4, 1, 4), None, (1, 2), [false; 2], None).unwrap();
-        let (mut counts, saturated) = layout.decode(&[255, 0, 100, 101]).unwrap();
+        let layout = Layout::new(granted(PixelFormat::GREY, 4, 1, 4), &whole((1, 2))).unwrap();
+        let Counts {
+            mut counts, saturated, ..
+        } = layout.decode(&[255, 0, 100, 101]).unwrap();
         assert_eq!(saturated, Some(array![[true, false]]));
         let masked = to_joules(&mut counts.clone(), saturated.clone(), 0.5, None);
         assert_eq!(masked, Some(array![[true, false]]));
@@ -356,10 +365,40 @@ mod tests {
     }
 
     #[test]
+    fn colours_of_a_bayer_filter_are_summed_or_kept_apart() {
+        let image = [10, 200, 11, 201, 200, 90, 201, 91];
+        let bayer = granted(PixelFormat::RGGB, 4, 2, 4);
+        assert_eq!(counts(bayer, &whole((1, 2)), &image).counts, array![[500.0, 504.0]]);
+        let split = Layout::new(bayer, &whole((2, 4))).unwrap_err();
+        assert_eq!(split, LayoutError::SplitsBayer { bin_x: 1, bin_y: 1 });
+        let sites = Decoding {
+            bayer: Bayer::Sites,
+            ..whole((2, 4))
+        };
+        assert_eq!(counts(bayer, &sites, &image).counts[[1, 3]], 91.0);
+    }
+
+    #[test]
+    fn a_video_signal_is_linear_in_light_before_it_is_summed() {
+        let response = Response {
+            transfer: Transfer::Bt709,
+            limited_range: true,
+        };
+        let decoding = Decoding {
+            response,
+            ..whole((1, 1))
+        };
+        // Black and white of YUYV, which the average of the signals would not show.
+        let found = counts(granted(PixelFormat::YUYV, 2, 1, 4), &decoding, &[16, 128, 235, 128]);
+        assert!((found.counts[[0, 0]] - 255.0).abs() < 1e-9);
+        assert_eq!(found.saturated, Some(array![[true]]), "235 is white");
+    }
+
+    #[test]
     fn what_does_not_fit_is_refused() {
         let image = granted(PixelFormat::Y16, 640, 480, 1280);
         let region = |x, y, width, height| Some(Region { x, y, width, height });
-        let layout = |region, shape| Layout::new(image, region, shape, [false; 2], None);
+        let layout = |region, shape| Layout::new(image, &Decoding { region, ..whole(shape) });
         assert!(layout(region(96, 16, 448, 448), (64, 64)).is_ok());
         assert!(matches!(
             layout(None, (64, 64)),
@@ -377,8 +416,8 @@ mod tests {
         }
         let short_rows = granted(PixelFormat::Y16, 640, 480, 640);
         assert!(matches!(
-            Layout::new(short_rows, None, (60, 64), [false; 2], None),
-            Err(LayoutError::Stride { .. })
+            Layout::new(short_rows, &whole((60, 64))),
+            Err(LayoutError::Stride { needed: 1280, .. })
         ));
     }
 }

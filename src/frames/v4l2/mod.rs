@@ -4,14 +4,25 @@
 mod clock;
 mod config;
 mod devices;
+mod exposure_control;
 mod faults;
+mod format;
 mod image;
+mod jpeg;
+mod ranking;
+mod response;
 mod session;
 mod sys;
+mod unpack;
 
 pub use config::Config;
 pub use devices::{Device, DeviceFormat, devices};
-pub use image::{Granted, Layout, LayoutError, PixelFormat, Region, to_joules};
+pub use format::{Light, PixelFormat};
+pub use image::{Bayer, Counts, DecodeError, Decoding, Granted, Layout, LayoutError, Region, to_joules};
+pub use jpeg::{HuffmanTable, USUAL_HUFFMAN_TABLES, usual_tables};
+pub use ranking::{Offer, rank, why};
+pub use response::{Response, Transfer};
+pub use session::{Settings, StartError, probe};
 pub use sys::Sizes;
 
 use std::path::PathBuf;
@@ -26,6 +37,7 @@ use crate::metric;
 use crate::optics::Camera;
 use crate::toml_file::Key;
 use clock::{Moment, Numbering, Stamped, exposed, is_monotonic};
+use exposure_control::{Brightness, ExposureControl};
 use faults::{Fault, Faults};
 use session::Session;
 use sys::{Format, Meta};
@@ -45,8 +57,10 @@ pub struct V4l2 {
     silence: Duration,
     stall: Duration,
     shape: (usize, usize),
+    /// At `config.exposure_us`.
     joules_per_count: f64,
     saturation_j: Option<f64>,
+    control: Option<ExposureControl>,
     state: State,
     faults: Faults,
     numbering: Numbering,
@@ -77,6 +91,11 @@ impl V4l2 {
         if let Some(exposure) = config.exposure_us {
             positive("v4l2.exposure_us", exposure)?;
         }
+        if let Some(level) = camera.saturation_j.filter(|_| config.auto_exposure) {
+            let expected =
+                "nothing with source.v4l2.auto_exposure = true, whose frames saturate at one energy and another";
+            return Err(Key::new("optics").at("saturation_j").refuse(expected, level).into());
+        }
         metrics::gauge!(metric::SOURCE_CONNECTED).set(0.0);
         let now = Instant::now();
         Ok(Self {
@@ -90,6 +109,7 @@ impl V4l2 {
             shape: camera.shape(),
             joules_per_count: camera.joules_per_count.ok_or(Error::NoScale)?,
             saturation_j: camera.saturation_j,
+            control: None,
             state: State::Closed { retry_at: now },
             numbering: Numbering::default(),
             last_format: None,
@@ -98,6 +118,14 @@ impl V4l2 {
             last_told: now,
             retry: SHORTEST_RETRY,
         })
+    }
+
+    /// What the device is and how it stands, while it is open.
+    pub fn settings(&self) -> Option<&Settings> {
+        match &self.state {
+            State::Open { session, .. } => Some(session.settings()),
+            State::Closed { .. } => None,
+        }
     }
 
     fn close(&mut self, fault: Fault, why: impl std::fmt::Display) {
@@ -122,6 +150,10 @@ impl V4l2 {
                     self.faults
                         .count(Fault::FormatChanged, format_args!("from {before:?} to {format:?}"));
                 }
+                self.control = match (self.config.auto_exposure, session.settings().exposure) {
+                    (true, Some(exposure)) => Some(ExposureControl::new(1e6 * exposure.as_secs_f64())),
+                    _ => None,
+                };
                 self.numbering.restart();
                 self.last_usable = Instant::now();
                 metrics::counter!(metric::SOURCE_OPENED).increment(1);
@@ -167,11 +199,9 @@ impl V4l2 {
                 return None;
             }
         }
-        let layout = session.layout();
         let (started, exposure) = (session.started(), session.exposure());
-        let taken = session.next(|image, meta| (layout.decode(image), image.len(), *meta));
-        match taken {
-            Ok(Some((decoded, length, meta))) => {
+        match session.next() {
+            Ok(Some((decoded, meta))) => {
                 let stale = is_monotonic(meta.flags) && meta.timestamp < started.monotonic;
                 if stale || *settling > 0 {
                     *settling = settling.saturating_sub(1);
@@ -182,7 +212,7 @@ impl V4l2 {
                     }
                     return None;
                 }
-                Some(self.take(decoded, length, layout.bytes_needed(), meta, exposure))
+                Some(self.take(decoded, meta, exposure))
             }
             // A stream in error is readable without a buffer; the next dequeue gives the error.
             Ok(None) => {
@@ -200,14 +230,7 @@ impl V4l2 {
         }
     }
 
-    fn take(
-        &mut self,
-        decoded: Option<(ndarray::Array2<f64>, Option<ndarray::Array2<bool>>)>,
-        length: usize,
-        needed: usize,
-        meta: Meta,
-        exposure: Duration,
-    ) -> Next {
+    fn take(&mut self, decoded: Result<Counts, DecodeError>, meta: Meta, exposure: Duration) -> Next {
         let (index, lost) = self.numbering.number(meta.sequence);
         if lost > 0 {
             metrics::counter!(metric::SOURCE_FRAMES_LOST).increment(lost);
@@ -218,16 +241,23 @@ impl V4l2 {
         }
         let time = self.time(&meta, exposure);
         let flagged = meta.flags & V4L2_BUF_FLAG_ERROR != 0;
-        let (mut pixels, saturated) = match decoded {
-            Some(decoded) if !flagged => decoded,
-            _ => {
-                let (fault, reason) = match flagged {
-                    true => (Fault::ErrorFlag, format!("the driver flags frame {index} as corrupt")),
-                    false => (
-                        Fault::ShortFrame,
-                        format!("frame {index} has {length} bytes, expected {needed}"),
-                    ),
+        let decoded = match flagged {
+            true => Err((Fault::ErrorFlag, format!("the driver flags frame {index} as corrupt"))),
+            false => decoded.map_err(|error| {
+                let fault = match error {
+                    DecodeError::Short { .. } => Fault::ShortFrame,
+                    DecodeError::Jpeg(_) => Fault::DamagedImage,
                 };
+                (fault, format!("frame {index}: {error}"))
+            }),
+        };
+        let Counts {
+            counts: mut pixels,
+            saturated,
+            brightest,
+        } = match decoded {
+            Ok(counts) => counts,
+            Err((fault, reason)) => {
                 self.faults.count(fault, &reason);
                 self.last_told = Instant::now();
                 return Next::Unusable {
@@ -238,7 +268,13 @@ impl V4l2 {
                 };
             }
         };
-        let masked = to_joules(&mut pixels, saturated, self.joules_per_count, self.saturation_j);
+        let scale = self.exposure_scale(exposure);
+        let frame = Brightness {
+            share: brightest,
+            is_saturated: saturated.is_some(),
+        };
+        self.control_exposure(index, frame);
+        let masked = to_joules(&mut pixels, saturated, self.joules_per_count * scale, self.saturation_j);
         self.last_usable = Instant::now();
         self.last_told = self.last_usable;
         self.retry = SHORTEST_RETRY;
@@ -249,6 +285,31 @@ impl V4l2 {
             masked,
         };
         Next::Frame(frame, Vec::new())
+    }
+
+    /// Configured exposure over a frame's own.
+    fn exposure_scale(&self, exposure: Duration) -> f64 {
+        match (&self.control, self.config.exposure_us) {
+            (Some(_), Some(configured_us)) if !exposure.is_zero() => configured_us / (1e6 * exposure.as_secs_f64()),
+            _ => 1.0,
+        }
+    }
+
+    /// Changes the exposure after a frame where the control says so. Frames are skipped until the change is in force, as after a start.
+    fn control_exposure(&mut self, index: u64, frame: Brightness) {
+        let State::Open { session, settling } = &mut self.state else {
+            return;
+        };
+        let Some((control, next_us)) = self.control.as_mut().and_then(|c| c.after(frame).map(|next| (c, next))) else {
+            return;
+        };
+        if let Some(granted) = session.set_exposure(next_us, &mut self.faults) {
+            let exposure_us = 1e6 * granted.as_secs_f64();
+            control.granted(exposure_us);
+            *settling = self.config.settle_frames.max(1);
+            let from_frame = index + 1 + u64::from(*settling);
+            tracing::info!(exposure_us, from_frame, brightest = frame.share, "the exposure changes");
+        }
     }
 
     /// The time of a frame; it increases from frame to frame unless the clock was set back.

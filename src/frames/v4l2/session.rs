@@ -9,8 +9,11 @@ use v4l::v4l_sys as c;
 use super::Config;
 use super::clock::Moment;
 use super::faults::{Fault, Faults};
-use super::image::{Granted, Layout, LayoutError, PixelFormat, fourcc_name};
-use super::sys::{Format, Meta, Node, Stream};
+use super::format::{Light, PixelFormat, fourcc_name};
+use super::image::{Counts, DecodeError, Granted, Layout, LayoutError};
+use super::ranking::{Offer, rank};
+use super::response::{Response, Transfer};
+use super::sys::{Colour, Format, Meta, Node, Stream};
 
 /// Buffers requested: enough for a scheduling delay of a few frames.
 const BUFFERS: u32 = 4;
@@ -48,7 +51,22 @@ pub struct Session {
     layout: Layout,
     granted: Format,
     started: Moment,
-    exposure: Duration,
+    settings: Settings,
+}
+
+/// What a device is and how it stands after its start.
+#[derive(Clone, Debug)]
+pub struct Settings {
+    pub card: String,
+    pub driver: String,
+    pub image: Granted,
+    /// The curve that the driver names; a driver that names none means that of the colour space.
+    pub response: Response,
+    /// As the device reports it, where it does.
+    pub rate_hz: Option<f64>,
+    /// As asked for and granted; `None` as the driver has it.
+    pub exposure: Option<Duration>,
+    pub gain: Option<i64>,
 }
 
 impl Session {
@@ -59,30 +77,13 @@ impl Session {
         shape: (usize, usize),
         faults: &mut Faults,
     ) -> Result<Self, StartError> {
-        let io = |call| move |source| StartError::Io { call, source };
-        let node = Node::open(device).map_err(io("open"))?;
+        let node = open(device)?;
         let capability = node.capability().clone();
-        if !(capability.captures && capability.streams) {
-            return Err(StartError::NoCapture {
-                card: capability.card,
-                driver: capability.driver,
-            });
-        }
-        let (granted, format) = negotiate(&node, config)?;
-        let layout = Layout::new(
-            Granted {
-                format,
-                width: granted.width as usize,
-                height: granted.height as usize,
-                stride: granted.stride as usize,
-            },
-            config.region(),
-            shape,
-            [config.flip_x, config.flip_y],
-            config.saturation_counts,
-        )?;
+        let (granted, format) = negotiate(&node, config, rate_hz, Some(shape))?;
+        let image = Granted::of(granted, format);
+        let layout = Layout::new(image, &config.decoding(shape))?;
         let granted_rate_hz = set_rate(&node, rate_hz, faults);
-        let exposure = set_exposure(&node, config, faults);
+        let exposure = config.exposure_us.and_then(|us| set_exposure(&node, us, faults));
         let gain = set_gain(&node, config, faults);
         tracing::info!(
             device = %device.display(),
@@ -103,11 +104,19 @@ impl Session {
         );
         let started = Moment::now();
         Ok(Self {
-            stream: Stream::start(node, BUFFERS).map_err(io("start"))?,
+            stream: Stream::start(node, BUFFERS).map_err(|source| StartError::Io { call: "start", source })?,
             layout,
             granted,
             started,
-            exposure: exposure.unwrap_or_default(),
+            settings: Settings {
+                card: capability.card,
+                driver: capability.driver,
+                image,
+                response: response_of(granted.colour, format),
+                rate_hz: granted_rate_hz,
+                exposure,
+                gain,
+            },
         })
     }
 
@@ -115,12 +124,23 @@ impl Session {
         self.stream.wait(patience)
     }
 
-    pub fn next<T>(&mut self, look: impl FnOnce(&[u8], &Meta) -> T) -> io::Result<Option<T>> {
-        self.stream.next(look)
+    /// The next frame's counts; `None` when there is no frame.
+    pub fn next(&mut self) -> io::Result<Option<(Result<Counts, DecodeError>, Meta)>> {
+        let layout = &self.layout;
+        self.stream.next(|image, meta| (layout.decode(image), *meta))
     }
 
-    pub fn layout(&self) -> Layout {
-        self.layout
+    /// Sets another exposure while frames come, and gives what the device then reports.
+    pub fn set_exposure(&mut self, asked_us: f64, faults: &mut Faults) -> Option<Duration> {
+        let granted = set_exposure(self.stream.node(), asked_us, faults);
+        if granted.is_some() {
+            self.settings.exposure = granted;
+        }
+        granted
+    }
+
+    pub fn settings(&self) -> &Settings {
+        &self.settings
     }
 
     pub fn granted(&self) -> Format {
@@ -132,41 +152,140 @@ impl Session {
     }
 
     pub fn exposure(&self) -> Duration {
-        self.exposure
+        self.settings.exposure.unwrap_or_default()
     }
 }
 
-/// The format that the driver really granted, if it is one we can use and as big as the config says.
-fn negotiate(node: &Node, config: &Config) -> Result<(Format, PixelFormat), StartError> {
-    let io = |call| move |source| StartError::Io { call, source };
-    let offered = node.formats();
-    let format = config.pixel_format.or_else(|| {
-        PixelFormat::ALL
-            .into_iter()
-            .find(|f| offered.iter().any(|o| o.fourcc == f.fourcc()))
-    });
-    let current = node.format().map_err(io("get format"))?;
-    let [width, height] = config.size.unwrap_or([current.width, current.height]);
-    let fourcc = format.map_or(current.fourcc, PixelFormat::fourcc);
-    let asked = Format {
-        fourcc,
-        width,
-        height,
-        ..current
+impl Granted {
+    fn of(granted: Format, format: PixelFormat) -> Self {
+        Self {
+            format,
+            width: granted.width as usize,
+            height: granted.height as usize,
+            stride: granted.stride as usize,
+        }
+    }
+}
+
+/// The curve of a video signal by the driver's word (the kernel's videodev2.h, V4L2_MAP_XFER_FUNC_DEFAULT and
+/// V4L2_MAP_QUANTIZATION_DEFAULT). Raw formats have none.
+fn response_of(colour: Colour, format: PixelFormat) -> Response {
+    const JPEG: u32 = 7;
+    const SRGB: u32 = 8;
+    const RAW: u32 = 11;
+    const FULL_RANGE: u32 = 1;
+    if format.light() != Light::Luma {
+        return Response::default();
+    }
+    let transfer = match (colour.transfer, colour.space) {
+        (5, _) | (0, RAW) => Transfer::Linear,
+        (2, _) | (0, JPEG | SRGB) => Transfer::Srgb,
+        _ => Transfer::Bt709,
     };
+    let is_full = match colour.quantisation {
+        0 => colour.space == JPEG,
+        quantisation => quantisation == FULL_RANGE,
+    };
+    Response {
+        transfer,
+        // JPEG has no other range.
+        limited_range: !is_full && !format.is_compressed(),
+    }
+}
+
+/// A node that captures.
+fn open(device: &Path) -> Result<Node, StartError> {
+    let node = Node::open(device).map_err(|source| StartError::Io { call: "open", source })?;
+    let capability = node.capability();
+    match capability.captures && capability.streams {
+        true => Ok(node),
+        false => Err(StartError::NoCapture {
+            card: capability.card.clone(),
+            driver: capability.driver.clone(),
+        }),
+    }
+}
+
+/// The image that a device would give, for a config that does not name the array's pixels yet.
+pub fn probe(device: &Path, config: &Config, rate_hz: f64) -> Result<Granted, StartError> {
+    let (granted, format) = negotiate(&open(device)?, config, rate_hz, None)?;
+    Ok(Granted::of(granted, format))
+}
+
+/// What a node offers and can be used, the best first. `wished` is taken where the node lists no sizes or a range of them.
+pub(super) fn offers(node: &Node, wished: [u32; 2], rate_hz: f64) -> Vec<Offer> {
+    let mut offers = Vec::new();
+    for format in node.formats() {
+        let Some(format) = PixelFormat::from_fourcc(format.fourcc) else {
+            continue;
+        };
+        let listed = node.sizes(format.fourcc());
+        let mut sizes: Vec<[u32; 2]> = match listed.is_empty() {
+            true => vec![wished],
+            false => listed.iter().map(|sizes| sizes.choice(wished)).collect(),
+        };
+        sizes.dedup();
+        offers.extend(sizes.into_iter().map(|size| Offer {
+            format,
+            size,
+            rate_hz: node.fastest_hz(format.fourcc(), size),
+        }));
+    }
+    rank(&mut offers, rate_hz);
+    offers
+}
+
+/// The format that the driver really granted, if it is one we can use and as big as the config says.
+fn negotiate(
+    node: &Node,
+    config: &Config,
+    rate_hz: f64,
+    shape: Option<(usize, usize)>,
+) -> Result<(Format, PixelFormat), StartError> {
+    let io = |call| move |source| StartError::Io { call, source };
+    let current = node.format().map_err(io("get format"))?;
+    let asked = choose(node, config, rate_hz, shape, current);
     let granted = node.set_format(asked).map_err(io("set format"))?;
-    let size_differs = config.size.is_some() && [granted.width, granted.height] != [width, height];
+    let size_differs = config.size.is_some() && [granted.width, granted.height] != [asked.width, asked.height];
     match PixelFormat::from_fourcc(granted.fourcc) {
-        Some(usable) if granted.fourcc == fourcc && !size_differs => Ok((granted, usable)),
+        Some(usable) if granted.fourcc == asked.fourcc && !size_differs => Ok((granted, usable)),
         _ => {
             let name = |f: Format| format!("{} {} × {}", fourcc_name(f.fourcc), f.width, f.height);
-            let names: Vec<_> = offered.iter().map(|o| fourcc_name(o.fourcc)).collect();
+            let names: Vec<_> = node.formats().iter().map(|o| fourcc_name(o.fourcc)).collect();
             Err(StartError::FormatRefused {
                 asked: name(asked),
                 granted: name(granted),
                 offered: names.join(", "),
             })
         }
+    }
+}
+
+/// The best of what a node offers within the config. A region of interest belongs to one size: without `size`, that in use.
+fn choose(node: &Node, config: &Config, rate_hz: f64, shape: Option<(usize, usize)>, current: Format) -> Format {
+    let in_use = [current.width, current.height];
+    let only = config.size.or(config.roi.map(|_| in_use));
+    let mut listed = offers(node, only.unwrap_or(in_use), rate_hz);
+    listed.retain(|o| config.pixel_format.is_none_or(|f| o.format == f));
+    let format = listed.first().map(|o| o.format).or(config.pixel_format);
+    listed.retain(|o| only.is_none_or(|size| o.size == size));
+    let fits = |offer: &&Offer| {
+        let image = Granted {
+            format: offer.format,
+            width: offer.size[0] as usize,
+            height: offer.size[1] as usize,
+            stride: 0,
+        };
+        shape.is_none_or(|shape| Layout::new(image, &config.decoding(shape)).is_ok())
+    };
+    let best = listed.iter().find(fits).or(listed.first());
+    let [width, height] = best.map_or(only.unwrap_or(in_use), |o| o.size);
+    let format = best.map(|o| o.format).or(format);
+    Format {
+        fourcc: format.map_or(current.fourcc, PixelFormat::fourcc),
+        width,
+        height,
+        ..current
     }
 }
 
@@ -182,10 +301,9 @@ fn set_rate(node: &Node, asked_hz: f64, faults: &mut Faults) -> Option<f64> {
 }
 
 /// Fixes the exposure time and gives what the device then reports.
-fn set_exposure(node: &Node, config: &Config, faults: &mut Faults) -> Option<Duration> {
+fn set_exposure(node: &Node, asked: f64, faults: &mut Faults) -> Option<Duration> {
     /// The unit of V4L2_CID_EXPOSURE_ABSOLUTE.
     const UNIT_US: f64 = 100.0;
-    let asked = config.exposure_us?;
     // Cameras without automatic exposure lack the switch.
     let manual = i64::from(c::v4l2_exposure_auto_type_V4L2_EXPOSURE_MANUAL);
     let _ = node.set_control(c::V4L2_CID_EXPOSURE_AUTO, manual);

@@ -4,10 +4,11 @@ use jiff::{SignedDuration, Timestamp};
 use nalgebra::{Matrix2, Vector2};
 
 use crate::claims::{Beam, Bearing, Claim, ClaimState, Standing, Store, seconds};
+use crate::geo::View;
 use crate::monitor::config::Config;
+use crate::monitor::stats::gaussian::largest_eigenvalue;
 use crate::monitor::track::detection::{OVERLAP, spot_m};
 use crate::monitor::track::user_track::UserTrack;
-use crate::optics::Camera;
 
 /// Speed at which a user may leave their last claim without a new one, beyond the one they claimed, m/s: a walk. Larger widens
 /// what is tolerated between claims, smaller raises a mismatch for who sets off. Not measured.
@@ -28,10 +29,16 @@ const MAX_SLACK_M: f64 = 60.0;
 #[derive(Clone, Debug)]
 pub struct ActiveClaim {
     pub claim: Claim,
-    /// Where the claim puts the beam, m; moved by our own pose error once the frame has shown it.
+    /// Where the claim puts the beam on the ground as the camera sees it, m.
+    pub claimed: Vector2<f64>,
+    /// The same, moved by our own pose error once the frame has shown it.
     pub position: Vector2<f64>,
-    /// Variance per axis, m².
+    /// Covariance of the claim, m².
+    pub cov: Matrix2<f64>,
+    /// Variance along its worst direction, m².
     pub variance: f64,
+    /// The same of our own pose at the claimed place, along its worst axis, m²; zero for a fixed platform.
+    pub pose_variance: f64,
     /// When the claim was made, by our clock; never after the frame.
     pub made: Timestamp,
     /// Age of the claim, s.
@@ -54,7 +61,7 @@ pub struct ActiveClaim {
 #[derive(Clone, Copy, Debug)]
 pub struct Scope<'a> {
     pub config: &'a Config,
-    pub camera: &'a Camera,
+    pub view: &'a View,
     /// Standard deviation of claims that state none, m.
     pub default_sigma_m: f64,
     /// Seconds by which the log's clock is ahead of ours.
@@ -85,7 +92,7 @@ pub fn active_claims(
             let is_active = standing.claim.state == ClaimState::Active;
             let bears =
                 (is_active && user.track.is_some_and(&is_followed)) || scope.bearing(&standing, &reach).is_some();
-            bears.then(|| ActiveClaim::new(&standing, reach, user))
+            bears.then(|| ActiveClaim::new(&standing, reach, user, &scope))
         })
         .collect();
     for claim in &mut claims {
@@ -107,7 +114,7 @@ pub fn has_claim(claims: &[ActiveClaim], user: &str) -> bool {
 struct Reach {
     made: Timestamp,
     age_s: f64,
-    variance: f64,
+    cov: Matrix2<f64>,
     slack_m: f64,
 }
 
@@ -118,17 +125,26 @@ impl Reach {
         let offset = SignedDuration::from_millis((scope.clock_offset_s * 1e3).round() as i64);
         let made = claim.time.saturating_sub(offset).map_or(now, |made| made.min(now));
         let age_s = seconds(made, now);
-        let sigma = claim
-            .sigma_m
-            .unwrap_or(scope.default_sigma_m)
-            .clamp(MIN_SIGMA_M, scope.config.tolerated_distance_m);
+        let believed = |sigma: f64| sigma.clamp(MIN_SIGMA_M, scope.config.tolerated_distance_m);
+        let cov = match claim.cov_m2 {
+            Some(stated) => believed_cov(&stated, believed),
+            None => Matrix2::identity() * believed(claim.sigma_m.unwrap_or(scope.default_sigma_m)).powi(2),
+        };
         Self {
             made,
             age_s,
-            variance: sigma * sigma,
+            cov,
             slack_m: (FREE_SPEED_M_S + standing.pace_m_s.min(MAX_SPEED_M_S)) * age_s,
         }
     }
+}
+
+/// A stated covariance with both its standard deviations as far as they are believed.
+fn believed_cov([[a, b], [_, c]]: &[[f64; 2]; 2], believed: impl Fn(f64) -> f64) -> Matrix2<f64> {
+    let mut axes = Matrix2::new(*a, *b, *b, *c).symmetric_eigen();
+    axes.eigenvalues
+        .apply(|variance| *variance = believed(variance.max(0.0).sqrt()).powi(2));
+    axes.recompose()
 }
 
 impl Scope<'_> {
@@ -136,30 +152,42 @@ impl Scope<'_> {
     /// and the claim's own error; how far the user may have gone since widens only what the claim may be associated with.
     fn bearing(&self, standing: &Standing, reach: &Reach) -> Option<Bearing> {
         let claim = standing.claim;
-        let is_near = |margin_m: f64| is_near_view(self.camera, Vector2::new(claim.x_m, claim.y_m), margin_m);
-        let sigmas_m = 5.0 * reach.variance.sqrt();
+        let place = self.view.apparent(claim.x_m, claim.y_m, claim.z_m);
+        let pose_m = 3.0 * self.pose_std_m(place);
+        let is_near = |margin_m: f64| is_near_view(self.view, place, margin_m + pose_m);
+        let sigmas_m = 5.0 * largest_eigenvalue(&reach.cov).sqrt();
         let reach_m = self.config.tolerated_distance_m + reach.slack_m + sigmas_m;
         let bears = match claim.state {
             ClaimState::Ended => reach.age_s <= self.config.ended_grace_s,
-            ClaimState::Active => reach.age_s <= CLAIM_LIFE_S && is_near(reach_m + spot_m(self.camera) * OVERLAP),
+            ClaimState::Active => reach.age_s <= CLAIM_LIFE_S && is_near(reach_m + spot_m(self.view) * OVERLAP),
         };
         let is_in_view = is_near(self.config.tolerated_distance_m + sigmas_m);
         bears.then_some(if is_in_view { Bearing::InView } else { Bearing::Beyond })
     }
 
+    /// Standard deviation of a place by our own pose, along its worst axis, m.
+    fn pose_std_m(&self, p: Vector2<f64>) -> f64 {
+        largest_eigenvalue(&self.view.pose_cov(p)).max(0.0).sqrt()
+    }
+
     /// Whether even a user as far off as is tolerated would show at least part of a spot.
     fn must_be_seen(&self, claim: &ActiveClaim) -> bool {
-        let off = self.config.tolerated_distance_m + claim.slack_m + 3.0 * claim.variance.sqrt();
-        is_near_view(self.camera, claim.position, (spot_m(self.camera) - off).min(0.0))
+        let pose_m = claim.pose_variance.sqrt();
+        let off = self.config.tolerated_distance_m + claim.slack_m + 3.0 * (claim.variance.sqrt() + pose_m);
+        is_near_view(self.view, claim.position, (spot_m(self.view) - off).min(0.0))
     }
 }
 
 impl ActiveClaim {
-    fn new(standing: &Standing, reach: Reach, before: UserTrack) -> Self {
+    fn new(standing: &Standing, reach: Reach, before: UserTrack, scope: &Scope) -> Self {
         let claim = standing.claim;
+        let position = scope.view.apparent(claim.x_m, claim.y_m, claim.z_m);
         Self {
-            position: Vector2::new(claim.x_m, claim.y_m),
-            variance: reach.variance,
+            claimed: position,
+            position,
+            variance: largest_eigenvalue(&reach.cov),
+            cov: reach.cov,
+            pose_variance: scope.pose_std_m(position).powi(2),
             made: reach.made,
             age_s: reach.age_s,
             slack_m: reach.slack_m,
@@ -177,13 +205,16 @@ impl ActiveClaim {
     /// deviation.
     pub fn association_cov(&self, tolerated_m: f64) -> Matrix2<f64> {
         let slack = 0.5 * self.slack_m.min(MAX_SLACK_M);
-        Matrix2::identity() * (self.variance + slack * slack + 0.25 * tolerated_m * tolerated_m)
+        let isotropic = |variance: f64| Matrix2::identity() * variance;
+        let tolerated = isotropic(0.25 * tolerated_m * tolerated_m);
+        self.cov + isotropic(self.pose_variance) + isotropic(slack * slack) + tolerated
     }
 }
 
-fn is_near_view(camera: &Camera, p: Vector2<f64>, margin_m: f64) -> bool {
-    let [x, y] = camera.to_sensor([p.x, p.y]);
-    let margin = margin_m / camera.ground_scale();
+fn is_near_view(view: &View, p: Vector2<f64>, margin_m: f64) -> bool {
+    let camera = &view.camera;
+    let [x, y] = view.to_sensor([p.x, p.y]);
+    let margin = margin_m / view.ground_scale();
     x.abs() <= camera.x.half_width() + margin && y.abs() <= camera.y.half_width() + margin
 }
 
@@ -198,13 +229,18 @@ pub mod fixture {
             user: user.into(),
             x_m: x,
             y_m: y,
+            z_m: None,
             sigma_m: Some(0.3),
+            cov_m2: None,
             power_w: None,
             state: ClaimState::Active,
         };
         ActiveClaim {
+            claimed: Vector2::new(x, y),
             position: Vector2::new(x, y),
+            cov: Matrix2::identity() * 0.09,
             variance: 0.09,
+            pose_variance: 0.0,
             made: claim.time,
             age_s: 0.0,
             slack_m: 0.0,
@@ -244,7 +280,9 @@ mod tests {
                 user: "a".into(),
                 x_m: *x,
                 y_m: 0.0,
+                z_m: None,
                 sigma_m: Some(1000.0),
+                cov_m2: None,
                 power_w: None,
                 state,
             };
@@ -255,7 +293,7 @@ mod tests {
         }
         let scope = Scope {
             config: &Config::default(),
-            camera: &optics::Config::default().camera().unwrap(),
+            view: &View::level(&optics::Config::default().camera().unwrap()),
             default_sigma_m: 1.0,
             clock_offset_s,
         };
@@ -303,7 +341,7 @@ mod tests {
     fn a_claim_is_in_view_within_what_is_tolerated_and_beyond_it_by_its_age() {
         let scope = Scope {
             config: &Config::default(),
-            camera: &optics::Config::default().camera().unwrap(),
+            view: &View::level(&optics::Config::default().camera().unwrap()),
             default_sigma_m: 0.2,
             clock_offset_s: 0.0,
         };

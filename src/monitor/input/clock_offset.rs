@@ -58,7 +58,6 @@ impl ClockOffset {
 
     /// Takes each new claim whose beam stands clear of others. Users who are not where they say are no clock.
     pub fn update(&mut self, frame: &FrameContext, is_mismatched: impl Fn(&str) -> bool) {
-        let displacement = frame.pose.displacement();
         for (i, claim) in frame.claims.iter().enumerate() {
             let Some(track) = frame.track(i).filter(|t| t.confirmed && !claim.ended) else {
                 continue;
@@ -74,8 +73,7 @@ impl ClockOffset {
                 && is_clear
                 && !is_mismatched(&claim.claim.user)
             {
-                let claimed = Vector2::new(claim.claim.x_m, claim.claim.y_m);
-                let claimed = claimed + displacement.at(claimed);
+                let claimed = claim.claimed + frame.displacement_at(claim.claimed);
                 user.push(stamped - claimed, track.filter.velocity(), claim.variance);
             }
         }

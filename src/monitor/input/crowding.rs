@@ -1,8 +1,8 @@
 //! Whether a claim near a beam is evidence: where many names are claimed without a beam, one of them is near any beam.
 
 use super::claim_state::ActiveClaim;
+use crate::geo::View;
 use crate::monitor::track::detection::view_m2;
-use crate::optics::Camera;
 
 /// Names claimed in view without a beam from which on a claim nearby is no evidence by itself. Smaller delays honest newcomers,
 /// larger lets fewer invented names cover for a stranger. Honest users have their beams: at the start of a run all of them
@@ -30,9 +30,9 @@ impl Default for Crowding {
 
 impl Crowding {
     /// Of a frame's claims, and of `elsewhere` names that the frame had no time or the store no room for.
-    pub fn of_claims(claims: &[ActiveClaim], elsewhere: f64, camera: &Camera) -> Self {
+    pub fn of_claims(claims: &[ActiveClaim], elsewhere: f64, view: &View) -> Self {
         let here = claims.iter().filter(|a| a.expected && !a.before.was_seen()).count();
-        Self::of(here as f64 + elsewhere, view_m2(camera))
+        Self::of(here as f64 + elsewhere, view_m2(view))
     }
 
     /// Of `names` anywhere in a view of `area_m2`: the mean number of them within the reach is [`BY_CHANCE`].

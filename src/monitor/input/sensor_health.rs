@@ -124,6 +124,7 @@ mod tests {
             time: at(s),
             result: Ok(&estimate),
             digest,
+            look: crate::monitor::Look::Level,
         };
         health.usable_estimate(&seen, visible_users).is_some()
     }
@@ -183,6 +184,7 @@ mod tests {
             time: at(8),
             result: Err(&error),
             digest: 5,
+            look: crate::monitor::Look::Level,
         };
         assert!(health.usable_estimate(&seen, 0).is_none());
         assert_eq!(health.evidence(at(9))["unusable_frames"], 2);

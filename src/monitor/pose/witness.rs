@@ -2,6 +2,8 @@
 
 use nalgebra::Vector2;
 
+use super::bias::Residual;
+use crate::geo::View;
 use crate::monitor::input::claim_state::ActiveClaim;
 use crate::monitor::track::tracker::Tracker;
 
@@ -32,9 +34,9 @@ impl Witness {
             None => REACH_SLACK * claim.slack_m.min(MAX_SLACK_M),
         };
         Self {
-            claimed: Vector2::new(claim.claim.x_m, claim.claim.y_m) + moved.unwrap_or_default(),
+            claimed: claim.claimed + moved.unwrap_or_default(),
             variance: claim.variance,
-            reach_m: REACH_M + REACH_SIGMAS * claim.variance.sqrt() + step_m,
+            reach_m: REACH_M + REACH_SIGMAS * claim.variance.sqrt() + claim.pose_variance.sqrt() + step_m,
         }
     }
 }
@@ -53,6 +55,22 @@ pub fn witnesses(claims: &[ActiveClaim], tracker: &Tracker) -> Vec<Witness> {
         Some(track.filter.position() - track.at(a.made)?)
     };
     heard.into_iter().map(|a| Witness::of(a, moved(a))).collect()
+}
+
+/// The claims whose own beam is followed and stands alone, each with how far the beam is from it.
+pub fn residuals(claims: &[ActiveClaim], tracker: &Tracker, view: &View) -> Vec<Residual> {
+    let residual = |a: &ActiveClaim| {
+        let track = tracker.get(a.before.current()?)?;
+        let is_clear = track.hit && track.confirmed && track.unresolved_from.is_none() && !a.ended;
+        let here = track.filter.position();
+        let claimed = a.claimed + (here - track.at(a.made)?);
+        is_clear.then(|| Residual {
+            offset: here - claimed,
+            variance: a.variance + 0.5 * track.filter.position_cov().trace(),
+            by_pose: view.by_pose(claimed),
+        })
+    };
+    claims.iter().filter_map(residual).collect()
 }
 
 #[cfg(test)]

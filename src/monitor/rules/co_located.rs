@@ -10,7 +10,7 @@ use crate::monitor::by_user::ByUser;
 use crate::monitor::evidence::power_against_reported;
 use crate::monitor::finding::{Cause, Content, Finding, is_renamed};
 use crate::monitor::frame_context::FrameContext;
-use crate::monitor::rules::watched_spot::{WatchedSpot, watched_spots};
+use crate::monitor::rules::watched_spot::{Owner, WatchedSpot, watched_spots};
 use crate::monitor::stats::co_location::{CoLocationEvidence, CoLocationTest, OtherBeams};
 use crate::monitor::stats::error_budget::TestFamily;
 use crate::monitor::stats::gaussian::largest_eigenvalue;
@@ -29,8 +29,13 @@ const SUSPECT_SHARE: f64 = 0.2;
 /// Resolutions within which one beam's light disturbs another's, and where it is lost may have become part of it. Not measured.
 const BESIDE_RESOLUTIONS: f64 = 3.0;
 
-/// What is remembered of each user's spot.
-pub type Memory = ByUser<Spot>;
+/// What is remembered of each spot.
+#[derive(Debug, Default)]
+pub struct Memory {
+    users: ByUser<Spot>,
+    /// Of known lights, by id.
+    lights: ByUser<Spot>,
+}
 
 #[derive(Debug, Default)]
 pub struct Spot {
@@ -42,9 +47,38 @@ pub struct Spot {
 }
 
 impl Memory {
+    fn get(&self, owner: Owner) -> Option<&Spot> {
+        match owner {
+            Owner::User(user) => self.users.get(user),
+            Owner::Light(id) => self.lights.get(id),
+        }
+    }
+
+    fn entry(&mut self, owner: Owner) -> &mut Spot {
+        match owner {
+            Owner::User(user) => self.users.entry(user),
+            Owner::Light(id) => self.lights.entry(id),
+        }
+    }
+
+    /// Forgets users who no longer matter.
+    pub fn retain(&mut self, matters: impl Fn(&str) -> bool) {
+        self.users.retain(matters);
+    }
+
+    /// Forgets the known lights that are none any more.
+    pub fn retain_lights(&mut self, is_known: impl Fn(&str) -> bool) {
+        self.lights.retain(is_known);
+    }
+
+    /// A known light of which the mean and standard deviation of its ln energy are known from before a restart.
+    pub fn remember_light(&mut self, id: &str, mean: f64, std: f64) {
+        self.lights.entry(id).test = CoLocationTest::remembered(mean, std);
+    }
+
     /// The user's usual energy, J, once their beam has a past.
     pub fn usual_energy_j(&self, user: &str) -> Option<f64> {
-        let (mean, _) = self.get(user)?.test.brightness.past()?;
+        let (mean, _) = self.users.get(user)?.test.brightness.past()?;
         Some(mean.exp())
     }
 
@@ -57,20 +91,22 @@ impl Memory {
         };
         let past = &alert.evidence["energy_over_the_past"];
         if let (Some(mean), Some(std)) = (past["past_ln_j"].as_f64(), past["past_ln_std"].as_f64()) {
-            self.entry(user).test = CoLocationTest::remembered(mean, std);
+            self.users.entry(user).test = CoLocationTest::remembered(mean, std);
         }
     }
 
     /// Takes the frame's light and positions, less what all beams have in common.
     fn update(&mut self, watched: &[WatchedSpot]) {
-        for (_, spot) in self.iter_mut().filter(|(user, _)| find(watched, user).is_none()) {
+        let users = self.users.iter_mut().map(|(user, spot)| (Owner::User(user), spot));
+        let lights = self.lights.iter_mut().map(|(id, spot)| (Owner::Light(id), spot));
+        for (_, spot) in users.chain(lights).filter(|(owner, _)| find(watched, *owner).is_none()) {
             spot.test.jitter.interrupt();
         }
         let displacements: Vec<(Option<SecondDifference>, CandidateSteps)> = watched
             .iter()
             .map(|w| {
                 let (time, detection) = (w.track.last_hit, &w.detection);
-                let test = &mut self.entry(w.user).test;
+                let test = &mut self.entry(w.owner).test;
                 let variance = largest_eigenvalue(&detection.cov);
                 (
                     test.jitter.second_difference(time, detection.position, detection.cov),
@@ -89,7 +125,7 @@ impl Memory {
             )
         });
         for (w, (jump, steps)) in watched.iter().zip(displacements) {
-            let spot = self.entry(w.user);
+            let spot = self.entry(w.owner);
             let learn = spot.suspected_since.is_none();
             if let Some(ln_energy) = w.ln_energy() {
                 spot.test.second_moment.push(&w.detection.moments, learn);
@@ -102,10 +138,12 @@ impl Memory {
         }
     }
 
-    /// What the watched beams besides `user`'s show.
-    fn others(&self, user: &str, watched: &[WatchedSpot]) -> OtherBeams {
-        let tests = || watched.iter().filter_map(|w| Some((w.user, &self.get(w.user)?.test)));
-        let others = || tests().filter(|(name, _)| *name != user).map(|(_, test)| test);
+    /// What the watched beams of the same kind besides the owner's show: lamps are steadier than users.
+    fn others(&self, owner: Owner, watched: &[WatchedSpot]) -> OtherBeams {
+        let is_like = |w: &&WatchedSpot| matches!(w.owner, Owner::User(_)) == matches!(owner, Owner::User(_));
+        let alike = || watched.iter().filter(is_like);
+        let tests = || alike().filter_map(|w| Some((w.owner, &self.get(w.owner)?.test)));
+        let others = || tests().filter(|(other, _)| *other != owner).map(|(_, test)| test);
         let enough = |values: Vec<f64>| match values.len() >= MIN_OTHERS {
             true => median_high(values.into_iter()),
             false => None,
@@ -115,6 +153,28 @@ impl Memory {
             rise: enough(others().filter_map(|test| test.brightness.recent_rise()).collect()),
             jitter: enough(others().filter_map(|test| test.jitter.recent_mean()).collect()),
             scatter: tests().map(|(_, test)| test.brightness.scatter()).sum(),
+        }
+    }
+
+    /// Evidence of a second beam in the spot of a known light, which [`evaluate`] has taken the frame of.
+    pub fn of_light(
+        &mut self,
+        frame: &FrameContext,
+        spot: &WatchedSpot,
+        watched: &[WatchedSpot],
+        threshold: f64,
+    ) -> CoLocationEvidence {
+        let others = self.others(spot.owner, watched);
+        let remembered = self.entry(spot.owner);
+        let evidence = remembered.test.evaluate(frame.config.tolerated_brightening, &others);
+        // Whether it lasts is the known light's own question; here it ends what the spot learns.
+        remembered.is_present(&evidence, threshold, false, frame);
+        if is_beside_unclaimed(frame, spot.track, &[]) {
+            remembered.accompanied_at = Some(frame.now);
+        }
+        match remembered.is_explained(frame) {
+            true => CoLocationEvidence::default(),
+            false => evidence,
         }
     }
 }
@@ -127,10 +187,13 @@ pub fn evaluate(frame: &FrameContext, memory: &mut Memory) -> Vec<Finding> {
     memory.update(&watched);
     let mut findings = Vec::new();
     for w in &watched {
-        let cause = Cause::CoLocated(w.user.to_owned());
-        let others = memory.others(w.user, &watched);
+        let Owner::User(user) = w.owner else {
+            continue;
+        };
+        let cause = Cause::CoLocated(user.to_owned());
+        let others = memory.others(w.owner, &watched);
         let is_open = frame.alerts.is_open(&cause);
-        let spot = memory.entry(w.user);
+        let spot = memory.entry(w.owner);
         if is_beside_unclaimed(frame, w.track, &findings) {
             spot.accompanied_at = Some(frame.now);
         }
@@ -146,7 +209,15 @@ pub fn evaluate(frame: &FrameContext, memory: &mut Memory) -> Vec<Finding> {
         }
         let lasted_s = seconds(raised_at.unwrap_or(frame.now), frame.now);
         let past = spot.test.brightness.past();
-        let content = content(frame, w, &evidence, past, threshold, Severity::of_duration(lasted_s));
+        let content = content(
+            frame,
+            w,
+            user,
+            &evidence,
+            past,
+            threshold,
+            Severity::of_duration(lasted_s),
+        );
         findings.push(Finding::present(cause, content));
     }
     for (cause, _) in frame.alerts.open() {
@@ -154,7 +225,8 @@ pub fn evaluate(frame: &FrameContext, memory: &mut Memory) -> Vec<Finding> {
             continue;
         };
         let is_present = findings.iter().any(|finding| finding.cause() == cause);
-        let is_tested = find(&watched, user).is_some() && memory.get(user).is_some_and(|spot| spot.test.has_verdict());
+        let is_watched = find(&watched, Owner::User(user)).is_some();
+        let is_tested = is_watched && memory.users.get(user).is_some_and(|spot| spot.test.has_verdict());
         if !is_present && (is_tested || !has_beam(frame, user)) {
             findings.push(Finding::Absent(cause.clone()));
         }
@@ -162,8 +234,8 @@ pub fn evaluate(frame: &FrameContext, memory: &mut Memory) -> Vec<Finding> {
     findings
 }
 
-fn find<'a>(watched: &'a [WatchedSpot], user: &str) -> Option<&'a WatchedSpot<'a>> {
-    let found = watched.binary_search_by(|w| w.user.cmp(user));
+fn find<'a>(watched: &'a [WatchedSpot], owner: Owner) -> Option<&'a WatchedSpot<'a>> {
+    let found = watched.binary_search_by(|w| w.owner.cmp(&owner));
     found.ok().map(|k| &watched[k])
 }
 
@@ -195,9 +267,14 @@ impl Spot {
         };
         // A second beam may be a user's whose claim has yet to come.
         let is_due = evidence.neg_log_p() > threshold && seconds(suspected, now) >= claim_wait_s;
-        // One detection that goes astray does not part a user and a stranger who has an alert.
-        let is_explained = self.accompanied_at.is_some_and(|t| seconds(t, now) < claim_wait_s);
-        is_open || (is_due && !is_explained)
+        is_open || (is_due && !self.is_explained(frame))
+    }
+
+    /// Whether an emitter with an alert of its own beside it explains it. One detection that goes astray does not part a user and a
+    /// stranger who has an alert.
+    fn is_explained(&self, frame: &FrameContext) -> bool {
+        let lately = |t| seconds(t, frame.now) < frame.claim_wait_s();
+        self.accompanied_at.is_some_and(lately)
     }
 }
 
@@ -231,6 +308,7 @@ fn alert_merged_into(frame: &FrameContext, track: &Track, findings: &[Finding]) 
 fn content(
     frame: &FrameContext,
     w: &WatchedSpot,
+    user: &str,
     evidence: &CoLocationEvidence,
     past: Option<(f64, f64)>,
     threshold: f64,
@@ -239,7 +317,7 @@ fn content(
     let (track, detection) = (w.track, &w.detection);
     let evidence = json!({
         "track": track.id,
-        SHARED_SPOT: w.user,
+        SHARED_SPOT: user,
         "resolution_m": detection.resolution_m,
         "energy_j": detection.energy_j,
         "energy_over_the_past": {
@@ -248,7 +326,7 @@ fn content(
             "past_ln_j": past.map(|p| p.0),
             "past_ln_std": past.map(|p| p.1),
         },
-        "power_against_reported": power_against_reported(frame, w.claim),
+        "power_against_reported": w.claim.and_then(|i| power_against_reported(frame, i)),
         "unrest_over_the_expected": { "ratio": evidence.jitter.ratio, "surprise": evidence.jitter.neg_log_p },
         "step_aside": {
             "length_m": evidence.step.length_m,
@@ -262,7 +340,7 @@ fn content(
         "threshold": threshold,
         "flags": detection.flags,
     });
-    Content::new(severity, evidence).at(track.filter.position(), track.filter.position_cov())
+    Content::new(severity, evidence).at(frame.position(track), frame.position_cov(track))
 }
 
 #[cfg(test)]
@@ -289,7 +367,7 @@ mod tests {
         fn new() -> Self {
             let mut memory = Memory::default();
             for k in 0..4 {
-                memory.entry(&format!("u-{k}")).test = CoLocationTest::remembered(0.0, 0.3);
+                memory.users.entry(&format!("u-{k}")).test = CoLocationTest::remembered(0.0, 0.3);
             }
             let scene = Scene::of_users(&USERS);
             Self { scene, memory }
@@ -297,6 +375,7 @@ mod tests {
 
         fn beams(energies: [f64; 4]) -> Vec<Detection> {
             let of = |([x, y], energy_j): ([f64; 2], f64)| Detection {
+                velocity: None,
                 energy_j,
                 ..detection(x, y)
             };

@@ -1,6 +1,5 @@
 //! `position_mismatch`: a user's beam is farther from the claim than is tolerated.
 
-use nalgebra::{Matrix2, Vector2};
 use serde_json::json;
 
 use crate::monitor::alert::{Alert, AlertKind, Severity};
@@ -64,7 +63,6 @@ impl Memory {
     /// Adds the residuals of new claims, and counts the frames that show a beam outside.
     pub fn update(&mut self, frame: &FrameContext) {
         let gate = frame.budget.threshold(TestFamily::Mismatch, frame.claims.len() as f64);
-        let displacement = frame.pose.displacement();
         let clock_uncertainty_s = frame.clock_uncertainty_s();
         let is_settled = frame.is_settled();
         for (i, claim) in frame.claims.iter().enumerate() {
@@ -83,21 +81,17 @@ impl Memory {
                 let is_clear = track.confirmed && track.merged_into.is_none() && confusion_m == 0.0;
                 match track.at(claim.made) {
                     Some(then) if is_clear && is_settled => {
-                        let claimed = Vector2::new(claim.claim.x_m, claim.claim.y_m);
-                        let claimed = claimed + displacement.at(claimed);
+                        let claimed = claim.claimed + frame.displacement_at(claim.claimed);
                         let beam = track.filter.position_cov();
-                        user.consistency
-                            .push(claim.claim.time, then - claimed, beam, claim.variance);
+                        user.consistency.push(claim.claim.time, then - claimed, beam, claim.cov);
                     }
                     _ if track.confirmed => user.consistency.skip(claim.claim.time),
                     _ => {}
                 }
             }
-            let cov = track.filter.position_cov()
-                + Matrix2::identity() * claim.variance
-                + frame.systematic_cov(claim.position);
+            let cov = track.filter.position_cov() + claim.cov + frame.systematic_cov(claim.position);
             let offset = track.filter.position() - claim.position;
-            let reach = frame.config.tolerated_distance_m
+            let reach = frame.tolerated_distance_m(claim.position)
                 + claim.slack_m
                 + confusion_m
                 + clock_uncertainty_s * track.filter.velocity().norm();
@@ -132,7 +126,7 @@ impl User {
     fn mismatch(&mut self, frame: &FrameContext, i: usize, threshold: f64) -> Option<Content> {
         let claim = &frame.claims[i];
         let track = frame.track(i);
-        let tolerated = frame.config.tolerated_distance_m;
+        let tolerated = frame.tolerated_distance_m(claim.position);
         if self.is_mismatched && self.outside == 0 && self.consistency.agree(AGREEING_CLAIMS, tolerated) {
             // What showed this mismatch is over and must not show another one.
             self.consistency.forget();
@@ -164,7 +158,7 @@ impl User {
             "answered_from_elsewhere": self.is_displaced,
             "power_against_reported": power_against_reported(frame, i),
         });
-        let content = Content::new(severity, evidence).at(track.filter.position(), track.filter.position_cov());
+        let content = Content::new(severity, evidence).at(frame.position(track), frame.position_cov(track));
         Some(content.with_claim(claimed(claim)))
     }
 }

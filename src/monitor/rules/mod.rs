@@ -3,8 +3,10 @@
 
 pub(super) mod co_located;
 pub(super) mod inputs;
+pub(super) mod known_light;
 pub(super) mod mismatch;
 pub(super) mod pose;
 pub(super) mod unclaimed;
 pub(super) mod unseen;
 pub(super) mod watched_spot;
+pub(super) mod zone;

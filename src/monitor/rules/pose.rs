@@ -20,6 +20,7 @@ const ENDS_BELOW: f64 = 0.9;
 const CRITICAL_RATIO: f64 = 4.0;
 
 const CAUSE: Cause = Cause::System(AlertKind::PoseInconsistent);
+const LOST: Cause = Cause::System(AlertKind::PoseLost);
 
 pub fn evaluate(frame: &FrameContext) -> Vec<Finding> {
     let limit = frame
@@ -27,7 +28,9 @@ pub fn evaluate(frame: &FrameContext) -> Vec<Finding> {
         .pose_limit_m
         .unwrap_or(DEFAULT_LIMIT * frame.config.tolerated_distance_m);
     let (place, worst) = worst_displacement(frame);
-    let neg_log_p = neg_log_p_outside(worst, &frame.systematic_cov(place), limit);
+    // What the poses' source itself states is no inconsistency.
+    let cov = frame.systematic_cov(place) + frame.view.pose_cov(place);
+    let neg_log_p = neg_log_p_outside(worst, &cov, limit);
     let threshold = frame.budget.threshold(TestFamily::Pose, 1.0);
     let is_open = frame.alerts.is_open(&CAUSE);
     let is_present = neg_log_p > threshold || (is_open && worst.norm() > ENDS_BELOW * limit);
@@ -55,17 +58,33 @@ pub fn evaluate(frame: &FrameContext) -> Vec<Finding> {
     vec![Finding::present(CAUSE, Content::new(severity, evidence))]
 }
 
+/// `pose_lost`: no pose has come for longer than is tolerated.
+pub fn lost(frame: &FrameContext) -> Vec<Finding> {
+    let content = frame.pose_lost_s.map(|age_s| {
+        let worst_m = frame.view.middle_and_edges_m().into_iter();
+        let worst_m = worst_m
+            .map(|p| frame.view.pose_cov(p).trace())
+            .fold(0.0, f64::max)
+            .sqrt();
+        let evidence = json!({
+            "pose_age_s": age_s,
+            "position_std_m": worst_m,
+            "is_any_pose_known": frame.is_placed,
+        });
+        Content::new(Severity::of_duration(age_s), evidence)
+    });
+    vec![Finding::of(LOST, content)]
+}
+
 /// Where in view our pose error displaces positions most, of the middle and the four edges, and by how much, m.
 fn worst_displacement(frame: &FrameContext) -> (Vector2<f64>, Vector2<f64>) {
-    let pose = frame.pose.displacement();
-    let camera = &frame.camera;
-    let [w, h] = [&camera.x, &camera.y].map(|axis| axis.half_width() * camera.ground_scale());
-    [[0.0, 0.0], [w, 0.0], [-w, 0.0], [0.0, h], [0.0, -h]]
-        .map(|[x, y]| Vector2::new(x, y))
-        .map(|p| (p, pose.at(p)))
+    let places = frame
+        .view
+        .middle_and_edges_m()
         .into_iter()
-        .max_by(|a, b| a.1.norm().total_cmp(&b.1.norm()))
-        .expect("five places")
+        .map(|p| (p, frame.displacement_at(p)));
+    let worst = places.max_by(|a, b| a.1.norm().total_cmp(&b.1.norm()));
+    worst.unwrap_or_default()
 }
 
 #[cfg(test)]

@@ -20,42 +20,57 @@ use crate::monitor::track::detection::view_m2;
 /// Resolutions of a spot within which the beam that an alert was about and the one that now has no claim are the same two. Larger
 /// moves an alert to a beam that has nothing to do with it, smaller raises a second one for the same two beams. Not measured.
 const SWAP_RESOLUTIONS: f64 = 2.0;
+/// How long a beam in a restricted zone waits for a claim, s: three frames at 10 frames/s. Longer delays an alert that must come within
+/// 0.3 s, shorter alerts a listed user whose claim is missing for a frame.
+const RESTRICTED_WAIT_S: f64 = 0.15;
 /// Absences of an honest user, one an hour: what a user's absence at the same moment is by chance. Assumed; evidence only.
 const ABSENCE_PERIOD_S: f64 = 3600.0;
 
 /// Since when each track has had no claim.
 #[derive(Debug, Default)]
-pub struct Memory(BTreeMap<u64, Timestamp>);
+pub struct Memory {
+    since: BTreeMap<u64, Timestamp>,
+    /// Tracks with an alert from before an operator drew an ignored zone about them.
+    dismissed: BTreeSet<u64>,
+}
 
 impl Memory {
     /// Takes a frame's association. A track whose measurement merged into another's starts to be without a claim when the two
     /// are resolved.
     pub fn update(&mut self, frame: &FrameContext) {
-        self.0.retain(|id, _| frame.tracker.get(*id).is_some());
+        self.since.retain(|id, _| frame.tracker.get(*id).is_some());
+        let is_ignored = |id: u64| frame.tracker.get(id).is_some_and(|t| frame.ignore_zone(t).is_some());
+        self.dismissed.retain(|id| is_ignored(*id));
         for track in &frame.tracker.tracks {
             if frame.association.contains(track.id) {
-                self.0.remove(&track.id);
+                self.since.remove(&track.id);
             } else if track.hit && track.unresolved_from.is_none() {
-                self.0.entry(track.id).or_insert(frame.now);
+                self.since.entry(track.id).or_insert(frame.now);
             }
         }
     }
 
     /// Whether the track has had no claim in the newest frame.
     pub fn is_unclaimed(&self, track: u64) -> bool {
-        self.0.contains_key(&track)
+        self.since.contains_key(&track)
+    }
+
+    /// An operator has drawn zones: alerts of beams that are ignored now end. One who walks into such a zone keeps theirs.
+    pub fn dismiss_ignored(&mut self, frame: &FrameContext) {
+        let ignored = frame.tracker.tracks.iter().filter(|t| frame.ignore_zone(t).is_some());
+        self.dismissed = ignored.map(|t| t.id).collect();
     }
 
     /// The track has been associated after all.
     pub fn remove(&mut self, track: u64) {
-        self.0.remove(&track);
+        self.since.remove(&track);
     }
 
     /// Tracks that would be alerted now, and since when they have had no claim.
     pub fn due(&self, frame: &FrameContext) -> Vec<(u64, Timestamp)> {
         let tracks = frame.tracker.tracks.iter();
         tracks
-            .filter_map(|track| Some((track, *self.0.get(&track.id)?)))
+            .filter_map(|track| Some((track, *self.since.get(&track.id)?)))
             .filter(|(track, since)| is_due(frame, track, *since))
             .filter(|(track, _)| !frame.alerts.is_open(&Cause::Track(track.id)))
             .map(|(track, since)| (track.id, since))
@@ -65,7 +80,11 @@ impl Memory {
     /// Since when each track without a claim and without an alert has had none.
     pub fn undecided(&self, alerts: &AlertLifecycle) -> Vec<Timestamp> {
         let open = |id: u64| alerts.is_open(&Cause::Track(id));
-        self.0.iter().filter(|(id, _)| !open(**id)).map(|(_, t)| *t).collect()
+        self.since
+            .iter()
+            .filter(|(id, _)| !open(**id))
+            .map(|(_, t)| *t)
+            .collect()
     }
 }
 
@@ -82,7 +101,7 @@ pub fn evaluate(frame: &FrameContext, memory: &mut Memory) -> Vec<Finding> {
         .collect();
     let before = alerted.clone();
     for track in &frame.tracker.tracks {
-        let Some(since) = memory.0.get(&track.id).copied() else {
+        let Some(since) = memory.since.get(&track.id).copied() else {
             continue;
         };
         if !alerted.contains(&track.id) {
@@ -98,13 +117,14 @@ pub fn evaluate(frame: &FrameContext, memory: &mut Memory) -> Vec<Finding> {
             }
             alerted.insert(track.id);
         }
-        if track.hit {
+        if track.hit && !memory.dismissed.contains(&track.id) {
             findings.push(Finding::present(Cause::Track(track.id), content(frame, track, since)));
         }
     }
     for id in before {
         let from = Cause::Track(id);
-        let is_there = frame.tracker.get(id).is_some_and(Track::is_seen) && memory.0.contains_key(&id);
+        let is_unclaimed = memory.since.contains_key(&id) && !memory.dismissed.contains(&id);
+        let is_there = is_unclaimed && frame.tracker.get(id).is_some_and(Track::is_seen);
         if is_there || is_renamed(&findings, &from) {
             continue;
         }
@@ -112,7 +132,7 @@ pub fn evaluate(frame: &FrameContext, memory: &mut Memory) -> Vec<Finding> {
             findings.push(Finding::Absent(from));
             continue;
         };
-        memory.0.insert(other, frame.now);
+        memory.since.insert(other, frame.now);
         alerted.remove(&id);
         alerted.insert(other);
         let to = Cause::Track(other);
@@ -128,12 +148,17 @@ fn threshold(frame: &FrameContext) -> f64 {
 
 /// Whether a beam that has had no claim since then is an emitter, and claims have had time to come.
 fn is_due(frame: &FrameContext, track: &Track, since: Timestamp) -> bool {
-    frame.is_settled()
-        && track.hit
-        && track.unresolved_from.is_none()
-        && track.confirmed
-        && track.score >= threshold(frame)
-        && seconds(since, frame.now) >= frame.claim_wait_s()
+    let is_emitter = track.hit && track.unresolved_from.is_none() && track.confirmed && track.score >= threshold(frame);
+    if !is_emitter {
+        return false;
+    }
+    let waited_s = seconds(since, frame.now);
+    if let Some(zone) = frame.restricted_zone(track) {
+        // Where no user is listed, no claim can make a beam one who may be there.
+        let is_known = zone.users.is_empty() || frame.is_settled();
+        return is_known && waited_s >= RESTRICTED_WAIT_S;
+    }
+    frame.is_settled() && waited_s >= frame.claim_wait_s() && frame.ignore_zone(track).is_none()
 }
 
 /// The beam without a claim in the spot of track `id`, when `id` itself is associated with one: where two beams merge, which is
@@ -156,7 +181,7 @@ fn lost_alert_near(frame: &FrameContext, memory: &Memory, track: &Track, finding
     let mut open = frame.alerts.open().filter(|(cause, _)| !is_renamed(findings, cause));
     open.find_map(|(cause, alert)| {
         let is_lost = match cause {
-            Cause::Track(id) => !memory.0.contains_key(id) || frame.tracker.get(*id).is_none_or(|t| !t.hit),
+            Cause::Track(id) => !memory.since.contains_key(id) || frame.tracker.get(*id).is_none_or(|t| !t.hit),
             Cause::CoLocated(_) => true,
             _ => return None,
         };
@@ -168,7 +193,7 @@ fn lost_alert_near(frame: &FrameContext, memory: &Memory, track: &Track, finding
 /// What else is evidence of an eavesdropper, each with its likelihood ratio against an honest stray beam.
 fn content(frame: &FrameContext, track: &Track, since: Timestamp) -> Content {
     let lasted_s = seconds(since, frame.now);
-    let evidence = json!({
+    let mut evidence = json!({
         "track": track.id,
         "seen_since": track.since,
         "unclaimed_s": lasted_s,
@@ -180,7 +205,34 @@ fn content(frame: &FrameContext, track: &Track, since: Timestamp) -> Content {
         "vanished_users": vanished_users(frame, since),
         "flags": track.detection.flags,
     });
-    Content::new(Severity::of_duration(lasted_s), evidence).at(track.filter.position(), track.filter.position_cov())
+    let of_light = [
+        ("lamp_or_beam", frame.light.lamp_or_beam(track, frame.budget.rate_hz())),
+        ("ghost_of", ghost_of(frame, track)),
+    ];
+    for (key, value) in of_light {
+        if let Some(value) = value {
+            evidence[key] = value;
+        }
+    }
+    let severity = match frame.restricted_zone(track) {
+        Some(_) => Severity::Critical,
+        None => Severity::of_duration(lasted_s),
+    };
+    Content::new(severity, evidence).at(frame.position(track), frame.position_cov(track))
+}
+
+/// The beam that this one is a reflection of, if it fades with one and stays beside it.
+fn ghost_of(frame: &FrameContext, track: &Track) -> Option<Value> {
+    let ghost = frame.light.ghost_of(track, &frame.tracker)?;
+    let user = |i: usize| frame.claims[i].claim.user.as_str();
+    let of = (0..frame.claims.len()).find(|i| frame.association.track_id(*i) == Some(ghost.of));
+    Some(json!({
+        "track": ghost.of,
+        "user": of.map(user),
+        "offset_m": ghost.offset_m,
+        "correlation": ghost.correlation,
+        "surprise": ghost.neg_log_p,
+    }))
 }
 
 /// One who wants a user's light stands within its spot; one who does not is anywhere in view.
@@ -193,7 +245,7 @@ fn nearest_user(frame: &FrameContext, track: &Track) -> Option<Value> {
         .map(|a| (a, (a.position - here).norm()))
         .min_by(|a, b| a.1.total_cmp(&b.1))?;
     let spot = frame.overlap_m();
-    let by_chance = std::f64::consts::PI * spot * spot * frame.claims.len() as f64 / view_m2(&frame.camera);
+    let by_chance = std::f64::consts::PI * spot * spot * frame.claims.len() as f64 / view_m2(&frame.view);
     let by_chance = by_chance.min(1.0);
     Some(json!({
         "user": claim.claim.user,

@@ -1,4 +1,4 @@
-//! The spots that are watched for a second beam: those of users whose beam stands alone, each with all of its light.
+//! The spots that are watched for a second beam: those of users and known lights whose beam stands alone, each with all of its light.
 
 use crate::estimate::Flags;
 use crate::monitor::frame_context::FrameContext;
@@ -6,11 +6,19 @@ use crate::monitor::stats::gaussian::largest_eigenvalue;
 use crate::monitor::track::beam_track::Track;
 use crate::monitor::track::detection::Detection;
 
-/// A user's beam that stands alone in this frame.
+/// Whose spot it is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Owner<'a> {
+    User(&'a str),
+    /// A known light, by id.
+    Light(&'a str),
+}
+
+/// The beam of a user or a known light that stands alone in this frame.
 pub struct WatchedSpot<'a> {
-    /// Index of the claim.
-    pub claim: usize,
-    pub user: &'a str,
+    /// Index of the claim, of a user's.
+    pub claim: Option<usize>,
+    pub owner: Owner<'a>,
     pub track: &'a Track,
     /// The track's detection, with all the light of the spot.
     pub detection: Detection,
@@ -25,16 +33,32 @@ impl WatchedSpot<'_> {
     }
 }
 
-/// The watched spots of a frame, by user: beams that are detected and confirmed, and where nobody else's may be.
+/// The watched spots of a frame, by owner: beams that are detected and confirmed, and where nobody else's may be.
 pub fn watched_spots<'a>(frame: &'a FrameContext) -> Vec<WatchedSpot<'a>> {
-    (0..frame.claims.len()).filter_map(|i| watched_spot(frame, i)).collect()
+    let of_users = (0..frame.claims.len()).filter_map(|i| {
+        let owner = Owner::User(&frame.claims[i].claim.user);
+        watched_spot(frame, Some(i), owner, frame.track(i)?)
+    });
+    let mut watched: Vec<WatchedSpot> = of_users.collect();
+    if !frame.lights.is_empty() {
+        watched.extend(frame.lights.iter().filter(|s| s.is_seen).filter_map(|state| {
+            let track = frame.tracker.get(state.track?)?;
+            watched_spot(frame, None, Owner::Light(&state.light.id), track)
+        }));
+        watched.sort_by_key(|w| w.owner);
+    }
+    watched
 }
 
-fn watched_spot<'a>(frame: &'a FrameContext, i: usize) -> Option<WatchedSpot<'a>> {
-    let track = frame.track(i)?;
-    (track.hit && track.confirmed && !is_shared(frame, i, track)).then(|| WatchedSpot {
-        claim: i,
-        user: &frame.claims[i].claim.user,
+fn watched_spot<'a>(
+    frame: &'a FrameContext,
+    claim: Option<usize>,
+    owner: Owner<'a>,
+    track: &'a Track,
+) -> Option<WatchedSpot<'a>> {
+    (track.hit && track.confirmed && !is_shared(frame, claim, track)).then(|| WatchedSpot {
+        claim,
+        owner,
         track,
         detection: whole_spot(frame, track),
     })
@@ -49,15 +73,15 @@ fn whole_spot(frame: &FrameContext, track: &Track) -> Detection {
         let is_near = (near.position - detection.position).norm() < reach;
         t.hit && t.id != track.id && is_near && !frame.association.contains(t.id)
     });
-    detection.united(others.map(|t| &t.detection), &frame.camera)
+    detection.united(others.map(|t| &t.detection), &frame.view)
 }
 
-/// Whether another user's beam may be in this spot, by tracks or by claims.
-fn is_shared(frame: &FrameContext, i: usize, track: &Track) -> bool {
+/// Whether the beam of another user than that of claim `own`, or a known light, may be in this spot, by tracks or by claims.
+fn is_shared(frame: &FrameContext, own: Option<usize>, track: &Track) -> bool {
     let (here, reach) = (track.filter.position(), track.detection.resolution_m);
     frame.confusion_m(track) > 0.0
         || (0..frame.claims.len())
-            .filter(|&j| j != i && frame.association.track_id(j).is_none())
+            .filter(|&j| Some(j) != own && frame.association.track_id(j).is_none())
             .map(|j| &frame.claims[j])
             .filter(|a| frame.crowding.is_evidence(a))
             .any(|a| {
@@ -75,7 +99,10 @@ mod tests {
 
     fn users(scene: &Scene) -> Vec<String> {
         let spots = watched_spots(scene.context());
-        spots.iter().map(|spot| spot.user.to_owned()).collect()
+        let user = |owner: Owner| match owner {
+            Owner::User(name) | Owner::Light(name) => name.to_owned(),
+        };
+        spots.iter().map(|spot| user(spot.owner)).collect()
     }
 
     #[test]

@@ -21,8 +21,8 @@ struct Residual {
     offset: Vector2<f64>,
     /// Covariance of the beam's position.
     beam: Matrix2<f64>,
-    /// Variance per axis of the claim.
-    claim: f64,
+    /// Covariance of the claim.
+    claim: Matrix2<f64>,
 }
 
 /// The residuals of one user, newest last; each claim counts once.
@@ -47,8 +47,8 @@ impl ClaimConsistency {
         self.newest
     }
 
-    /// Takes a claim of variance `claim` per axis, m², that its beam was `offset` away from, m.
-    pub fn push(&mut self, time: Timestamp, offset: Vector2<f64>, beam: Matrix2<f64>, claim: f64) {
+    /// Takes a claim of covariance `claim`, m², that its beam was `offset` away from, m.
+    pub fn push(&mut self, time: Timestamp, offset: Vector2<f64>, beam: Matrix2<f64>, claim: Matrix2<f64>) {
         self.newest = Some(time);
         self.residuals.push_back(Residual { offset, beam, claim });
         if self.residuals.len() > WINDOWS[WINDOWS.len() - 1] {
@@ -80,9 +80,11 @@ impl ClaimConsistency {
             let of = |f: &dyn Fn(&Residual) -> f64| weighted().map(|(w, r)| w * f(r)).sum::<f64>();
             let mean = Vector2::new(of(&|r| r.offset.x), of(&|r| r.offset.y));
             let beam = Matrix2::from_fn(|i, j| of(&|r| r.beam[(i, j)]));
-            let own: f64 = weighted().map(|(w, r)| w * w * r.claim).sum();
-            let claim = COMMON_SHARE * of(&|r| r.claim) + (1.0 - COMMON_SHARE) * own;
-            let cov = beam + Matrix2::identity() * claim + systematic;
+            let claim = Matrix2::from_fn(|i, j| {
+                let own: f64 = weighted().map(|(w, r)| w * w * r.claim[(i, j)]).sum();
+                COMMON_SHARE * of(&|r| r.claim[(i, j)]) + (1.0 - COMMON_SHARE) * own
+            });
+            let cov = beam + claim + systematic;
             let neg_log_p = neg_log_p_outside(mean, &cov, radius_m);
             if neg_log_p > worst.neg_log_p || m == 1 {
                 worst = Excess {
@@ -98,12 +100,9 @@ impl ClaimConsistency {
     /// Whether the newest `n` claims all agree with the beam to within `radius_m` and a standard deviation.
     pub fn agree(&self, n: usize, radius_m: f64) -> bool {
         self.residuals.len() >= n
-            && self
-                .residuals
-                .iter()
-                .rev()
-                .take(n)
-                .all(|r| r.offset.norm() <= radius_m + (r.claim + largest_eigenvalue(&r.beam)).sqrt())
+            && self.residuals.iter().rev().take(n).all(|r| {
+                r.offset.norm() <= radius_m + (largest_eigenvalue(&r.claim) + largest_eigenvalue(&r.beam)).sqrt()
+            })
     }
 }
 
@@ -114,7 +113,12 @@ mod tests {
     fn pushed(offsets: &[f64], claim: f64) -> ClaimConsistency {
         let mut consistency = ClaimConsistency::default();
         for x in offsets {
-            consistency.push(Timestamp::UNIX_EPOCH, Vector2::new(*x, 0.0), Matrix2::zeros(), claim);
+            consistency.push(
+                Timestamp::UNIX_EPOCH,
+                Vector2::new(*x, 0.0),
+                Matrix2::zeros(),
+                Matrix2::identity() * claim,
+            );
         }
         consistency
     }

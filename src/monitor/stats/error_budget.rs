@@ -59,6 +59,11 @@ impl ErrorBudget {
         }
     }
 
+    /// Frames per second.
+    pub fn rate_hz(&self) -> f64 {
+        self.rate_hz
+    }
+
     /// ln(1/α) for each of `tests` like tests in every frame: Bonferroni's share of the family's false alerts.
     pub fn threshold(&self, family: TestFamily, tests: f64) -> f64 {
         self.threshold_at(self.rate_hz, family, tests)

@@ -36,9 +36,14 @@ impl Association {
         self.track_of[i]
     }
 
-    /// Whether a claim is associated with this track.
+    /// Whether a claim or a known light is associated with this track.
     pub fn contains(&self, track: u64) -> bool {
         self.associated.contains(&track)
+    }
+
+    /// A known light is associated with this track.
+    pub fn assign_light(&mut self, track: u64) {
+        self.associated.insert(track);
     }
 
     pub fn assign(&mut self, i: usize, track: u64) {
@@ -126,6 +131,7 @@ mod tests {
             timing: &ClaimTiming::default(),
             crowding: Crowding::default(),
             alerts: &AlertLifecycle::new("replay".into(), None, 60.0),
+            of_lights: &BTreeSet::new(),
             store: &Store::new(&claims::Config::default()),
         };
         associate(claims, tracker, &eligibility).track_of

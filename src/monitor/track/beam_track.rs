@@ -106,7 +106,11 @@ impl Track {
         } else {
             detection.cov
         };
-        self.filter.update(detection.position, cov);
+        match detection.velocity {
+            // Filtering a posterior again would count the same light twice.
+            Some(velocity) => self.filter.adopt(detection.position, cov, velocity),
+            None => self.filter.update(detection.position, cov),
+        }
         self.last_hit = time;
         self.hit = true;
         self.merged_into = None;

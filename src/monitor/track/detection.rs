@@ -1,8 +1,9 @@
 //! One frame's emitters as the tracker takes them: position, covariance and the probability that each is clutter.
 
-use nalgebra::{Matrix2, Vector2};
+use nalgebra::{Matrix2, Matrix2x6, Vector2};
 
 use crate::estimate::{Emitter, Estimate, Flags};
+use crate::geo::View;
 use crate::monitor::stats::moment_score::MomentScore;
 use crate::optics::Camera;
 
@@ -19,6 +20,10 @@ pub const OVERLAP: f64 = 3.0;
 pub struct Detection {
     pub position: Vector2<f64>,
     pub cov: Matrix2<f64>,
+    /// ∂position/∂pose; zero for a fixed platform.
+    pub by_pose: Matrix2x6<f64>,
+    /// Velocity, m/s, where the estimator follows emitters over frames: position and covariance are then a posterior of all of them.
+    pub velocity: Option<Vector2<f64>>,
     pub energy_j: f64,
     pub flags: Flags,
     pub moments: MomentScore,
@@ -32,7 +37,7 @@ pub struct Detection {
 
 impl Detection {
     /// The emitters of an estimate whose position and covariance are finite, each with its clutter probability.
-    pub fn of(estimate: &Estimate, camera: &Camera) -> Vec<Self> {
+    pub fn of(estimate: &Estimate, view: &View) -> Vec<Self> {
         // A frame that the model explains badly has errors beyond its covariances.
         let inflation = if estimate.reduced_chi2.is_finite() {
             estimate.reduced_chi2.clamp(1.0, MAX_INFLATION)
@@ -45,36 +50,41 @@ impl Detection {
             .emitters
             .iter()
             .filter(is_finite)
-            .map(|e| Self::of_emitter(e, inflation, camera))
+            .filter_map(|e| Self::of_emitter(e, inflation, view))
             .collect();
         for i in 0..detections.len() {
-            detections[i].clutter_probability = clutter_probability(&detections, i, camera);
+            detections[i].clutter_probability = clutter_probability(&detections, i, view);
         }
         detections
     }
 
-    fn of_emitter(e: &Emitter, inflation: f64, camera: &Camera) -> Self {
-        let [[a, b], [_, c]] = e.cov_m2;
+    /// `None` where the emitter's ray does not come down to the ground.
+    fn of_emitter(e: &Emitter, inflation: f64, view: &View) -> Option<Self> {
+        let camera = &view.camera;
+        let placed = view.place(e.sensor_m, [e.x_m, e.y_m], e.cov_m2)?;
+        let [[a, b], [_, c]] = placed.cov_m2;
         let (a, c) = (a.max(0.0), c.max(0.0));
         // No correlation beyond ±1, whatever a learned estimator states.
         let most = a.sqrt() * c.sqrt();
         let b = b.clamp(-most, most);
         let cov = Matrix2::new(a, b, b, c) * inflation + Matrix2::identity() * POSITION_FLOOR_M.powi(2);
-        Self {
-            position: Vector2::new(e.x_m, e.y_m),
+        Some(Self {
+            position: placed.position_m,
             cov,
+            by_pose: placed.by_pose,
+            velocity: e.velocity.map(|v| Vector2::new(v.vx_m_s, v.vy_m_s)),
             energy_j: e.energy_j,
             flags: e.flags,
             moments: MomentScore::of(&e.second_moment, inflation),
             snr: snr(camera, e.energy_j) / inflation.sqrt(),
-            resolution_m: resolution_m(camera, snr(camera, e.energy_j)),
+            resolution_m: resolution_m(view, snr(camera, e.energy_j)),
             clutter_probability: 0.0,
-        }
+        })
     }
 
     /// This and `others` as one spot: all the light, its centre, and the second moments about it. A fit gives this of one
     /// emitter where it found one; where it found several in a spot, their number is nearly chance.
-    pub fn united<'a>(&'a self, others: impl Iterator<Item = &'a Self> + Clone, camera: &Camera) -> Self {
+    pub fn united<'a>(&'a self, others: impl Iterator<Item = &'a Self> + Clone, view: &View) -> Self {
         let all = || std::iter::once(self).chain(others.clone());
         let energy_j: f64 = all().map(|d| d.energy_j).sum();
         if others.clone().next().is_none() || !(energy_j > 0.0) {
@@ -83,7 +93,7 @@ impl Detection {
         let position = all()
             .map(|d| d.position * (d.energy_j / energy_j))
             .sum::<Vector2<f64>>();
-        let spot_m = spot_m(camera);
+        let spot_m = spot_m(view);
         let spread = all().map(|d| {
             let off = (d.position - position) / spot_m;
             off * off.transpose() * (d.energy_j / energy_j)
@@ -107,13 +117,13 @@ impl Detection {
 }
 
 /// σ of a spot on the ground, m.
-pub fn spot_m(camera: &Camera) -> f64 {
-    camera.spot_sigma_m * camera.ground_scale()
+pub fn spot_m(view: &View) -> f64 {
+    view.camera.spot_sigma_m * view.ground_scale()
 }
 
 /// Area of the view on the ground, m².
-pub fn view_m2(camera: &Camera) -> f64 {
-    let [width, height] = [camera.x.half_width(), camera.y.half_width()].map(|h| 2.0 * h * camera.ground_scale());
+pub fn view_m2(view: &View) -> f64 {
+    let [width, height] = [&view.camera.x, &view.camera.y].map(|axis| 2.0 * axis.half_width() * view.ground_scale());
     width * height
 }
 
@@ -126,17 +136,18 @@ pub fn snr(camera: &Camera, energy_j: f64) -> f64 {
 
 /// An equal pair is resolved at d ≥ 5 σ/√SNR (measured on the fit); never taken beyond 3 σ, where any two spots show two
 /// maxima.
-fn resolution_m(camera: &Camera, snr: f64) -> f64 {
+fn resolution_m(view: &View, snr: f64) -> f64 {
+    let camera = &view.camera;
     let sigma = camera.spot_sigma_m;
     let apart = 5.0 * sigma / snr.max(1e-3).sqrt();
     let pitch = camera.x.pitch_m.max(camera.y.pitch_m);
-    apart.max(0.5 * pitch).min(3.0 * sigma) * camera.ground_scale()
+    apart.max(0.5 * pitch).min(3.0 * sigma) * view.ground_scale()
 }
 
 /// Probability that detection `i` is spurious: rare on its own, common where one spot may have been split in two. Assumed, not
 /// measured; even the largest is no excuse for silence: nine detections in ten frames outweigh it, so that nobody gains
 /// more than a second by making the fit doubtful.
-fn clutter_probability(detections: &[Detection], i: usize, camera: &Camera) -> f64 {
+fn clutter_probability(detections: &[Detection], i: usize, view: &View) -> f64 {
     const ALONE: f64 = 1e-3;
     const NEIGHBOURED: f64 = 1e-2;
     const POORLY_FITTED: f64 = 0.03;
@@ -153,7 +164,7 @@ fn clutter_probability(detections: &[Detection], i: usize, camera: &Camera) -> f
         .intersects(Flags::NO_CONVERGENCE | Flags::POOR_FIT | Flags::ILL_CONDITIONED)
     {
         POORLY_FITTED
-    } else if nearest < OVERLAP * camera.spot_sigma_m * camera.ground_scale() {
+    } else if nearest < OVERLAP * spot_m(view) {
         NEIGHBOURED
     } else {
         ALONE
@@ -169,6 +180,8 @@ pub mod fixture {
         Detection {
             position: Vector2::new(x, y),
             cov: Matrix2::identity() * 0.01,
+            by_pose: Matrix2x6::zeros(),
+            velocity: None,
             energy_j: 1.0,
             flags: Flags::empty(),
             moments: MomentScore::default(),
@@ -186,6 +199,10 @@ mod tests {
     use crate::estimate;
     use crate::optics;
 
+    fn view() -> View {
+        View::level(&optics::Config::default().camera().unwrap())
+    }
+
     fn emitter(x_m: f64, cov_m2: [[f64; 2]; 2]) -> Emitter {
         Emitter {
             x_m,
@@ -194,6 +211,7 @@ mod tests {
             energy_j: 1e-3,
             energy_std_j: 1e-6,
             sensor_m: [0.0, 0.0],
+            velocity: None,
             second_moment: estimate::SecondMomentScore::default(),
             flags: Flags::empty(),
         }
@@ -205,7 +223,7 @@ mod tests {
             reduced_chi2,
             ..Estimate::default()
         };
-        Detection::of(&estimate, &optics::Config::default().camera().unwrap())
+        Detection::of(&estimate, &view())
     }
 
     #[test]
@@ -229,8 +247,7 @@ mod tests {
 
     #[test]
     fn clutter_is_rarer_the_better_a_detection_stands_alone() {
-        let camera = optics::Config::default().camera().unwrap();
-        let spot_m = spot_m(&camera);
+        let spot_m = spot_m(&view());
         let beside = |away: f64| {
             let cov = [[1e-4, 0.0], [0.0, 1e-4]];
             of(vec![emitter(0.0, cov), emitter(away, cov)], 1.0)[0].clutter_probability
@@ -241,17 +258,17 @@ mod tests {
         );
         let mut poor = detection(0.0, 0.0);
         poor.flags = Flags::POOR_FIT;
-        assert_eq!(clutter_probability(&[poor], 0, &camera), 0.03);
+        assert_eq!(clutter_probability(&[poor], 0, &view()), 0.03);
     }
 
     #[test]
     fn two_detections_of_one_spot_are_their_centre_of_light() {
-        let camera = optics::Config::default().camera().unwrap();
+        let view = view();
         let (mut a, b) = (detection(0.0, 0.0), detection(4.0, 0.0));
         a.energy_j = 3.0;
-        let both = a.united([&b].into_iter(), &camera);
+        let both = a.united([&b].into_iter(), &view);
         assert_eq!((both.energy_j, both.snr), (4.0, 200.0));
         assert!((both.position - Vector2::new(1.0, 0.0)).norm() < 1e-12);
-        assert_eq!(a.united(std::iter::empty(), &camera).position, a.position);
+        assert_eq!(a.united(std::iter::empty(), &view).position, a.position);
     }
 }

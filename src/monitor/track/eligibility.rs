@@ -1,6 +1,8 @@
 //! Whether a beam may be that of a user who is not known by one yet: it is near their claim by more than chance, and has not walked
 //! onto it.
 
+use std::collections::BTreeSet;
+
 use jiff::Timestamp;
 use nalgebra::Vector2;
 
@@ -29,6 +31,8 @@ pub struct Eligibility<'a> {
     pub timing: &'a ClaimTiming,
     pub crowding: Crowding,
     pub alerts: &'a AlertLifecycle,
+    /// Tracks of known lights.
+    pub of_lights: &'a BTreeSet<u64>,
     pub store: &'a Store,
 }
 
@@ -36,6 +40,10 @@ impl Eligibility<'_> {
     /// `owner` is the claim that the track was associated with in the frame before.
     pub fn allows(&self, claim: &ActiveClaim, track: &Track, owner: Option<&ActiveClaim>) -> bool {
         if claim.before.track != Some(track.id) && claim.age_s > self.freshness_s(claim) {
+            return false;
+        }
+        // Who claims to be where a known light is must bring a beam of their own.
+        if self.of_lights.contains(&track.id) {
             return false;
         }
         if claim.before.is_established() {

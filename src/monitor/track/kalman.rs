@@ -9,6 +9,8 @@ use crate::monitor::stats::gaussian::mahalanobis2;
 const ACCELERATION: f64 = 1.5;
 /// Standard deviation of an unknown velocity, m/s, and so of one after a manoeuvre. Larger widens the gate of a new track.
 const SPEED_STD: f64 = 8.0;
+/// Time, s, within which an adopted velocity may have changed by the acceleration. Longer widens the gate after a missed frame.
+const ADOPTED_S: f64 = 1.0;
 /// Squared Mahalanobis innovation past which the beam has manoeuvred: χ² of two degrees exceeds it once in 3,000. Smaller loses
 /// the velocity to noise, larger follows a jump later.
 const MANOEUVRE: f64 = 16.0;
@@ -87,6 +89,15 @@ impl KalmanFilter {
         let left = Matrix4::identity() - gain * h;
         let joseph = left * self.cov * left.transpose() + gain * r * gain.transpose();
         self.cov = 0.5 * (joseph + joseph.transpose());
+    }
+
+    /// Takes over a position, m, of covariance `r`, m², and a velocity, m/s, that hold all that was measured until now.
+    pub fn adopt(&mut self, z: Vector2<f64>, r: Matrix2<f64>, velocity: Vector2<f64>) {
+        *self = Self::start(z, r);
+        for k in 0..2 {
+            self.state[k + 2] = velocity[k];
+            self.cov[(k + 2, k + 2)] = ACCELERATION * ADOPTED_S;
+        }
     }
 
     pub fn position(&self) -> Vector2<f64> {

@@ -5,6 +5,7 @@ pub(super) mod beam_track;
 pub(super) mod detection;
 pub(super) mod eligibility;
 pub(super) mod kalman;
+pub(super) mod registration;
 pub(super) mod tracker;
 pub(super) mod user_track;
 pub(super) mod user_tracks;

@@ -43,8 +43,15 @@ impl Tracker {
         self.max_score = max_score;
     }
 
-    /// Links one frame's detections to the tracks; `dt_s` is the time since the last frame, s.
+    /// Predicts the tracks, and links one frame's detections to them.
+    #[cfg(test)]
     pub fn step(&mut self, time: Timestamp, detections: &[Detection], dt_s: f64) {
+        self.predict(time);
+        self.take(time, detections, dt_s);
+    }
+
+    /// Predicts every track to `time`.
+    pub fn predict(&mut self, time: Timestamp) {
         let elapsed = self.time.map_or(0.0, |t| seconds(t, time)).max(0.0);
         self.time = Some(time);
         if elapsed > FORGET_AFTER_S {
@@ -53,6 +60,10 @@ impl Tracker {
         for track in &mut self.tracks {
             track.filter.predict(elapsed);
         }
+    }
+
+    /// Links one frame's detections to the tracks, which are predicted to its time; `dt_s` is the time since the last frame, s.
+    pub fn take(&mut self, time: Timestamp, detections: &[Detection], dt_s: f64) {
         let owner = self.link(detections);
         let mut hit = vec![None; self.tracks.len()];
         for (j, o) in owner.iter().enumerate() {

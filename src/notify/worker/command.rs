@@ -1,13 +1,13 @@
 //! What operators ask of the worker: enable, replay, test, and other endpoints after a reload.
 
-use std::sync::Arc;
 use std::time::Duration;
 
+use reqwest::StatusCode;
 use tokio::sync::oneshot;
 
 use super::Worker;
 use crate::journal::{self, Journal};
-use crate::notify::client::{self, Failure};
+use crate::notify::channel::{Failure, Message, Verdict};
 use crate::notify::status::TestOutcome;
 use crate::notify::{AskError, Clock, Endpoint, payload};
 
@@ -97,12 +97,13 @@ impl Worker {
                     return;
                 }
                 lane.tested_at = Some(now);
-                let request = test(lane.endpoint.clone(), self.journal.id().to_owned(), self.clock);
-                tokio::spawn(async move { done.send(Ok(request.await)) });
+                let (endpoint, journal, clock) = (lane.endpoint.clone(), self.journal.clone(), self.clock);
+                tokio::spawn(async move { done.send(Ok(send_test(&endpoint, journal.id(), clock).await)) });
             }
             Command::Replace { endpoints, done } => {
-                self.journal
-                    .subscribe(endpoints.iter().map(Endpoint::subscription).collect());
+                let before: Vec<String> = self.lanes.iter().map(|lane| lane.endpoint.name.clone()).collect();
+                let subscriptions: Vec<_> = endpoints.iter().map(Endpoint::subscription).collect();
+                self.journal.resubscribe(&before, &subscriptions);
                 self.replace(endpoints);
                 self.show(self.clock.uptime());
                 let _ = done.send(());
@@ -111,20 +112,25 @@ impl Worker {
     }
 }
 
-/// Sends a test event like any other, but once and beside the queue.
-async fn test(endpoint: Arc<Endpoint>, journal: String, clock: Clock) -> TestOutcome {
+/// Sends a test event like any other, but once and beside the queue. `journal` is the name in its id.
+pub async fn send_test(endpoint: &Endpoint, journal: &str, clock: Clock) -> TestOutcome {
     let now = clock.now();
     let id = format!("msg_{journal}_test_{}", now.as_millisecond());
     let began = clock.uptime();
-    let request = client::post(&endpoint, &id, payload::test_body(now), now);
-    let answer = tokio::time::timeout(TEST_TIMEOUT, request).await;
-    let (status, failure) = match answer.unwrap_or(Err(Failure::Timeout)) {
-        Ok(answer) => (Some(answer.status.as_u16()), answer.failure()),
-        Err(failure) => (None, Some(failure)),
+    let message = Message {
+        id: &id,
+        event: &payload::test_event(now),
+        is_test: true,
+        now,
+    };
+    let (status, failure) = match super::deliver(endpoint, message, TEST_TIMEOUT).await {
+        Verdict::Delivered(status) => (status, None),
+        Verdict::Gone | Verdict::Expired => (Some(StatusCode::GONE), Some(Failure::Status(StatusCode::GONE))),
+        Verdict::Failed { failure, .. } => (failure.status(), Some(failure)),
     };
     TestOutcome {
         delivered: failure.is_none(),
-        status,
+        status: status.map(|status| status.as_u16()),
         took_ms: (clock.uptime() - began).as_millis() as u64,
         error: failure.map(|failure| failure.to_string()),
     }

@@ -75,6 +75,7 @@ impl Lane {
     pub(super) fn change(&mut self, endpoint: Arc<Endpoint>) {
         let shown = EndpointStatus::new(&endpoint);
         self.status.url = shown.url;
+        self.status.kind = shown.kind;
         self.status.kinds = shown.kinds;
         self.cool_down.set_period(endpoint.cool_down);
         self.endpoint = endpoint;
@@ -92,7 +93,7 @@ impl Lane {
         if self.is_known && self.read_to >= last {
             return None;
         }
-        let (name, after) = (self.endpoint.name().to_owned(), self.read_to);
+        let (name, after) = (self.endpoint.name.clone(), self.read_to);
         let (is_cooled, begun_at) = (!self.cool_down.is_off(), self.begun_at);
         let held = self.journal.waiting_in_memory(&name, after).and_then(|(rows, is_all)| {
             let rows = rows.into_iter().filter(|row| !self.ahead.contains(&row.seq)).collect();
@@ -160,7 +161,7 @@ impl Lane {
         status.last_error = status.last_error.take().or(record.last_error);
         if record.disabled_at.is_some() {
             tracing::warn!(
-                endpoint = self.endpoint.name(),
+                endpoint = self.endpoint.name.as_str(),
                 "this webhook's receiver answered 410 Gone; nothing is sent until it is enabled"
             );
             self.queue.disable();
@@ -191,8 +192,8 @@ impl Lane {
             }
             Ruling::Withhold(rows) => {
                 self.status.withheld += rows.len() as u64;
-                let name = self.endpoint.name();
-                counter!(metric::WEBHOOK_ATTEMPTS, "endpoint" => name.to_owned(), "outcome" => "withheld")
+                let name = &self.endpoint.name;
+                counter!(metric::WEBHOOK_ATTEMPTS, "endpoint" => name.clone(), "outcome" => "withheld")
                     .increment(rows.len() as u64);
                 for row in rows {
                     self.journal.attempted(Attempt {

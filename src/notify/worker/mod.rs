@@ -14,13 +14,14 @@ use rand_chacha::ChaCha8Rng;
 use tokio::sync::mpsc;
 use tokio::task::{Id, JoinError, JoinSet};
 
-use super::client::{self, Failure, Verdict};
+use super::channel::{Failure, Message, Verdict};
 use super::queue::Next;
 use super::status::{EndpointState, EndpointStatus};
 use super::{Clock, Endpoint};
 use crate::journal::{Attempt, Journal, Outcome};
 use crate::metric;
 pub(super) use command::Command;
+pub use command::send_test;
 use lane::{Found, Lane};
 
 /// How long requests that are under way may still take when the daemon stops.
@@ -76,7 +77,7 @@ impl Worker {
         let begun_at = self.journal.last_seq();
         let mut before = std::mem::take(&mut self.lanes);
         for endpoint in endpoints.into_iter().map(Arc::new) {
-            let kept = before.iter().position(|lane| lane.endpoint.name() == endpoint.name());
+            let kept = before.iter().position(|lane| lane.endpoint.name == endpoint.name);
             let lane = match kept {
                 Some(k) => {
                     let mut lane = before.swap_remove(k);
@@ -91,7 +92,7 @@ impl Worker {
             self.lanes.push(lane);
         }
         for lane in before {
-            let name = lane.endpoint.name().to_owned();
+            let name = lane.endpoint.name.clone();
             for metric in [
                 metric::WEBHOOK_QUEUED,
                 metric::WEBHOOK_OLDEST,
@@ -107,7 +108,7 @@ impl Worker {
     }
 
     fn named(&self, name: &str) -> Option<usize> {
-        self.lanes.iter().position(|lane| lane.endpoint.name() == name)
+        self.lanes.iter().position(|lane| lane.endpoint.name == name)
     }
 
     pub(super) async fn run(mut self, shutdown: impl Future<Output = ()>) {
@@ -179,13 +180,7 @@ impl Worker {
     }
 
     fn settle(&mut self, ended: Result<(Id, Verdict), JoinError>) {
-        let (id, verdict) = ended.unwrap_or_else(|error| {
-            let verdict = Verdict::Failed {
-                failure: Failure::Broken,
-                retry_after: None,
-            };
-            (error.id(), verdict)
-        });
+        let (id, verdict) = ended.unwrap_or_else(|error| (error.id(), Failure::Broken.into()));
         let Some((of, seq)) = self.under_way.remove(&id) else {
             return;
         };
@@ -194,13 +189,13 @@ impl Worker {
         let Some(lane) = self.lanes.iter_mut().find(|lane| lane.id == of) else {
             return;
         };
-        let name = lane.endpoint.name();
+        let name = lane.endpoint.name.as_str();
         let count = |outcome: &'static str| {
             counter!(metric::WEBHOOK_ATTEMPTS, "endpoint" => name.to_owned(), "outcome" => outcome).increment(1);
         };
         let was_failing = lane.queue.is_failing();
         let (next, error) = match verdict {
-            Verdict::Delivered => {
+            Verdict::Delivered(_) => {
                 count("delivered");
                 lane.status.sent += 1;
                 lane.status.last_success = Some(at);
@@ -289,7 +284,7 @@ impl Worker {
             let age = status
                 .oldest_queued
                 .map_or(0.0, |at| wall.duration_since(at).as_secs_f64().max(0.0));
-            let name = lane.endpoint.name();
+            let name = lane.endpoint.name.as_str();
             gauge!(metric::WEBHOOK_QUEUED, "endpoint" => name.to_owned()).set(status.queued as f64);
             gauge!(metric::WEBHOOK_OLDEST, "endpoint" => name.to_owned()).set(age);
             gauge!(metric::WEBHOOK_DEAD_LETTERS, "endpoint" => name.to_owned()).set(status.failed as f64);
@@ -300,16 +295,27 @@ impl Worker {
 }
 
 async fn attempt(journal: Journal, endpoint: Arc<Endpoint>, seq: u64, clock: Clock) -> Verdict {
-    let id = format!("msg_{}_{seq}", journal.id());
+    let id = journal.event_id(seq);
     let found = tokio::task::spawn_blocking(move || journal.event(seq)).await;
-    let failure = match found {
-        Ok(Ok(Some(event))) => return client::send(&endpoint, &id, &event, clock.now()).await,
+    let event = match found {
+        Ok(Ok(Some(event))) => event,
         Ok(Ok(None)) => return Verdict::Expired,
-        Err(_) => Failure::Broken,
-        Ok(Err(error)) => Failure::Journal(error),
+        Ok(Err(error)) => return Failure::Journal(error).into(),
+        Err(_) => return Failure::Broken.into(),
     };
-    Verdict::Failed {
-        failure,
-        retry_after: None,
-    }
+    let message = Message {
+        id: &id,
+        event: &event,
+        is_test: false,
+        now: clock.now(),
+    };
+    deliver(&endpoint, message, endpoint.timeout).await
+}
+
+/// One attempt, which ends in time.
+async fn deliver(endpoint: &Endpoint, message: Message<'_>, timeout: Duration) -> Verdict {
+    let delivery = endpoint.channel.deliver(message);
+    tokio::time::timeout(timeout, delivery)
+        .await
+        .unwrap_or_else(|_| Failure::Timeout.into())
 }

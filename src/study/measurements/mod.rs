@@ -1,17 +1,20 @@
-//! Measurements over many random stories: how often honest users raise an alert, how often and how soon an attack does, and how
-//! much error a calibration leaves.
+//! Measurements over many random stories: how often honest users raise an alert, how often and how soon an attack does, how
+//! much error a calibration leaves, and what zones and known lights hide.
 
 mod alone;
 mod calibration;
+mod formats;
+mod lens;
 mod measured;
 mod pixels;
+mod zones;
 
 pub use measured::Measured;
 
 /// Something to measure.
 pub struct Measurement {
     pub name: &'static str,
-    /// Stories (devices of a calibration), unless another number is asked for.
+    /// Stories (devices of a calibration, frames of a format), unless another number is asked for.
     pub stories: u64,
     run: fn(stories: u64, seed: u64) -> Measured,
 }
@@ -36,6 +39,9 @@ pub const ALL: &[Measurement] = &[
     measurement("stranger-in-crowd", 200, pixels::strangers_in_crowd),
     measurement("shadow", 10, pixels::shadows),
     measurement("calibration", 5, calibration::error_left),
+    measurement("lens", 40, lens::lenses),
+    measurement("zones", 40, zones::known_lights_and_zones),
+    measurement("formats", 200, formats::cost),
 ];
 
 const fn measurement(name: &'static str, stories: u64, run: fn(u64, u64) -> Measured) -> Measurement {

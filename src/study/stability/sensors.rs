@@ -1,7 +1,7 @@
 //! Extreme cameras and units.
 
 use super::emitters::LIMIT;
-use super::trial::{Source, camera, energy, expose, observe};
+use super::trial::{Source, anywhere, camera, energy, expose, observe};
 use super::{Case, false_alarms_allowed};
 use crate::optics::{BlurConfig, Camera, Config};
 
@@ -77,7 +77,73 @@ pub(super) fn cases() -> Vec<Case> {
             || camera([32, 32], 1e-3),
         ));
     }
+    for (name, width, noise, is_sampled, saturation) in [
+        ("no noise", 1.0, 0.0, false, f64::INFINITY),
+        (
+            "no noise, 1.4 % narrower than configured",
+            0.986,
+            0.0,
+            false,
+            f64::INFINITY,
+        ),
+        ("10 % wider than configured", 1.1, 1.0, false, f64::INFINITY),
+        ("no noise, 10 % wider than configured", 1.1, 0.0, false, f64::INFINITY),
+        ("sampled instead of integrated", 1.0, 0.0, true, f64::INFINITY),
+        ("saturated at half of its peak", 1.0, 1.0, false, 0.5),
+    ] {
+        cases.push(brightest(name, width, noise, is_sampled, saturation));
+    }
     cases
+}
+
+/// A spot of a peak of 10⁵ standard deviations that is not as the config says.
+fn brightest(name: &'static str, width: f64, noise: f64, is_sampled: bool, saturation: f64) -> Case {
+    const PEAK: f64 = 1e5;
+    Case::new(
+        GROUP,
+        format!("brightest beam: {name}"),
+        "at this signal-to-noise ratio no hypothesis explains the frame",
+        "an emitter within a pixel of it",
+        move |options| {
+            let mut camera = camera([64, 64], 1e-3);
+            let peak_j = PEAK * camera.noise_std_j;
+            if saturation.is_finite() {
+                camera.saturation_j = Some(saturation * peak_j);
+            }
+            let shown = Camera {
+                spot_sigma_m: width * camera.spot_sigma_m,
+                noise_std_j: noise * camera.noise_std_j,
+                ..camera.clone()
+            };
+            let tally = observe(options, &camera, |rng| {
+                let at = anywhere(&camera, 3e-3, rng);
+                let area = std::f64::consts::TAU * shown.spot_sigma_m.powi(2) / (camera.x.pitch_m * camera.y.pitch_m);
+                let source = Source {
+                    sensor_m: at,
+                    energy_j: peak_j * area,
+                };
+                let mut frame = expose(&shown, &[source], rng);
+                for ((b, a), pixel) in frame.pixels.indexed_iter_mut() {
+                    if is_sampled {
+                        let d2 = (camera.x.centre(a) - at[0]).powi(2) + (camera.y.centre(b) - at[1]).powi(2);
+                        *pixel = peak_j * (-0.5 * d2 / shown.spot_sigma_m.powi(2)).exp();
+                    }
+                    *pixel = pixel.min(camera.saturation_limit_j());
+                }
+                (frame, vec![source])
+            });
+            let missed = tally
+                .estimates()
+                .filter(|(truth, estimate)| {
+                    estimate.emitters.iter().all(|e| {
+                        let d = [0, 1].map(|k| e.sensor_m[k] - truth[0].sensor_m[k]);
+                        d[0].hypot(d[1]) > camera.x.pitch_m
+                    })
+                })
+                .count();
+            tally.observed(missed == 0, &format!("missed in {missed} frames"))
+        },
+    )
 }
 
 fn shows(name: String, hard: &'static str, camera: impl Fn() -> Camera + 'static) -> Case {

@@ -68,6 +68,7 @@ fn clock_step(by_s: f64) -> Case {
                     time,
                     result: Ok(&estimate),
                     digest: frame + 1,
+                    look: crate::monitor::Look::Level,
                 };
                 let report = monitor.step(seen, &mut store);
                 let news = report
@@ -123,7 +124,9 @@ fn claim(time: Timestamp) -> Claim {
         user: "u-1".to_owned(),
         x_m: 10.0,
         y_m: -20.0,
+        z_m: None,
         sigma_m: Some(1.0),
+        cov_m2: None,
         power_w: None,
         state: ClaimState::Active,
     }
@@ -138,6 +141,7 @@ fn emitter(camera: &Camera, frame: u64, [x_m, y_m]: [f64; 2], cov_m2: [[f64; 2];
         energy_j: 7e-3,
         energy_std_j: 1e-5,
         sensor_m: camera.to_sensor([x_m, y_m]),
+        velocity: None,
         second_moment: SecondMomentScore::default(),
         flags: Flags::empty(),
     }
@@ -148,6 +152,7 @@ fn estimate(emitters: Vec<Emitter>) -> Estimate {
         emitters,
         estimator: "study",
         reduced_chi2: 1.0,
+        spot_error: 0.0,
         condition: 1.0,
         ..Estimate::default()
     }
@@ -185,6 +190,7 @@ fn covariance(name: &str, hard: &'static str, cov_m2: [[f64; 2]; 2]) -> Case {
                     time,
                     result: Ok(&estimate),
                     digest: frame + 1,
+                    look: crate::monitor::Look::Level,
                 };
                 let report = monitor.step(seen, &mut store);
                 malformed += report

@@ -7,7 +7,7 @@ mod telling;
 pub use telling::{Told, claims, tally, tell, tell_with};
 
 use crate::claim::Claim;
-use crate::monitor::Config;
+use crate::monitor::{AlertEvent, Config, Monitor};
 use crate::optics::{self, Camera};
 use jiff::{SignedDuration, Timestamp};
 use rand::{RngExt, SeedableRng};
@@ -28,6 +28,12 @@ pub struct Actor {
     pub states_sigma: bool,
     pub ended_at: Option<f64>,
     pub energy_j: f64,
+    /// Factor on the energy at a time.
+    pub glow: Box<dyn Fn(f64) -> f64>,
+    /// Standard deviation of a frame's energy over its mean. A beam has 25 %.
+    pub fading: f64,
+    /// The actor before this one that it is a reflection of: it fades with that.
+    pub reflects: Option<usize>,
     /// Power that the claims state.
     pub reports_w: Option<f64>,
 }
@@ -45,6 +51,9 @@ impl Actor {
             states_sigma: true,
             ended_at: None,
             energy_j: 0.007,
+            glow: Box::new(|_| 1.0),
+            fading: 0.25,
+            reflects: None,
             reports_w: None,
         }
     }
@@ -60,7 +69,18 @@ impl Actor {
             states_sigma: true,
             ended_at: None,
             energy_j: 0.007,
+            glow: Box::new(|_| 1.0),
+            fading: 0.25,
+            reflects: None,
             reports_w: None,
+        }
+    }
+
+    /// A light that nobody claims: steady to 2 %.
+    pub fn lamp(path: impl Fn(f64) -> Option<[f64; 2]> + 'static) -> Self {
+        Self {
+            fading: 0.02,
+            ..Self::intruder(path)
         }
     }
 
@@ -112,6 +132,8 @@ pub struct Story {
     pub forged: Vec<(f64, Claim)>,
     /// The monitor is killed and started again then.
     pub restarts_at: Option<f64>,
+    /// What the operator does before the frame at a time, after these events.
+    pub operator: Box<dyn Fn(f64, &mut Monitor, &[AlertEvent])>,
 }
 
 impl Story {
@@ -133,6 +155,7 @@ impl Story {
             monitor: Config::default(),
             forged: Vec::new(),
             restarts_at: None,
+            operator: Box::new(|_, _, _| {}),
         }
     }
 }

@@ -86,18 +86,21 @@ fn detect(story: &Story, t: f64, rng: &mut ChaCha8Rng) -> Vec<Emitter> {
     let shift = (story.shift)(t);
     let [s, a] = (story.turn)(t);
     let mut spots: Vec<([f64; 2], f64)> = Vec::new();
-    for actor in &story.actors {
+    let mut fadings = vec![1.0; story.actors.len()];
+    for (k, actor) in story.actors.iter().enumerate() {
         let Some([x, y]) = (actor.beam)(t) else { continue };
         let p = [x + shift[0] + s * x - a * y, y + shift[1] + a * x + s * y];
         if !camera.sees(p) || rng.random::<f64>() >= story.detected {
             continue;
         }
-        // Ten coherence times a frame: 29 % scintillation.
-        let fading = Normal::<f64>::new(1.0, 0.25)
-            .expect("a standard deviation")
-            .sample(rng)
-            .clamp(0.3, 2.5);
-        spots.push((p, actor.energy_j * fading));
+        // A beam's ten coherence times a frame: 29 % scintillation.
+        let own = || Normal::<f64>::new(1.0, actor.fading).expect("a standard deviation");
+        fadings[k] = match actor.reflects {
+            Some(of) => fadings[of],
+            None => own().sample(rng).clamp(0.3, 2.5),
+        };
+        let fading = fadings[k];
+        spots.push((p, actor.energy_j * fading * (actor.glow)(t)));
     }
     if rng.random::<f64>() < story.ghosts {
         spots.push(([rng.random_range(-120.0..120.0), rng.random_range(-120.0..120.0)], 1e-3));
@@ -140,6 +143,7 @@ fn detect(story: &Story, t: f64, rng: &mut ChaCha8Rng) -> Vec<Emitter> {
                 energy_j,
                 energy_std_j: 1e-5,
                 sensor_m: camera.to_sensor([x_m, y_m]),
+                velocity: None,
                 second_moment: score(&blob, story, &camera, &mut shapes),
                 flags: Flags::empty(),
             }
@@ -176,7 +180,9 @@ pub fn claims(story: &Story) -> Vec<(f64, Claim)> {
                         user: user.clone(),
                         x_m: x + ex,
                         y_m: y + ey,
+                        z_m: None,
                         sigma_m: actor.states_sigma.then_some(actor.sigma_m),
+                        cov_m2: None,
                         power_w: actor.reports_w,
                         state: if over { ClaimState::Ended } else { ClaimState::Active },
                     },
@@ -221,6 +227,7 @@ pub fn tell_with(story: &Story, keep: bool) -> Told {
             monitor = Monitor::new(&story.monitor, &config, &camera, source.clone());
             monitor.restore(open.into_values().collect());
         }
+        (story.operator)(t, &mut monitor, &events);
         while let Some((_, claim)) = upcoming.next_if(|(comes, _)| *comes <= t + 1e-9) {
             store.insert(claim, at(t));
         }
@@ -234,6 +241,7 @@ pub fn tell_with(story: &Story, keep: bool) -> Told {
             emitters: detect(story, t, &mut rng),
             estimator: "story",
             reduced_chi2: 1.0,
+            spot_error: 0.0,
             saturated_share: 0.0,
             condition: 1.0,
             steps: 0,
@@ -269,6 +277,7 @@ pub fn tell_with(story: &Story, keep: bool) -> Told {
             time: at(t),
             result: error.as_ref().map_or(Ok(&estimate), Err),
             digest,
+            look: crate::monitor::Look::Level,
         };
         let report = monitor.step(seen, &mut store);
         events.extend(report.events.iter().cloned());

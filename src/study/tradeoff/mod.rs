@@ -11,7 +11,7 @@ mod score;
 
 use std::path::Path;
 
-use crate::estimate::{ESTIMATORS, Learned};
+use crate::estimate::Learned;
 pub(in crate::study) use networks::Candidate;
 pub(in crate::study) use scene::Scene;
 pub(in crate::study) use score::{Answer, CUTOFF_M, bound_ratio};
@@ -21,6 +21,7 @@ pub use error::{Error, PictureError};
 pub use networks::{Trained, Training};
 pub use oracle::Oracle;
 pub use scene::{Cell, Noise};
+pub(super) use score::of_single_frames;
 pub use score::{Row, Study};
 
 /// Cells, estimators and frames to measure.
@@ -121,7 +122,7 @@ fn cells_under(condition: Condition) -> [Cell; 3] {
 
 fn names() -> Vec<&'static str> {
     let learned = Learned::ALL.into_iter().map(Learned::name);
-    ESTIMATORS.iter().map(|r| r.name).chain(learned).collect()
+    of_single_frames().map(|r| r.name).chain(learned).collect()
 }
 
 /// Runs what `out` does not hold yet and writes tradeoff.json after each row, tradeoff.md and the pictures at the end.

@@ -6,7 +6,7 @@ use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, Pos, VPos};
 
 use super::report::{PAPER, cells, front, is_paper_cell};
-use super::{Error, PictureError, Row, Study};
+use super::{Error, PictureError, Row, Study, of_single_frames};
 use crate::estimate::ESTIMATORS;
 
 const SIZE: (u32, u32) = (900, 600);
@@ -151,8 +151,7 @@ fn accuracy_against_array(study: &Study, path: &Path) -> Drawn {
         .y_label_formatter(&|v| format!("{v:.0e}"))
         .label_style(FONT)
         .draw()?;
-    let mut lines: Vec<(String, Vec<(f64, f64)>)> = ESTIMATORS
-        .iter()
+    let mut lines: Vec<(String, Vec<(f64, f64)>)> = of_single_frames()
         .map(|spec| {
             let own = rows.iter().filter(|r| r.estimator == spec.name);
             (

@@ -2,8 +2,8 @@
 
 use std::fmt::Write;
 
-use super::{Noise, Row, Study};
-use crate::estimate::{DEFAULT, ESTIMATORS, Learned};
+use super::{Noise, Row, Study, of_single_frames};
+use crate::estimate::{DEFAULT, Learned};
 
 /// Array sizes, and the mean squared errors that the paper reports there for its hybrid and its U-Net, m².
 pub(super) const PAPER: [(usize, f64, f64); 6] = [
@@ -68,7 +68,7 @@ pub(super) fn markdown(study: &Study) -> String {
         let of = |rows: &[Row]| rows.iter().filter(|r| is_of(&r.estimator, name)).count();
         format!("on the front in {} of {} cells", of(&fronts), of(&study.rows))
     };
-    for spec in ESTIMATORS {
+    for spec in of_single_frames() {
         let default = if spec.name == DEFAULT { " (default)" } else { "" };
         let _ = writeln!(
             text,
@@ -138,7 +138,7 @@ pub(super) fn markdown(study: &Study) -> String {
 /// The paper's errors by array size, and those of every estimator that has a row among the cells that `is_wanted` names.
 fn beside(text: &mut String, study: &Study, is_wanted: impl Fn(&Row) -> bool) {
     let rows: Vec<&Row> = study.rows.iter().filter(|r| is_wanted(r)).collect();
-    let mut names: Vec<&str> = ESTIMATORS.iter().map(|r| r.name).collect();
+    let mut names: Vec<&str> = of_single_frames().map(|r| r.name).collect();
     for row in &rows {
         if !names.contains(&row.estimator.as_str()) {
             names.push(&row.estimator);

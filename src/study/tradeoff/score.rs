@@ -8,7 +8,7 @@ use super::Error;
 use super::networks::{Candidate, Training};
 use super::scene::{Cell, Scene};
 use crate::assign::ospa;
-use crate::estimate;
+use crate::estimate::{self, ESTIMATORS, EstimatorSpec};
 
 /// OSPA's cutoff, m.
 pub(in crate::study) const CUTOFF_M: f64 = 25.0;
@@ -197,4 +197,9 @@ fn quantile(sorted: &[f64], share: f64) -> Option<f64> {
     sorted
         .get(((sorted.len().max(1) - 1) as f64 * share).round() as usize)
         .copied()
+}
+
+/// The estimators of single frames: each of the trade-off's frames is a scene of its own.
+pub(in crate::study) fn of_single_frames() -> impl Iterator<Item = &'static EstimatorSpec> {
+    ESTIMATORS.iter().filter(|r| !r.remembers())
 }

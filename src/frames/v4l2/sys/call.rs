@@ -17,12 +17,13 @@ pub trait Zeroed: Sized {
 impl Zeroed for c::v4l2_capability {}
 impl Zeroed for c::v4l2_fmtdesc {}
 impl Zeroed for c::v4l2_frmsizeenum {}
+impl Zeroed for c::v4l2_frmivalenum {}
 impl Zeroed for c::v4l2_format {}
 impl Zeroed for c::v4l2_streamparm {}
 impl Zeroed for c::v4l2_queryctrl {}
 impl Zeroed for c::v4l2_requestbuffers {}
 impl Zeroed for c::v4l2_buffer {}
-impl Zeroed for c::v4l2_plane {}
+impl Zeroed for [c::v4l2_plane; 8] {}
 
 /// `argument` must be the struct that `request` is defined for: every call in this module pairs them as the V4L2
 /// headers do, and the request number carries the struct's size.

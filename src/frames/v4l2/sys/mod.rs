@@ -12,7 +12,7 @@ mod stream;
 
 use std::time::Duration;
 
-pub use node::{Format, Node, Sizes};
+pub use node::{Colour, Format, Node, Sizes};
 pub use stream::{Meta, Stream};
 
 /// Time since an arbitrary start, on the clock that drivers stamp frames with.

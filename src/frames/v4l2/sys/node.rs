@@ -10,6 +10,9 @@ use v4l::v4l2::vidioc;
 
 use super::call::{Zeroed, ioctl, text};
 
+/// VIDEO_MAX_PLANES.
+pub(super) const MOST_PLANES: usize = 8;
+
 /// Identity of a node.
 #[derive(Clone, Debug)]
 pub struct Capability {
@@ -43,6 +46,22 @@ pub enum Sizes {
     },
 }
 
+impl Sizes {
+    /// The size to use: of a range `wished` where it is one of it, otherwise the largest, which a driver may make by scaling.
+    pub fn choice(self, wished: [u32; 2]) -> [u32; 2] {
+        match self {
+            Self::One { width, height } => [width, height],
+            Self::Range { min, max, step } => {
+                let is_one = |k: usize| {
+                    let above = wished[k].checked_sub(min[k]).filter(|_| wished[k] <= max[k]);
+                    above.is_some_and(|above| above.checked_rem(step[k]).is_none_or(|r| r == 0))
+                };
+                if is_one(0) && is_one(1) { wished } else { max }
+            }
+        }
+    }
+}
+
 /// An image format, as asked for or as granted.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Format {
@@ -51,8 +70,19 @@ pub struct Format {
     pub height: u32,
     /// Bytes from one row to the next.
     pub stride: u32,
-    /// Bytes of a whole image.
+    /// Bytes of a whole image, or of its first plane.
     pub size: u32,
+    pub colour: Colour,
+    /// Planes of a frame, each in a buffer of its own; the first holds what is read.
+    pub planes: u8,
+}
+
+/// How a driver says that counts follow from light, in V4L2's numbers; 0 leaves it to the colour space.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Colour {
+    pub space: u32,
+    pub quantisation: u32,
+    pub transfer: u32,
 }
 
 /// An open device node, non-blocking.
@@ -179,16 +209,22 @@ impl Node {
                 height: pix.height,
                 stride: pix.bytesperline,
                 size: pix.sizeimage,
+                colour: Colour {
+                    space: pix.colorspace,
+                    quantisation: pix.quantization,
+                    transfer: pix.xfer_func,
+                },
+                planes: 1,
             });
         }
         // SAFETY: as above, for the multi-planar buffer type.
         let pix = unsafe { raw.fmt.pix_mp };
         // Copied, since the struct is packed.
         let (plane, planes) = (pix.plane_fmt[0], pix.num_planes);
-        if planes != 1 {
+        if !(1..=MOST_PLANES).contains(&usize::from(planes)) {
             return Err(io::Error::new(
-                io::ErrorKind::Unsupported,
-                format!("an image of {planes} planes; expected one"),
+                io::ErrorKind::InvalidData,
+                format!("an image of {planes} planes; V4L2 has one to {MOST_PLANES}"),
             ));
         }
         Ok(Format {
@@ -197,7 +233,30 @@ impl Node {
             height: pix.height,
             stride: plane.bytesperline,
             size: plane.sizeimage,
+            colour: Colour {
+                space: pix.colorspace,
+                quantisation: pix.quantization.into(),
+                transfer: pix.xfer_func.into(),
+            },
+            planes,
         })
+    }
+
+    /// The highest frame rate of a format and size, Hz, where the node lists it.
+    pub fn fastest_hz(&self, fourcc: u32, [width, height]: [u32; 2]) -> Option<f64> {
+        let rate = |index| {
+            let mut raw = c::v4l2_frmivalenum::zeroed();
+            (raw.index, raw.pixel_format, raw.width, raw.height) = (index, fourcc, width, height);
+            ioctl(&self.fd, vidioc::VIDIOC_ENUM_FRAMEINTERVALS, &mut raw).ok()?;
+            let interval = match raw.type_ == c::v4l2_frmivaltypes_V4L2_FRMIVAL_TYPE_DISCRETE {
+                // SAFETY: the type says which member the kernel filled; both are integers.
+                true => unsafe { raw.__bindgen_anon_1.discrete },
+                // SAFETY: as above.
+                false => unsafe { raw.__bindgen_anon_1.stepwise.min },
+            };
+            Some(f64::from(interval.denominator) / f64::from(interval.numerator.max(1)))
+        };
+        (0..256).map_while(rate).max_by(f64::total_cmp)
     }
 
     /// Asks for a frame interval, s, and gives the one granted; `None` where the device sets its own pace.

@@ -10,7 +10,9 @@ use v4l::v4l_sys as c;
 use v4l::v4l2::{self, vidioc};
 
 use super::call::{Zeroed, ioctl};
-use super::node::Node;
+use super::node::{MOST_PLANES, Node};
+
+type Planes = [c::v4l2_plane; MOST_PLANES];
 
 /// Metadata of one filled buffer.
 #[derive(Clone, Copy, Debug)]
@@ -55,6 +57,10 @@ impl Stream {
         Ok(stream)
     }
 
+    pub fn node(&self) -> &Node {
+        &self.node
+    }
+
     /// Waits for a filled buffer or an error; `false` when neither came in time.
     pub fn wait(&self, patience: Duration) -> io::Result<bool> {
         let mut fd = libc::pollfd {
@@ -77,8 +83,8 @@ impl Stream {
         if let Some(error) = self.broken.take() {
             return Err(error);
         }
-        let (mut raw, mut plane) = self.describe(0);
-        match self.buffer_ioctl(vidioc::VIDIOC_DQBUF, &mut raw, &mut plane) {
+        let (mut raw, mut planes) = self.describe(0);
+        match self.buffer_ioctl(vidioc::VIDIOC_DQBUF, &mut raw, &mut planes) {
             Err(e) if e.kind() == io::ErrorKind::WouldBlock => return Ok(None),
             other => other?,
         }
@@ -90,7 +96,7 @@ impl Stream {
         };
         let (used, offset) = match self.node.capability.multi_planar {
             false => (raw.bytesused as usize, 0),
-            true => (plane.bytesused as usize, plane.data_offset as usize),
+            true => (planes[0].bytesused as usize, planes[0].data_offset as usize),
         };
         let meta = Meta {
             flags: raw.flags,
@@ -107,26 +113,26 @@ impl Stream {
         Ok(Some(seen))
     }
 
-    fn describe(&self, index: u32) -> (c::v4l2_buffer, c::v4l2_plane) {
+    fn describe(&self, index: u32) -> (c::v4l2_buffer, Planes) {
         let mut raw = c::v4l2_buffer::zeroed();
         raw.index = index;
         raw.type_ = self.node.buffer_type();
         raw.memory = c::v4l2_memory_V4L2_MEMORY_MMAP;
-        (raw, c::v4l2_plane::zeroed())
+        (raw, Planes::zeroed())
     }
 
     fn queue(&self, index: u32) -> io::Result<()> {
-        let (mut raw, mut plane) = self.describe(index);
-        self.buffer_ioctl(vidioc::VIDIOC_QBUF, &mut raw, &mut plane)
+        let (mut raw, mut planes) = self.describe(index);
+        self.buffer_ioctl(vidioc::VIDIOC_QBUF, &mut raw, &mut planes)
     }
 
     fn buffer_ioctl(
         &self,
         request: vidioc::_IOC_TYPE,
         raw: &mut c::v4l2_buffer,
-        plane: &mut c::v4l2_plane,
+        planes: &mut Planes,
     ) -> io::Result<()> {
-        buffer_ioctl(&self.node, request, raw, plane)
+        buffer_ioctl(&self.node, request, raw, planes)
     }
 }
 
@@ -141,11 +147,11 @@ fn buffer_ioctl(
     node: &Node,
     request: vidioc::_IOC_TYPE,
     raw: &mut c::v4l2_buffer,
-    plane: &mut c::v4l2_plane,
+    planes: &mut Planes,
 ) -> io::Result<()> {
     if node.capability.multi_planar {
-        raw.m.planes = plane;
-        raw.length = 1;
+        raw.m.planes = planes.as_mut_ptr();
+        raw.length = MOST_PLANES as u32;
     }
     ioctl(&node.fd, request, raw)
 }
@@ -163,15 +169,15 @@ unsafe impl Send for Mapping {}
 impl Mapping {
     fn new(node: &Node, index: u32) -> io::Result<Self> {
         let mut raw = c::v4l2_buffer::zeroed();
-        let mut plane = c::v4l2_plane::zeroed();
+        let mut planes = Planes::zeroed();
         raw.index = index;
         raw.type_ = node.buffer_type();
         raw.memory = c::v4l2_memory_V4L2_MEMORY_MMAP;
-        buffer_ioctl(node, vidioc::VIDIOC_QUERYBUF, &mut raw, &mut plane)?;
+        buffer_ioctl(node, vidioc::VIDIOC_QUERYBUF, &mut raw, &mut planes)?;
         let (length, offset) = match node.capability.multi_planar {
             // SAFETY: for mapped buffers the kernel fills the offset members.
             false => (raw.length, unsafe { raw.m.offset }),
-            true => (plane.length, unsafe { plane.m.mem_offset }),
+            true => (planes[0].length, unsafe { planes[0].m.mem_offset }),
         };
         let (length, offset) = (length as usize, offset.into());
         // SAFETY: asks for a fresh mapping at an address of the kernel's choice; no memory of ours is touched.

@@ -1,61 +1,27 @@
-//! `oapwatch calibrate`: fits the calibration of a device to frames with known positions.
+//! `oapwatch calibrate --truth`: fits the calibration of a device to frames with known positions.
 
 use std::io::Write;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use anyhow::{Context, anyhow};
 use ndarray::Array2;
 
-use super::progress::Steps;
-use super::{Failure, Outcome};
+use super::args::Args;
 use crate::calibrate::{self, Calibrated, file, truth};
+use crate::cli::progress::Steps;
+use crate::cli::{Failure, Outcome};
 use crate::config::Config;
 use crate::estimate;
 use crate::frames::npy;
 use crate::optics::Camera;
 
-#[derive(Debug, clap::Args)]
-#[command(
-    after_help = "Examples:\n  oapwatch calibrate --config oapwatch.toml --truth positions.ndjson \\\n    --out calibration.toml frames.npy"
-)]
-pub struct Args {
-    /// Config with the data sheet of the device; the result must improve on a calibration that it names
-    #[arg(long)]
-    config: PathBuf,
-    /// NDJSON with the known positions of each frame
-    #[arg(long)]
-    truth: PathBuf,
-    /// Where to write the calibration
-    #[arg(long)]
-    out: PathBuf,
-    /// Print one JSON object instead of sentences
-    #[arg(long)]
-    json: bool,
-    /// FRAMES.npy
-    frames: PathBuf,
-}
-
 /// Most rejected lines of the truth file that the report names.
 const NAMED: usize = 20;
 
-pub fn run(args: Args) -> Outcome {
-    let mut config = Config::load_uncalibrated(&args.config).map_err(Failure::config)?;
+pub fn run(args: &Args, truth_file: &Path, config: &Config, camera: &Camera) -> Outcome {
     let in_config = || args.config.display().to_string();
-    if let Some(path) = config.optics.calibration.take() {
-        match file::read(&path) {
-            Ok(calibration) => config.optics.calibrated = Some(calibration),
-            // The file that this command will write.
-            Err(file::Error::Io { source, .. }) if source.kind() == std::io::ErrorKind::NotFound => {}
-            Err(e) => return Err(Failure::config(e)),
-        }
-    }
-    let camera = config
-        .optics
-        .camera()
-        .with_context(in_config)
-        .map_err(Failure::Config)?;
-    let beacons = truth::read(&args.truth).map_err(Failure::input)?;
-    let frames = read_frames(&args, &camera, &beacons)?;
+    let beacons = truth::read(truth_file).map_err(Failure::input)?;
+    let frames = read_frames(args, truth_file, camera, &beacons)?;
     let list: Vec<(usize, &Array2<f64>)> = frames.iter().map(|(k, pixels)| (*k, pixels)).collect();
 
     let mut steps = Steps::unbounded();
@@ -67,12 +33,12 @@ pub fn run(args: Args) -> Outcome {
     };
     let mut build = |camera: &Camera| estimate::build(&config.estimator, camera);
     // Checked before the long fit.
-    build(&camera).with_context(in_config).map_err(Failure::Config)?;
-    let outcome = calibrate::calibrate(&camera, &list, &beacons, &mut build, &mut progress);
+    build(camera).with_context(in_config).map_err(Failure::Config)?;
+    let outcome = calibrate::calibrate(camera, &list, &beacons, &mut build, &mut progress);
     steps.finish();
     let calibrated = outcome.map_err(|e| match e {
         calibrate::Error::TooLittle { .. } => {
-            Failure::Input(anyhow::Error::new(e).context(args.truth.display().to_string()))
+            Failure::Input(anyhow::Error::new(e).context(truth_file.display().to_string()))
         }
         calibrate::Error::Estimator(e) => Failure::Config(anyhow::Error::new(e).context(in_config())),
         calibrate::Error::Unusable(_) => Failure::other(e),
@@ -124,7 +90,12 @@ pub fn run(args: Args) -> Outcome {
 }
 
 /// Reads the frames that have beacons.
-fn read_frames(args: &Args, camera: &Camera, beacons: &[truth::Beacon]) -> Result<Vec<(usize, Array2<f64>)>, Failure> {
+fn read_frames(
+    args: &Args,
+    truth_file: &Path,
+    camera: &Camera,
+    beacons: &[truth::Beacon],
+) -> Result<Vec<(usize, Array2<f64>)>, Failure> {
     let reader = npy::Reader::open(&args.frames, camera.joules_per_count).map_err(Failure::input)?;
     let (ny, nx) = reader.shape();
     if (ny, nx) != camera.shape() {
@@ -147,7 +118,7 @@ fn read_frames(args: &Args, camera: &Camera, beacons: &[truth::Beacon]) -> Resul
     if frames.is_empty() {
         return Err(Failure::Input(anyhow!(
             "{}: no position belongs to any of the {total} frames of {}; its first is for frame {}",
-            args.truth.display(),
+            truth_file.display(),
             args.frames.display(),
             beacons.first().map_or(0, |b| b.frame)
         )));

@@ -1,0 +1,23 @@
+// The access points of a hub, those in trouble first.
+
+import { clock, el, lasting, shown } from "./words.js";
+
+const ORDER = { lost: 0, blind: 1, good: 2 };
+const TONE = { lost: "bad", blind: "warn", good: "ok" };
+const $ = (id) => document.getElementById(id);
+
+export function showStations(stations, isHub) {
+  $("stations").hidden = !isHub;
+  $("sensor").hidden = isHub;
+  $("places").hidden = isHub;
+  if (!isHub) return;
+  const name = (s) => `${s.site}.${s.station}`;
+  const sorted = [...stations].sort((a, b) => ORDER[a.state] - ORDER[b.state] || name(a).localeCompare(name(b), undefined, { numeric: true }));
+  const lost = stations.filter((s) => s.state === "lost").length;
+  $("station-count").textContent = `${stations.length} known${lost ? `, ${lost} lost` : ""}`;
+  const behind = (s) => (s.lag_s === null ? "" : `${s.lag_s < 0 ? "−" : ""}${lasting(Math.abs(s.lag_s) * 1000)}`);
+  $("station-rows").replaceChildren(...sorted.map((s) => {
+    const texts = [["", shown(name(s))], [TONE[s.state], s.state], ["n", `${s.emitters}`], ["n", behind(s)], ["n", `${s.alerts_waiting}`], ["", clock(Date.parse(s.last_seen_at))]];
+    return el("tr", {}, ...texts.map(([className, text]) => el("td", { className }, text)));
+  }));
+}

@@ -1,0 +1,185 @@
+//! Finds spots without knowing their shape, and what only looks like one: hot pixels and the halo of a brighter spot.
+
+use crate::optics::{Axis, Camera, psf};
+
+/// Significance of a detection in standard deviations. Fainter spots teach nothing about the shape.
+const SIGMAS: f64 = 8.0;
+
+/// A local maximum of the matched filter.
+#[derive(Clone, Copy, Debug)]
+pub struct Peak {
+    pub at: [f64; 2],
+    pub energy_j: f64,
+}
+
+/// Matched filter with the camera's Gaussian on images of its shape.
+pub struct MatchedFilter {
+    x: Vec<Vec<f64>>,
+    y: Vec<Vec<f64>>,
+    norm2: f64,
+}
+
+impl MatchedFilter {
+    pub fn new(camera: &Camera) -> Self {
+        let kernels = |axis: &Axis| -> Vec<Vec<f64>> {
+            (0..axis.n)
+                .map(|k| {
+                    let mut out = vec![0.0; axis.n];
+                    psf::profile(axis, axis.centre(k), camera.spot_sigma_m, &mut out);
+                    out
+                })
+                .collect()
+        };
+        let (x, y) = (kernels(&camera.x), kernels(&camera.y));
+        let norm = |k: &[Vec<f64>]| k[k.len() / 2].iter().map(|v| v * v).sum::<f64>();
+        Self {
+            norm2: norm(&x) * norm(&y),
+            x,
+            y,
+        }
+    }
+
+    /// Local maxima of an image (J, row by row) above the noise, the brightest first.
+    pub fn peaks(&self, camera: &Camera, image: &[f64], noise_j: f64) -> Vec<Peak> {
+        let (ny, nx) = camera.shape();
+        let mut along_x = vec![0.0; ny * nx];
+        for (row, out) in image.chunks_exact(nx).zip(along_x.chunks_exact_mut(nx)) {
+            for (o, kernel) in out.iter_mut().zip(&self.x) {
+                *o = kernel.iter().zip(row).map(|(a, b)| a * b).sum();
+            }
+        }
+        let mut filtered = vec![0.0; ny * nx];
+        for (kernel, out) in self.y.iter().zip(filtered.chunks_exact_mut(nx)) {
+            for (w, line) in kernel.iter().zip(along_x.chunks_exact(nx)).filter(|(w, _)| **w > 1e-12) {
+                out.iter_mut().zip(line).for_each(|(o, v)| *o += w * v);
+            }
+        }
+        let value = |j: usize, i: usize| filtered[j * nx + i];
+        let mut peaks = Vec::new();
+        let least = SIGMAS * noise_j * self.norm2.sqrt();
+        for j in 0..ny {
+            for i in 0..nx {
+                let here = value(j, i);
+                if here < least {
+                    continue;
+                }
+                let (js, is) = (
+                    j.saturating_sub(1)..(j + 2).min(ny),
+                    i.saturating_sub(1)..(i + 2).min(nx),
+                );
+                if js
+                    .flat_map(|b| is.clone().map(move |a| (b, a)))
+                    .any(|(b, a)| value(b, a) > here)
+                {
+                    continue;
+                }
+                let at = [
+                    camera.x.centre(i) + camera.x.pitch_m * vertex(i, nx, |a| value(j, a)),
+                    camera.y.centre(j) + camera.y.pitch_m * vertex(j, ny, |b| value(b, i)),
+                ];
+                peaks.push(Peak {
+                    at,
+                    energy_j: here / self.norm2,
+                });
+            }
+        }
+        peaks.sort_by(|a, b| b.energy_j.total_cmp(&a.energy_j));
+        peaks
+    }
+}
+
+/// Offset of a parabola's vertex through three neighbours, in pixels.
+fn vertex(k: usize, n: usize, value: impl Fn(usize) -> f64) -> f64 {
+    if k == 0 || k + 1 == n {
+        return 0.0;
+    }
+    let (a, b, c) = (value(k - 1), value(k), value(k + 1));
+    let curvature = a - 2.0 * b + c;
+    if curvature < 0.0 {
+        (0.5 * (a - c) / curvature).clamp(-0.5, 0.5)
+    } else {
+        0.0
+    }
+}
+
+/// Chooses from peaks those that are spots of their own: not within the halo that a brighter spot of an unknown shape may have.
+/// `halo(d)` is the share of a spot's own peak that it may have at a distance of d m.
+pub fn own_spots(peaks: &[Peak], brighter: &[Peak], halo: impl Fn(f64) -> f64) -> Vec<Peak> {
+    let mut chosen: Vec<Peak> = Vec::new();
+    for peak in peaks {
+        let is_halo = chosen.iter().chain(brighter).any(|other| {
+            let d = (peak.at[0] - other.at[0]).hypot(peak.at[1] - other.at[1]);
+            peak.energy_j < halo(d) * other.energy_j
+        });
+        if !is_halo {
+            chosen.push(*peak);
+        }
+    }
+    chosen
+}
+
+/// Pixels that are brighter than any spot's light could make them beside their neighbours: hot ones and cosmic rays. Needs spots
+/// wider than [`NARROWEST`] pixels.
+pub fn single_pixels(camera: &Camera, image: &[f64], background_j: f64, noise_j: f64) -> Vec<usize> {
+    let (ny, nx) = camera.shape();
+    let width = camera.spot_sigma_m / camera.x.pitch_m.max(camera.y.pitch_m);
+    if width < NARROWEST {
+        return Vec::new();
+    }
+    // A quarter of what the brightest neighbour of the brightest pixel of a Gaussian half as wide would have.
+    let share = 0.25 * (-0.5 / (0.5 * width).powi(2)).exp();
+    let mut found = Vec::new();
+    for j in 0..ny {
+        for i in 0..nx {
+            let own = image[j * nx + i] - background_j;
+            if own < SIGMAS * noise_j {
+                continue;
+            }
+            let mut neighbours = Vec::with_capacity(4);
+            if i > 0 {
+                neighbours.push(j * nx + i - 1);
+            }
+            if i + 1 < nx {
+                neighbours.push(j * nx + i + 1);
+            }
+            if j > 0 {
+                neighbours.push((j - 1) * nx + i);
+            }
+            if j + 1 < ny {
+                neighbours.push((j + 1) * nx + i);
+            }
+            let brightest = neighbours
+                .iter()
+                .map(|p| image[*p] - background_j)
+                .fold(f64::MIN, f64::max);
+            if brightest + 3.0 * noise_j < share * own {
+                found.push(j * nx + i);
+            }
+        }
+    }
+    found
+}
+
+/// Least σ of a spot in pixels for which single pixels can be told from spots.
+const NARROWEST: f64 = 0.7;
+
+/// Noise of one pixel, J, from what a pixel has beyond the mean of its neighbours, over frames of shape (Ny, Nx): spots are smooth
+/// beside it, and the median leaves out those that are not.
+pub fn pixel_noise<'a>(camera: &Camera, frames: impl Iterator<Item = &'a [f64]>) -> f64 {
+    let (ny, nx) = camera.shape();
+    let mut each: Vec<f64> = frames
+        .filter_map(|image| {
+            let mut rough = Vec::with_capacity(ny * nx);
+            for row in image.chunks_exact(nx) {
+                for w in row.windows(3) {
+                    rough.push((w[1] - 0.5 * (w[0] + w[2])).abs());
+                }
+            }
+            crate::stats::median(rough.into_iter().filter(|v| v.is_finite()).collect())
+        })
+        // The variance of w₁ − (w₀ + w₂)/2 is 1.5 σ²; a median magnitude is 0.6745 σ.
+        .map(|m| m / 0.6745 / 1.5_f64.sqrt())
+        .collect();
+    each.sort_by(f64::total_cmp);
+    each.get(each.len() / 2).copied().unwrap_or(0.0)
+}

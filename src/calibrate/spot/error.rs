@@ -1,0 +1,33 @@
+//! Why nothing was learned.
+
+use super::coverage::CELLS;
+
+/// Why nothing was learned.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    #[error("expected at least {MIN_FRAMES} frames, found {frames}")]
+    TooFewFrames { frames: usize },
+    #[error(
+        "no spots in {frames} frames: nothing is {SIGMAS} σ above the noise of {noise_j:.2e} J a pixel; are they dark frames?"
+    )]
+    NoSpots { frames: usize, noise_j: f64 },
+    #[error("{saturated} of {frames} frames hold saturated pixels and no other spots; reduce the exposure or the gain")]
+    Saturated { frames: usize, saturated: usize },
+    #[error(
+        "expected at least {MIN_SPOTS} spots {SIGMAS} σ above the noise, found {spots} in {frames} frames: too few or too faint"
+    )]
+    TooFewSpots { frames: usize, spots: usize },
+    #[error(
+        "the spots stand on {covered} of the {} sixteenths of a pixel (expected {needed}): let them move by a pixel or more while \
+         frames are taken",
+        CELLS
+    )]
+    Phases { covered: usize, needed: usize },
+    #[error("the spots are not alike: the best common shape leaves {share:.0} % of a spot's light unexplained")]
+    NotAlike { share: f64 },
+}
+
+/// Fewest frames and spots: a fifth is held out, and each pixel phase wants several spots.
+pub(super) const MIN_FRAMES: usize = 15;
+pub(super) const MIN_SPOTS: usize = 60;
+const SIGMAS: f64 = 8.0;

@@ -1,0 +1,171 @@
+//! What residuals say: noise, shot noise, and by how much the spot differs from its template.
+
+use faer::Mat;
+use ndarray::Array2;
+
+use super::learn::{Learner, norm};
+use crate::calibrate::exposure::ScaledCholesky;
+
+/// Rings around spots, σ, within each of which the template's error is measured.
+const RINGS: [f64; 6] = [0.0, 1.5, 3.0, 5.0, 8.0, 12.0];
+/// The halo that a spot error is a share of: half-width at half its height, σ. That of the estimator's noise model.
+const HALO: f64 = 3.0;
+/// Standard deviations from which a figure counts.
+const SIGNIFICANT: f64 = 3.0;
+/// Residuals beyond this many σ are outliers, with what a template that is this wrong would add.
+const OUTLIER: f64 = 5.0;
+const LARGEST_ERROR: f64 = 0.05;
+
+/// Squared residuals of a learner's images regressed on what makes them.
+#[derive(Clone, Copy, Debug)]
+pub struct Variance {
+    /// Noise of a pixel without light, J.
+    pub read_noise_j: f64,
+    /// Growth of the variance with the expected energy, J; none where it does not show.
+    pub gain_j: Option<f64>,
+    /// Share of a spot's light by which it differs from the template, anywhere in its halo.
+    pub spot_error: f64,
+}
+
+struct Pixel {
+    squared: f64,
+    light: f64,
+    halo2: f64,
+    /// Of the nearest spot, σ.
+    distance: f64,
+}
+
+/// Regresses r² = σ² + g·E + (s·H)², H = E·‖spot‖/(1 + (d/3σ)²) over the pixels in use.
+pub fn variance(learner: &Learner) -> Variance {
+    let pixels = pixels(learner);
+    let noise2 = learner.noise_j.powi(2);
+    let typical: f64 = pixels
+        .iter()
+        .map(|p| p.light.abs())
+        .fold(0.0, f64::max)
+        .max(learner.noise_j);
+    let scale = [noise2, typical, pixels.iter().map(|p| p.halo2).fold(noise2, f64::max)];
+    let mut now = [1.0, 0.0, 0.0];
+    let mut covariance = Mat::<f64>::identity(3, 3);
+    for _ in 0..4 {
+        let mut h = Mat::<f64>::zeros(3, 3);
+        let mut g = vec![0.0; 3];
+        for p in &pixels {
+            let row = [1.0, p.light / scale[1], p.halo2 / scale[2]];
+            let expected = row.iter().zip(&now).map(|(a, b)| a * b).sum::<f64>().max(0.2 * now[0]);
+            let squared = p.squared / noise2;
+            if squared > OUTLIER * OUTLIER * expected {
+                continue;
+            }
+            // The variance of r² is twice the square of its mean.
+            let weight = 0.5 / (expected * expected);
+            for a in 0..3 {
+                g[a] += weight * row[a] * squared;
+                for b in 0..3 {
+                    h[(a, b)] += weight * row[a] * row[b];
+                }
+            }
+        }
+        let Some(solver) = ScaledCholesky::new(&h, 1e-9) else {
+            break;
+        };
+        let x = solver.solve(&g);
+        covariance = solver.solve_many(&Mat::identity(3, 3));
+        now = [x[0].max(0.01), x[1].max(0.0), x[2].max(0.0)];
+    }
+    let gain = now[1] * noise2 / scale[1];
+    let is_shot = now[1] > SIGNIFICANT * covariance[(1, 1)].max(0.0).sqrt();
+    let gain_j = is_shot.then_some(gain).filter(|g| *g > 0.0);
+    let read2 = now[0] * noise2;
+    Variance {
+        read_noise_j: read2.sqrt(),
+        gain_j,
+        spot_error: spot_error(&pixels, read2, gain_j.unwrap_or(0.0)),
+    }
+}
+
+/// Largest over the rings of √(excess of r² over the noise / H²), where it is significant.
+fn spot_error(pixels: &[Pixel], read2: f64, gain: f64) -> f64 {
+    let rings = RINGS.windows(2).map(|ring| {
+        let (mut excess, mut halo2, mut var) = (0.0, 0.0, 0.0);
+        for p in pixels.iter().filter(|p| (ring[0]..ring[1]).contains(&p.distance)) {
+            let noise2 = read2 + gain * p.light.max(0.0);
+            if p.squared > OUTLIER * OUTLIER * (noise2 + (LARGEST_ERROR * LARGEST_ERROR) * p.halo2) {
+                continue;
+            }
+            // Weighted by H²/σ⁴, which is best where the error is small.
+            let weight = p.halo2 / (noise2 * noise2);
+            excess += weight * (p.squared - noise2);
+            halo2 += weight * p.halo2;
+            var += weight * weight * 2.0 * noise2 * noise2;
+        }
+        match excess > SIGNIFICANT * var.sqrt() {
+            true => (excess / halo2).sqrt(),
+            false => 0.0,
+        }
+    });
+    rings.fold(0.0, f64::max)
+}
+
+fn pixels(learner: &Learner) -> Vec<Pixel> {
+    let camera = learner.camera;
+    let sigma = camera.spot_sigma_m;
+    let norm = norm(camera, &learner.model);
+    let mut out = Vec::new();
+    for patch in &learner.patches {
+        let expected = patch.expected(camera, &learner.model);
+        for (k, e) in expected.iter().enumerate().filter(|(k, _)| patch.weight[*k] > 0.0) {
+            let x = camera.x.centre(patch.x.start + k % patch.x.len());
+            let y = camera.y.centre(patch.y.start + k / patch.x.len());
+            let (mut halo, mut nearest) = (0.0, f64::INFINITY);
+            for s in &patch.sources {
+                let d = (s.at[0] - x).hypot(s.at[1] - y) / sigma;
+                halo += s.energy_j * norm / (1.0 + (d / HALO).powi(2));
+                nearest = nearest.min(d);
+            }
+            out.push(Pixel {
+                squared: (patch.data[k] - e).powi(2),
+                light: e - patch.background,
+                halo2: halo * halo,
+                distance: nearest,
+            });
+        }
+    }
+    out
+}
+
+/// Half-width of [`mean_residual`], σ.
+const PICTURED: f64 = 8.0;
+
+/// Mean residual of whole pixels around spots, over the spots' energies times `norm`: (2n + 1, 2n + 1), rows in y.
+pub fn mean_residual(learner: &Learner, norm: f64) -> Array2<f64> {
+    let camera = learner.camera;
+    let pitch = camera.x.pitch_m.max(camera.y.pitch_m);
+    let n = (PICTURED * camera.spot_sigma_m / pitch).ceil().clamp(4.0, 40.0) as i64;
+    let side = 2 * n as usize + 1;
+    let (mut sum, mut weight) = (Array2::<f64>::zeros((side, side)), Array2::<f64>::zeros((side, side)));
+    for patch in &learner.patches {
+        let expected = patch.expected(camera, &learner.model);
+        for s in &patch.sources {
+            let pixel = |k: usize| {
+                let (axis, range) = [(&camera.x, &patch.x), (&camera.y, &patch.y)][k];
+                ((s.at[k] - axis.min_m) / axis.pitch_m).floor() as i64 - range.start as i64
+            };
+            let (i0, j0) = (pixel(0) - n, pixel(1) - n);
+            for ((j, i), total) in sum.indexed_iter_mut() {
+                let (x, y) = (i0 + i as i64, j0 + j as i64);
+                if !(0..patch.x.len() as i64).contains(&x) || !(0..patch.y.len() as i64).contains(&y) {
+                    continue;
+                }
+                let p = y as usize * patch.x.len() + x as usize;
+                if patch.weight[p] > 0.0 {
+                    // Σ E·r / Σ E² is the share of the light that is missing there.
+                    *total += s.energy_j * (patch.data[p] - expected[p]);
+                    weight[(j, i)] += s.energy_j.powi(2);
+                }
+            }
+        }
+    }
+    sum.zip_mut_with(&weight, |s, w| *s = if *w > 0.0 { *s / w / norm } else { 0.0 });
+    sum
+}

@@ -1,0 +1,376 @@
+//! The template as it is learned: bicubic splines for each component of the field, and what pixels collect of them.
+
+use ndarray::Array2;
+
+use crate::optics::spot::{Component, Field, FieldPolynomial, Template};
+use crate::optics::{Axis, Camera};
+
+/// Unit-energy template Σ_c p_c(u, v)·T_c(x, y), p_0 = 1, the others products of Legendre polynomials.
+#[derive(Clone, Debug)]
+pub struct TemplateModel {
+    pub field: Field,
+    pub knot_m: f64,
+    /// Splines a side of the first component; odd, so that one is in the middle.
+    pub n: usize,
+    /// Splines a side of the others, which lie within it; odd.
+    pub inner: usize,
+    pub degree: usize,
+    /// First n², then inner² for each other component; rows in y.
+    pub coefficients: Vec<f64>,
+}
+
+impl TemplateModel {
+    /// The Gaussian that a camera assumes, on knots `knot_m` apart out to `radius_m`.
+    pub fn gaussian(camera: &Camera, knot_m: f64, radius_m: f64) -> Self {
+        let field = Field {
+            half_sensor_m: [camera.x.half_width(), camera.y.half_width()],
+        };
+        let s2 = camera.spot_sigma_m.powi(2);
+        let density = |x: f64, y: f64| (-0.5 * (x * x + y * y) / s2).exp() / (std::f64::consts::TAU * s2);
+        let template = Template::of_density(field, knot_m, radius_m, density);
+        let coefficients = &template.components[0].coefficients;
+        let total = coefficients.sum();
+        Self {
+            field,
+            knot_m,
+            n: coefficients.nrows(),
+            inner: 0,
+            degree: 0,
+            coefficients: coefficients.iter().map(|c| c / total).collect(),
+        }
+    }
+
+    pub fn radius_m(&self) -> f64 {
+        0.5 * (self.n + 3) as f64 * self.knot_m
+    }
+
+    /// Components of the field, at least one.
+    pub fn components(&self) -> usize {
+        FieldPolynomial::length(self.degree)
+    }
+
+    /// Place of spline `k` of `n`, m from the spot's centre.
+    pub fn knot(&self, k: usize) -> f64 {
+        (k as f64 - 0.5 * (self.n - 1) as f64) * self.knot_m
+    }
+
+    /// Root mean square of p_c over the sensor.
+    pub fn field_rms(&self, c: usize) -> f64 {
+        let (i, j) = FieldPolynomial::powers().nth(c).unwrap_or_default();
+        1.0 / f64::from((2 * i + 1) * (2 * j + 1)).sqrt()
+    }
+
+    /// Start of component `c` in the coefficients and its splines a side.
+    pub fn block(&self, c: usize) -> (usize, usize) {
+        match c {
+            0 => (0, self.n),
+            _ => (self.n * self.n + (c - 1) * self.inner * self.inner, self.inner),
+        }
+    }
+
+    /// Adds components for a field polynomial of `degree`, zero as yet, out to `radius_m`.
+    pub fn vary(&mut self, degree: usize, radius_m: f64) {
+        let wanted = (2.0 * radius_m / self.knot_m) as usize;
+        self.inner = (wanted | 1).min(self.n);
+        self.degree = degree;
+        let length = self.n * self.n + (self.components() - 1) * self.inner * self.inner;
+        self.coefficients.resize(length, 0.0);
+    }
+
+    /// The same first component on `n` splines a side.
+    pub fn widened(&self, n: usize) -> Self {
+        let margin = (n - self.n) / 2;
+        let mut coefficients = vec![0.0; n * n];
+        for j in 0..self.n {
+            let start = (j + margin) * n + margin;
+            coefficients[start..start + self.n].copy_from_slice(&self.coefficients[j * self.n..(j + 1) * self.n]);
+        }
+        Self {
+            n,
+            inner: 0,
+            degree: 0,
+            coefficients,
+            ..*self
+        }
+    }
+
+    /// The same first component on the support of another model, whose knots are the same.
+    pub fn widened_to(&self, other: &Self) -> Self {
+        match other.n > self.n {
+            true => self.widened(other.n),
+            false => self.cropped(other.n),
+        }
+    }
+
+    fn cropped(&self, n: usize) -> Self {
+        let margin = (self.n - n) / 2;
+        let line = |j: usize| &self.coefficients[(j + margin) * self.n + margin..][..n];
+        Self {
+            n,
+            inner: 0,
+            degree: 0,
+            coefficients: (0..n).flat_map(line).copied().collect(),
+            ..*self
+        }
+    }
+
+    /// p_c at a place on the sensor, m.
+    pub fn field_values(&self, sensor_m: [f64; 2]) -> Vec<f64> {
+        let ([u, v], _) = self.field.at(sensor_m);
+        let powers = FieldPolynomial::powers().take(self.components());
+        powers.map(|(i, j)| legendre(i, u) * legendre(j, v)).collect()
+    }
+
+    /// Σ_c p_c·`coefficients`_c as n×n splines.
+    pub fn local(&self, coefficients: &[f64], field_values: &[f64], out: &mut Vec<f64>) {
+        let n = self.n;
+        out.clear();
+        out.extend_from_slice(&coefficients[..n * n]);
+        let margin = (n - self.inner) / 2;
+        for (c, p) in field_values.iter().enumerate().skip(1) {
+            let (start, m) = self.block(c);
+            for (j, line) in coefficients[start..start + m * m].chunks_exact(m).enumerate() {
+                let to = (j + margin) * n + margin;
+                for (o, v) in out[to..to + m].iter_mut().zip(line) {
+                    *o += p * v;
+                }
+            }
+        }
+    }
+
+    /// The adjoint of [`Self::local`]: adds an n×n gradient to that of the coefficients.
+    pub fn local_adjoint(&self, gradient: &[f64], field_values: &[f64], out: &mut [f64]) {
+        let n = self.n;
+        for (o, g) in out[..n * n].iter_mut().zip(gradient) {
+            *o += g;
+        }
+        let margin = (n - self.inner) / 2;
+        for (c, p) in field_values.iter().enumerate().skip(1) {
+            let (start, m) = self.block(c);
+            for (j, line) in out[start..start + m * m].chunks_exact_mut(m).enumerate() {
+                let from = (j + margin) * n + margin;
+                for (o, v) in line.iter_mut().zip(&gradient[from..from + m]) {
+                    *o += p * v;
+                }
+            }
+        }
+    }
+
+    /// Makes the light 1 everywhere; returns the factor on the energy of spots at places with the given field values.
+    pub fn normalise(&mut self) -> impl Fn(&[f64]) -> f64 + use<> {
+        let light: Vec<f64> = (0..self.components())
+            .map(|c| {
+                let (start, m) = self.block(c);
+                self.coefficients[start..start + m * m].iter().sum()
+            })
+            .collect();
+        let (n, margin) = (self.n, (self.n - self.inner) / 2);
+        // A change over the field carries no light: its share of the first component is taken out.
+        for c in 1..light.len() {
+            let (start, m) = self.block(c);
+            let (first, change) = self.coefficients.split_at_mut(start);
+            let within: f64 = (0..m * m).map(|k| first[(k / m + margin) * n + k % m + margin]).sum();
+            for k in 0..m * m {
+                change[k] -= light[c] / within * first[(k / m + margin) * n + k % m + margin];
+            }
+        }
+        self.coefficients.iter_mut().for_each(|k| *k /= light[0]);
+        move |p: &[f64]| light.iter().zip(p).map(|(l, p)| l * p).sum::<f64>().max(0.1 * light[0])
+    }
+
+    /// As the optics takes it, with monomials for Legendre polynomials.
+    pub fn template(&self) -> Template {
+        let powers: Vec<(i32, i32)> = FieldPolynomial::powers().take(self.components()).collect();
+        let components = powers.iter().enumerate().map(|(c, (i, j))| {
+            let (start, m) = self.block(c);
+            let margin = (self.n - m) / 2;
+            let mut coefficients = Array2::zeros((self.n, self.n));
+            for (k, value) in self.coefficients[start..start + m * m].iter().enumerate() {
+                coefficients[(k / m + margin, k % m + margin)] = *value;
+            }
+            let (a, b) = (legendre_monomials(*i), legendre_monomials(*j));
+            let field = powers.iter().map(|(k, l)| a[*k as usize] * b[*l as usize]).collect();
+            Component {
+                field: FieldPolynomial(field),
+                coefficients,
+            }
+        });
+        Template {
+            field: self.field,
+            knot_m: self.knot_m,
+            components: components.collect(),
+        }
+    }
+}
+
+/// Highest degree of the field's polynomials.
+pub const MOST_DEGREE: usize = 4;
+
+/// Coefficients of the Legendre polynomial of degree `n` (Abramowitz and Stegun, 1964, table 22.9).
+fn legendre_monomials(n: i32) -> [f64; MOST_DEGREE + 1] {
+    match n {
+        0 => [1.0, 0.0, 0.0, 0.0, 0.0],
+        1 => [0.0, 1.0, 0.0, 0.0, 0.0],
+        2 => [-0.5, 0.0, 1.5, 0.0, 0.0],
+        3 => [0.0, -1.5, 0.0, 2.5, 0.0],
+        _ => [0.375, 0.0, -3.75, 0.0, 4.375],
+    }
+}
+
+fn legendre(n: i32, t: f64) -> f64 {
+    legendre_monomials(n).iter().rev().fold(0.0, |sum, c| sum * t + c)
+}
+
+/// What the pixels of one axis collect of the splines of a spot: pixel k of `pixels` touches the splines from `first[k]` on.
+pub struct Band {
+    pub pixels: std::ops::Range<usize>,
+    pub width: usize,
+    first: Vec<usize>,
+    /// (pixels, width).
+    value: Vec<f64>,
+    /// Derivative by the spot's place, 1/m.
+    slope: Vec<f64>,
+}
+
+impl Band {
+    /// For a spot at `at` on `axis`, `n` splines, knots `knot_m` apart.
+    pub fn new(axis: &Axis, at: f64, n: usize, knot_m: f64) -> Self {
+        let radius = 0.5 * (n + 3) as f64 * knot_m;
+        let pixels = pixels_within(axis, at, radius);
+        let width = ((axis.pitch_m / knot_m).ceil() as usize + 4).min(n);
+        let (mut first, mut value, mut slope) = (Vec::new(), Vec::new(), Vec::new());
+        for k in pixels.clone() {
+            let [lo, hi] = [k, k + 1].map(|e| (axis.edge(e) - at + radius) / knot_m);
+            let start = ((lo - 4.0).ceil().max(0.0) as usize).min(n - width);
+            first.push(start);
+            for i in start..start + width {
+                let [(below, b0), (above, b1)] = [lo, hi].map(|t| cardinal(t - i as f64));
+                value.push(above - below);
+                slope.push((b0 - b1) / knot_m);
+            }
+        }
+        Self {
+            pixels,
+            width,
+            first,
+            value,
+            slope,
+        }
+    }
+
+    /// Leaves only the pixels of a range.
+    pub fn clip(&mut self, range: &std::ops::Range<usize>) {
+        let start = self.pixels.start.max(range.start);
+        let end = self.pixels.end.min(range.end).max(start);
+        let skip = start - self.pixels.start;
+        let skip = skip.min(self.first.len());
+        self.first.drain(..skip);
+        self.value.drain(..skip * self.width);
+        self.slope.drain(..skip * self.width);
+        self.pixels = start..end;
+    }
+
+    fn line(&self, k: usize, slope: bool) -> (usize, &[f64]) {
+        let values = if slope { &self.slope } else { &self.value };
+        (self.first[k], &values[k * self.width..(k + 1) * self.width])
+    }
+}
+
+/// Pixels along one axis that reach within `radius_m` of a place.
+pub fn pixels_within(axis: &Axis, at: f64, radius_m: f64) -> std::ops::Range<usize> {
+    let pixel = |x: f64| ((x - axis.min_m) / axis.pitch_m).clamp(0.0, axis.n as f64);
+    let first = pixel(at - radius_m).floor() as usize;
+    first..(pixel(at + radius_m).ceil() as usize).max(first)
+}
+
+/// Integral and value of the cardinal cubic B-spline on [0, 4] at t (de Boor, 1978, ch. IX).
+fn cardinal(t: f64) -> (f64, f64) {
+    // From the middle out: B₃ is even about 2.
+    let (r, is_right) = ((t - 2.0).abs(), t > 2.0);
+    let (half, value) = if r >= 2.0 {
+        (0.5, 0.0)
+    } else if r >= 1.0 {
+        let s = 2.0 - r;
+        (0.5 - s.powi(4) / 24.0, s.powi(3) / 6.0)
+    } else {
+        (
+            2.0 / 3.0 * r - r.powi(3) / 3.0 + r.powi(4) / 8.0,
+            2.0 / 3.0 - r * r + 0.5 * r.powi(3),
+        )
+    };
+    (if is_right { 0.5 + half } else { 0.5 - half }, value)
+}
+
+/// Buffers of [`forward`] and [`adjoint`].
+#[derive(Default)]
+pub struct Scratch(Vec<f64>);
+
+/// What pixels collect of n×n splines: (rows, columns) of the two bands, with the derivative along x or y where asked for.
+pub fn forward(
+    splines: &[f64],
+    n: usize,
+    [x, y]: [&Band; 2],
+    slope: [bool; 2],
+    scratch: &mut Scratch,
+    out: &mut Vec<f64>,
+) {
+    let (nx, ny) = (x.pixels.len(), y.pixels.len());
+    let t = &mut scratch.0;
+    t.clear();
+    t.resize(n * nx, 0.0);
+    for j in 0..n {
+        let line = &splines[j * n..(j + 1) * n];
+        for k in 0..nx {
+            let (first, values) = x.line(k, slope[0]);
+            t[j * nx + k] = line[first..first + x.width]
+                .iter()
+                .zip(values)
+                .map(|(a, b)| a * b)
+                .sum();
+        }
+    }
+    out.clear();
+    out.resize(nx * ny, 0.0);
+    if out.is_empty() {
+        return;
+    }
+    for (k, row) in out.chunks_exact_mut(nx).enumerate().take(ny) {
+        let (first, values) = y.line(k, slope[1]);
+        for (w, line) in values.iter().zip(t[first * nx..].chunks_exact(nx)) {
+            for (o, v) in row.iter_mut().zip(line) {
+                *o += w * v;
+            }
+        }
+    }
+}
+
+/// The adjoint of [`forward`] without derivatives: the gradient of n×n splines for one of the pixels.
+pub fn adjoint(pixels: &[f64], n: usize, [x, y]: [&Band; 2], scratch: &mut Scratch, out: &mut Vec<f64>) {
+    let (nx, ny) = (x.pixels.len(), y.pixels.len());
+    out.clear();
+    out.resize(n * n, 0.0);
+    if nx * ny == 0 {
+        return;
+    }
+    let t = &mut scratch.0;
+    t.clear();
+    t.resize(n * nx, 0.0);
+    for (k, row) in pixels.chunks_exact(nx).enumerate().take(ny) {
+        let (first, values) = y.line(k, false);
+        for (w, line) in values.iter().zip(t[first * nx..].chunks_exact_mut(nx)) {
+            for (o, v) in line.iter_mut().zip(row) {
+                *o += w * v;
+            }
+        }
+    }
+    for j in 0..n {
+        let line = &mut out[j * n..(j + 1) * n];
+        for k in 0..nx {
+            let (first, values) = x.line(k, false);
+            let value = t[j * nx + k];
+            for (o, w) in line[first..first + x.width].iter_mut().zip(values) {
+                *o += value * w;
+            }
+        }
+    }
+}

@@ -1,0 +1,34 @@
+//! `oapwatch calibrate`: learns the calibration of a device from its frames, with or without known positions.
+
+mod args;
+mod blind;
+mod picture;
+mod surveyed;
+
+pub use args::Args;
+
+use anyhow::Context;
+
+use super::{Failure, Outcome};
+use crate::calibrate::file;
+use crate::config::Config;
+
+pub fn run(args: Args) -> Outcome {
+    let mut config = Config::load_uncalibrated(&args.config).map_err(Failure::config)?;
+    if let Some(path) = config.optics.calibration.take() {
+        match file::read(&path) {
+            Ok(calibration) => config.optics.calibrated = Some(calibration),
+            // The file that this command will write.
+            Err(file::Error::Io { source, .. }) if source.kind() == std::io::ErrorKind::NotFound => {}
+            Err(e) => return Err(Failure::config(e)),
+        }
+    }
+    let camera = config.optics.camera();
+    let camera = camera
+        .with_context(|| args.config.display().to_string())
+        .map_err(Failure::Config)?;
+    match &args.truth {
+        Some(truth) => surveyed::run(&args, truth, &config, &camera),
+        None => blind::run(&args, &camera),
+    }
+}

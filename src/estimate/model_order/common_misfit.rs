@@ -1,0 +1,205 @@
+//! Common misfit: what the residuals around bright spots have in common, which is the lens's and not the sky's.
+//!
+//! A stranger stands beside one user; a lens makes the same rings, tails and ghosts beside all. The share of its light by which a spot
+//! misses the model at an offset is therefore taken to be what more than half of the bright spots show there at least.
+
+use crate::estimate::model::halo;
+use crate::estimate::model::hypothesis::{Hypothesis, PointSource};
+use crate::estimate::model_order::candidate::Candidate;
+use crate::estimate::model_order::proposals::disjoint_close_pairs;
+use crate::estimate::model_order::search::Search;
+
+/// Offsets at which spots are compared: their spacing and the largest along an axis, σ.
+const SPACING: f64 = 0.75;
+const OFFSETS: i32 = 16;
+/// Spots of less than this share of the brightest one's energy, and more than this number, are not compared.
+const BRIGHT: f64 = 0.1;
+const MAX_SPOTS: usize = 12;
+/// Combined significance, squared, of the spots that agree at an offset; noise alone reaches it at one of 4,000 offsets in a few of a
+/// million frames.
+const SIGNIFICANT: f64 = 36.0;
+/// Significance at which a spot that does not follow the common misfit shows it.
+const VISIBLE: f64 = 5.0;
+/// Largest share of the squared residual that the common misfit may leave.
+const MAX_INCONSISTENT: f64 = 0.5;
+/// Largest ratio of a spot's misfit to the common one that is allowed for.
+const MAX_GROWTH: f64 = 2.5;
+/// Significance that the common misfit keeps under the weights: well below a source's threshold (5.5), so that spots that differ from
+/// the common one are covered too.
+const LEFT: f64 = 2.0;
+/// Largest spot error found: more is no lens.
+pub(crate) const MAX_SPOT_ERROR: f64 = 0.1;
+/// Largest common misfit, as a share of the light, within the core. Two equal sources 2 σ apart, taken for one, show 0.14 and more; Airy
+/// discs, Moffat profiles, defocus, coma and astigmatism up to 0.06.
+const MAX_CORE: f64 = 0.1;
+
+/// Sources nearer than this to a brighter one, σ, may be a part of its spot whatever their energy.
+pub(crate) const CORE: f64 = 2.5;
+/// Relative difference up to which the distances between the sources of two pairs are alike.
+const ALIKE: f64 = 0.2;
+/// Largest share of a bright source's light, times the halo's height, that a misfit may look like.
+const SATELLITE: f64 = 0.5;
+
+/// The bright spots of a hypothesis: what is faint beside a brighter source is left out, as it may be that one's misfit. `merge_core`: what
+/// stands in a brighter source's core is merged with it whatever its energy.
+pub(crate) fn bright_spots(hypothesis: &Hypothesis, merge_core: bool) -> Vec<PointSource> {
+    let mut sources = hypothesis.sources.clone();
+    sources.sort_by(|a, b| b.a.total_cmp(&a.a));
+    // Each spot with its brightest source.
+    let mut spots: Vec<[PointSource; 2]> = Vec::new();
+    for source in sources {
+        let is_in_core = |head: &PointSource| merge_core && distance2(head.u, source.u) < CORE * CORE;
+        let is_faint = |head: &PointSource| source.a < SATELLITE * halo::height(distance2(head.u, source.u)) * head.a;
+        if let Some([spot, _]) = spots.iter_mut().find(|[_, head]| is_in_core(head)) {
+            let whole = spot.a + source.a;
+            for k in 0..2 {
+                spot.u[k] = (spot.a * spot.u[k] + source.a * source.u[k]) / whole;
+            }
+            spot.a = whole;
+        } else if !spots.iter().any(|[_, head]| is_faint(head)) {
+            spots.push([source; 2]);
+        }
+    }
+    spots.into_iter().map(|[spot, _]| spot).collect()
+}
+
+/// Whether nearly all spots are pairs along the same direction and equally far apart, as an elongated spot is explained by a model that is
+/// round.
+pub(crate) fn are_pairs_alike(hypothesis: &Hypothesis) -> bool {
+    let spots = bright_spots(hypothesis, true).len();
+    let pairs: Vec<[f64; 2]> = disjoint_close_pairs(hypothesis, CORE)
+        .into_iter()
+        .map(|(i, j)| [0, 1].map(|k| hypothesis.sources[i].u[k] - hypothesis.sources[j].u[k]))
+        .collect();
+    let is_alike = |a: &[f64; 2], b: &[f64; 2]| {
+        let flip = (a[0] * b[0] + a[1] * b[1]).signum();
+        distance2(*a, b.map(|v| flip * v)) < (ALIKE * a[0].hypot(a[1])).powi(2)
+    };
+    let most = pairs
+        .iter()
+        .map(|a| pairs.iter().filter(|b| is_alike(a, b)).count())
+        .max();
+    most.is_some_and(|most| most > 2 && 4 * most >= 3 * spots)
+}
+
+pub(crate) fn distance2(a: [f64; 2], b: [f64; 2]) -> f64 {
+    (a[0] - b[0]).powi(2) + (a[1] - b[1]).powi(2)
+}
+
+/// The spot error that a fitted hypothesis of bright spots shows, 0 where their residuals have nothing in common.
+pub(crate) fn common_misfit(search: &mut Search, candidate: &mut Candidate) -> f64 {
+    let (mx, my) = (search.compressed().mx, search.compressed().my);
+    let bases = search.context.bases;
+    let norm = halo::spot_norm(bases);
+    let residual = &candidate.evaluation(&mut search.context).residual;
+    search.matched_filter.respond(residual, mx, my);
+    let filter = &*search.matched_filter;
+    let sources = &candidate.sources;
+    let brightest = sources.iter().fold(0.0, |m: f64, s| m.max(s.a));
+    let mut bright: Vec<&PointSource> = sources.iter().filter(|s| s.a > BRIGHT * brightest).collect();
+    bright.sort_by(|a, b| b.a.total_cmp(&a.a));
+    bright.truncate(MAX_SPOTS);
+    let ends = bases.axes().map(|b| [b.edges[0], b.edges[b.n]]);
+    let middle = ends.map(|[low, high]| 0.5 * (low + high));
+    let radial = |s: &&PointSource| {
+        let d = [0, 1].map(|k| s.u[k] - middle[k]);
+        let length = d[0].hypot(d[1]);
+        if length > 0.0 {
+            d.map(|v| v / length)
+        } else {
+            [1.0, 0.0]
+        }
+    };
+    let views = |turn: &dyn Fn(&&PointSource) -> [f64; 2]| bright.iter().map(|s| (*s, turn(s))).collect::<Vec<View>>();
+    // Along the sensor's axes; along each spot's direction from the sensor's middle, as for coma; and each spot with itself turned by half a
+    // turn, as few spots have little else to be compared with.
+    let along_axes = views(&|_| [1.0, 0.0]);
+    let mirrored = [along_axes.clone(), views(&|_| [-1.0, 0.0])].concat();
+    [along_axes, views(&radial), mirrored]
+        .iter()
+        .map(|views| compare(views, sources, norm, ends, |u| filter.response_at(u)))
+        .fold(0.0, f64::max)
+}
+
+/// A spot and the direction that its offsets are taken along.
+type View<'a> = (&'a PointSource, [f64; 2]);
+
+fn compare(
+    views: &[View],
+    sources: &[PointSource],
+    norm: f64,
+    ends: [[f64; 2]; 2],
+    response: impl Fn([f64; 2]) -> Option<f64>,
+) -> f64 {
+    let (mut largest, mut core) = (0.0f64, 0.0f64);
+    // Per spot: Σ r², Σ r t and Σ t² over the offsets that tell something.
+    let mut sums = vec![[0.0; 3]; views.len()];
+    let mut values: Vec<(f64, f64, usize)> = Vec::with_capacity(views.len());
+    for p in -OFFSETS..=OFFSETS {
+        for q in -OFFSETS..=OFFSETS {
+            let offset = [f64::from(p) * SPACING, f64::from(q) * SPACING];
+            let d2 = offset[0].powi(2) + offset[1].powi(2);
+            if d2 > (f64::from(OFFSETS) * SPACING).powi(2) {
+                continue;
+            }
+            values.clear();
+            for (i, (spot, [c, s])) in views.iter().enumerate() {
+                let u = [
+                    spot.u[0] + c * offset[0] - s * offset[1],
+                    spot.u[1] + s * offset[0] + c * offset[1],
+                ];
+                if (0..2).any(|k| u[k] < ends[k][0] || u[k] > ends[k][1]) {
+                    continue;
+                }
+                let own = spot.a * halo::height(d2);
+                let is_own = sources
+                    .iter()
+                    .all(|t| std::ptr::eq(t, *spot) || t.a * halo::height(distance2(t.u, u)) < own);
+                if let Some(r) = response(u).filter(|_| is_own) {
+                    values.push((r / (spot.a * norm), r, i));
+                }
+            }
+            let need = values.len() / 2 + 1;
+            if values.len() < 2 {
+                continue;
+            }
+            let mut common = 0.0f64;
+            for sign in [1.0, -1.0] {
+                values.sort_by(|a, b| (sign * b.0).total_cmp(&(sign * a.0)));
+                let least = sign * values[need - 1].0;
+                let square: f64 = values[..need].iter().map(|v| v.1 * v.1).sum();
+                if least > 0.0 && square > SIGNIFICANT && values[..need].iter().all(|v| sign * v.1 > 1.0) {
+                    common = sign * least;
+                    largest = largest.max(least / halo::height(d2));
+                    if d2 < CORE * CORE {
+                        core = core.max(least);
+                    }
+                }
+            }
+            let is_visible = values.iter().any(|v| v.1.abs() > VISIBLE);
+            for &(_, r, i) in &values {
+                if is_visible {
+                    let t = common * views[i].0.a * norm;
+                    sums[i][0] += r * r - 1.0;
+                    sums[i][1] += r * t;
+                    sums[i][2] += t * t;
+                }
+            }
+        }
+    }
+    let (mut whole, mut left, mut strongest) = (0.0, 0.0, 1.0f64);
+    for [rr, rt, tt] in sums {
+        let follows = if tt > 0.0 { rt.max(0.0).powi(2) / tt } else { 0.0 };
+        whole += rr;
+        left += rr - follows;
+        // Aberrations grow towards the edge: a spot may show the common misfit more strongly than most.
+        if rr - follows < MAX_INCONSISTENT * rr {
+            strongest = strongest.max((rt / tt).min(MAX_GROWTH));
+        }
+    }
+    if whole > 0.0 && left < MAX_INCONSISTENT * whole && core < MAX_CORE {
+        (strongest * largest / LEFT).min(MAX_SPOT_ERROR)
+    } else {
+        0.0
+    }
+}

@@ -1,0 +1,190 @@
+//! The search where spots may differ from the PSF: every pixel's variance is raised by the spots' halo, so that no hypothesis explains a
+//! lens's rings, tails and ghosts by emitters.
+
+use crate::estimate::fit::work_budget::WorkBudget;
+use crate::estimate::model::bases::Bases;
+use crate::estimate::model::compressed_frame::CompressedFrame;
+use crate::estimate::model::halo::{Halo, height, spot_norm};
+use crate::estimate::model::hypothesis::{Hypothesis, Nuisances, PointSource, Width};
+use crate::estimate::model_order::candidate::Candidate;
+use crate::estimate::model_order::common_misfit::{
+    CORE, MAX_SPOT_ERROR, are_pairs_alike, bright_spots, common_misfit, distance2,
+};
+use crate::estimate::model_order::maximum_likelihood::refit_reweighted;
+use crate::estimate::model_order::search::{Search, SearchSpace};
+use crate::estimate::preprocess::screening::PreprocessedFrame;
+
+/// Rounds of adding residual peaks, each under weights that follow the sources found so far.
+const PASSES: usize = 6;
+/// Rounds of proposals under the last weights.
+const ROUNDS: usize = 3;
+/// Peaks below this share of the highest one wait for the next round, whose weights allow for the brighter ones' halo.
+const STRONG_PEAK: f64 = 0.1;
+/// Peaks of the frame above this share of the highest one are taken for spots of their own: higher than any ring or tail.
+const HIGH_PEAK: f64 = 0.2;
+/// Share of the variance that the halo of other spots adds to a position: their misfit is smooth across a spot, while the weights must hold
+/// at its worst place. Found from Airy discs at SNR 1000, the kind of spot whose positions others move most.
+const POSITION_SHARE: f64 = 0.1;
+
+/// What a frame shows of its spots' shape.
+pub(crate) enum Shape {
+    /// Nothing that the PSF does not explain.
+    AsModelled,
+    /// Fewer sources explain the frame with equal weights.
+    Simpler(Hypothesis),
+    /// The spots differ from the PSF by this share of their light; the bright ones.
+    Different(f64, Hypothesis),
+}
+
+impl Shape {
+    /// Of a spot error that is known.
+    pub fn of_spot_error(spot_error: f64, hypothesis: &Hypothesis) -> Self {
+        let start = Hypothesis {
+            sources: bright_spots(hypothesis, false),
+            converged: false,
+            ..hypothesis.clone()
+        };
+        Self::Different(spot_error.min(MAX_SPOT_ERROR), start)
+    }
+}
+
+/// Compares the residuals around the bright spots of `hypothesis`. Where it explains the frame, that stands unless its sources are
+/// arranged as a lens's misfit is.
+pub(crate) fn inspect_shape(
+    space: &mut SearchSpace,
+    compressed: &mut CompressedFrame,
+    frame: &PreprocessedFrame,
+    hypothesis: &Hypothesis,
+    is_explained: bool,
+    budget: &mut WorkBudget,
+) -> Shape {
+    let has_width = hypothesis.nuisances.width != Width::Known;
+    let (merged, separate) = (bright_spots(hypothesis, true), bright_spots(hypothesis, false));
+    let mut alternatives = match is_explained {
+        false => vec![merged, separate],
+        true if has_width || are_pairs_alike(hypothesis) => vec![merged],
+        true if separate.len() < hypothesis.sources.len() => vec![separate],
+        true => return Shape::AsModelled,
+    };
+    compressed.load(frame, &space.bases.x, &space.bases.y);
+    let mut search = space.search(compressed, frame, budget);
+    if !is_explained {
+        alternatives.insert(0, highest_peaks(&mut search, hypothesis));
+    }
+    for sources in alternatives {
+        let mut candidate = Candidate::from(Hypothesis {
+            sources,
+            converged: false,
+            ..hypothesis.clone()
+        });
+        search.fit_trial(&mut candidate);
+        if search.is_explained_by(&candidate) {
+            let mut rival = Candidate::from(hypothesis.clone());
+            search.fit_trial(&mut rival);
+            if search.score(&candidate) < search.score(&rival) {
+                return Shape::Simpler(candidate.into_hypothesis());
+            }
+        }
+        let error = common_misfit(&mut search, &mut candidate);
+        if error > 0.0 {
+            return Shape::Different(error, candidate.into_hypothesis());
+        }
+    }
+    Shape::AsModelled
+}
+
+/// The highest peaks of the frame, whatever a hypothesis made of it.
+fn highest_peaks(search: &mut Search, hypothesis: &Hypothesis) -> Vec<PointSource> {
+    let mut dark = Candidate::from(Hypothesis::empty(Nuisances {
+        background: hypothesis.nuisances.background,
+        width: Width::Known,
+    }));
+    search.fit_trial(&mut dark);
+    let peaks = search.residual_peaks(&mut dark);
+    let least = peaks.first().map_or(0.0, |p| HIGH_PEAK * p.significance);
+    let high = peaks.iter().take_while(|p| p.significance >= least);
+    high.map(|p| PointSource::new(p.u, p.a)).collect()
+}
+
+/// Searches from `start` under the weights of a spot error; leaves them in `compressed`.
+pub(crate) fn search_with_spot_error(
+    space: &mut SearchSpace,
+    compressed: &mut CompressedFrame,
+    frame: &PreprocessedFrame,
+    spot_error: f64,
+    start: Hypothesis,
+    budget: &mut WorkBudget,
+) -> Hypothesis {
+    compressed.load(frame, &space.bases.x, &space.bases.y);
+    let most = compressed.max_sources();
+    let bright = start.sources.clone();
+    let mut candidate = Candidate::from(start);
+    for _ in 0..PASSES {
+        set_weights(space, compressed, frame, spot_error, &candidate.sources);
+        let mut search = space.search(compressed, frame, budget);
+        search.fit_trial(&mut candidate);
+        let peaks = search.residual_peaks(&mut candidate);
+        let least = peaks.first().map_or(0.0, |p| STRONG_PEAK * p.significance);
+        let threshold = search.criterion.threshold().sqrt();
+        let room = most.saturating_sub(candidate.sources.len());
+        let added: Vec<PointSource> = peaks
+            .iter()
+            .filter(|p| p.significance > threshold && p.significance >= least)
+            .take(room)
+            .map(|p| PointSource::new(p.u, p.a))
+            .collect();
+        if added.is_empty() || search.is_exhausted() {
+            break;
+        }
+        candidate.sources.extend(added);
+    }
+    set_weights(space, compressed, frame, spot_error, &candidate.sources);
+    let mut search = space.search(compressed, frame, budget);
+    search.converge(&mut candidate);
+    let refined = refit_reweighted(&mut search, candidate.clone().into_hypothesis(), ROUNDS);
+    // A bright spot is never its own halo's.
+    let is_kept = |spot: &PointSource| refined.sources.iter().any(|s| distance2(s.u, spot.u) < CORE * CORE);
+    match bright.iter().all(is_kept) {
+        true => refined,
+        false => candidate.into_hypothesis(),
+    }
+}
+
+/// Removes sources that do not exceed the halo of the others, the faintest first.
+pub(crate) fn drop_halo(bases: &Bases, spot_error: f64, penalty: f64, sources: &mut Vec<PointSource>) {
+    let norm = spot_norm(bases);
+    let error = spot_error.min(MAX_SPOT_ERROR);
+    sources.sort_by(|a, b| b.a.total_cmp(&a.a));
+    let mut kept: Vec<PointSource> = Vec::with_capacity(sources.len());
+    for source in sources.drain(..) {
+        let halo: f64 = kept
+            .iter()
+            .map(|s| (s.a * norm * height(distance2(s.u, source.u))).powi(2))
+            .sum();
+        if (source.a * norm).powi(2) > penalty * (1.0 + error * error * halo) {
+            kept.push(source);
+        }
+    }
+    *sources = kept;
+}
+
+/// Weights that allow for the halo of `sources`, and the variances that their positions are reported with.
+fn set_weights(
+    space: &SearchSpace,
+    compressed: &mut CompressedFrame,
+    frame: &PreprocessedFrame,
+    spot_error: f64,
+    sources: &[PointSource],
+) {
+    let halo = Halo::new(&space.bases, sources);
+    let variance = |square: f64| 1.0 + spot_error * spot_error * square;
+    compressed.set_weights(frame, space.bases.axes(), |k| variance(halo.square[k]));
+    let nx = space.bases.x.n;
+    let mx = compressed.mx;
+    let mut position_weights = compressed.weights.clone();
+    for (k, others) in halo.square_of_others.iter().enumerate() {
+        let w = &mut position_weights[k / nx * mx + k % nx];
+        *w = w.powi(2) * variance(POSITION_SHARE * *others);
+    }
+    compressed.position_weights = position_weights;
+}

@@ -1,0 +1,147 @@
+//! What is known of all emitters' positions and velocities together: a quadratic log likelihood in information form.
+
+use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
+
+/// Numbers of an emitter's state: position (x, y) in σ and velocity in σ/s.
+pub(crate) const STATE: usize = 4;
+
+/// −2 ln L(x) = constant − 2 gᵀδ + δᵀΛδ with δ = x − `at`, over the states of all emitters at one time. Λ may be singular: what is not
+/// known has no information.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct JointInformation {
+    pub at: DVector<f64>,
+    pub gradient: DVector<f64>,
+    pub information: DMatrix<f64>,
+}
+
+impl JointInformation {
+    pub fn len(&self) -> usize {
+        self.at.len() / STATE
+    }
+
+    /// −2 ln L at `state`, up to the constant.
+    pub fn cost(&self, state: &DVector<f64>) -> f64 {
+        let step = state - &self.at;
+        (&self.information * &step).dot(&step) - 2.0 * self.gradient.dot(&step)
+    }
+
+    /// The gradient −½ ∂(−2 ln L)/∂x at `state`.
+    pub fn gradient_at(&self, state: &DVector<f64>) -> DVector<f64> {
+        &self.gradient - &self.information * (state - &self.at)
+    }
+
+    /// The same likelihood, expanded about `state`.
+    pub fn recentre(&mut self, state: &DVector<f64>) {
+        self.gradient = self.gradient_at(state);
+        self.at.copy_from(state);
+    }
+
+    /// Adds an emitter of which only the variances of position and velocity are known.
+    pub fn insert(&mut self, state: [f64; STATE], variance: [f64; 2]) {
+        let n = self.at.len();
+        self.at = self.at.clone().resize_vertically(n + STATE, 0.0);
+        self.gradient = self.gradient.clone().resize_vertically(n + STATE, 0.0);
+        self.information = self.information.clone().resize(n + STATE, n + STATE, 0.0);
+        for k in 0..STATE {
+            self.at[n + k] = state[k];
+            self.information[(n + k, n + k)] = 1.0 / variance[k / 2];
+            // Velocities are zero before anything is known of them.
+            if k >= 2 {
+                self.gradient[n + k] = -state[k] / variance[1];
+            }
+        }
+    }
+
+    /// Removes an emitter: what was known of the others through it stays (the Schur complement).
+    pub fn marginalise(&mut self, emitter: usize) {
+        let n = self.at.len();
+        let gone: Vec<usize> = (STATE * emitter..STATE * (emitter + 1)).collect();
+        let kept: Vec<usize> = (0..n).filter(|k| !gone.contains(k)).collect();
+        let of = |rows: &[usize], columns: &[usize]| {
+            DMatrix::from_fn(rows.len(), columns.len(), |r, c| {
+                self.information[(rows[r], columns[c])]
+            })
+        };
+        let mut inner = of(&gone, &gone);
+        for k in 0..STATE {
+            inner[(k, k)] += 1e-12 * inner[(k, k)].abs() + 1e-300;
+        }
+        let cross = of(&kept, &gone);
+        let mut information = of(&kept, &kept);
+        let mut gradient = DVector::from_fn(kept.len(), |k, _| self.gradient[kept[k]]);
+        if let Some(factor) = Cholesky::new(inner) {
+            let weights = factor.solve(&cross.transpose());
+            information -= &cross * &weights;
+            let own = DVector::from_fn(STATE, |k, _| self.gradient[gone[k]]);
+            gradient -= weights.transpose() * own;
+        }
+        self.at = DVector::from_fn(kept.len(), |k, _| self.at[kept[k]]);
+        (self.information, self.gradient) = (information, gradient);
+        self.symmetrise();
+    }
+
+    /// The same knowledge `dt` seconds later, every emitter having gone straight on: Λ' = F⁻ᵀΛF⁻¹.
+    pub fn propagate(&mut self, dt: f64) {
+        let n = self.at.len();
+        for e in (0..n).step_by(STATE) {
+            for k in e..e + 2 {
+                self.at[k] += dt * self.at[k + 2];
+                let g = self.gradient[k];
+                self.gradient[k + 2] -= dt * g;
+            }
+        }
+        // F⁻¹ from the right, then F⁻ᵀ from the left.
+        for e in (0..n).step_by(STATE) {
+            for k in e..e + 2 {
+                for r in 0..n {
+                    let p = self.information[(r, k)];
+                    self.information[(r, k + 2)] -= dt * p;
+                }
+            }
+        }
+        for e in (0..n).step_by(STATE) {
+            for k in e..e + 2 {
+                for c in 0..n {
+                    let p = self.information[(k, c)];
+                    self.information[(k + 2, c)] -= dt * p;
+                }
+            }
+        }
+    }
+
+    /// Adds process noise of the given covariance to `indices`: (Λ⁻¹ + GQGᵀ)⁻¹ by Woodbury's identity.
+    pub fn add_noise(&mut self, indices: &[usize], noise: &DMatrix<f64>) {
+        let n = self.at.len();
+        let columns = DMatrix::from_fn(n, indices.len(), |r, c| self.information[(r, indices[c])]);
+        let inner = DMatrix::from_fn(indices.len(), indices.len(), |r, c| {
+            self.information[(indices[r], indices[c])]
+        });
+        let Some(precision) = noise.clone().try_inverse() else {
+            return;
+        };
+        let Some(inverse) = (precision + inner).try_inverse() else {
+            return;
+        };
+        let own = DVector::from_fn(indices.len(), |k, _| self.gradient[indices[k]]);
+        let weights = &columns * inverse;
+        self.gradient -= &weights * own;
+        self.information -= &weights * columns.transpose();
+        self.symmetrise();
+    }
+
+    fn symmetrise(&mut self) {
+        let transposed = self.information.transpose();
+        self.information += transposed;
+        self.information *= 0.5;
+    }
+
+    /// The Cholesky factor of Λ with its diagonal raised by `relative`.
+    pub fn factor(&self, relative: f64) -> Option<Cholesky<f64, Dyn>> {
+        let mut damped = self.information.clone();
+        for k in 0..damped.nrows() {
+            let d = damped[(k, k)];
+            damped[(k, k)] = d + relative * d.abs() + 1e-300;
+        }
+        Cholesky::new(damped)
+    }
+}

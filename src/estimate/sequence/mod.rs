@@ -1,0 +1,16 @@
+//! Frames together: emitters keep their positions and velocities from frame to frame, while each frame's energies are free.
+//!
+//! Every answer is the maximum likelihood of this frame and all before it that still tell something. Independently fading beams are
+//! told apart where no single frame could (the multi-snapshot problem of array processing: Ottersten, Viberg and Stoica, 1993).
+//! Recent frames are kept as a window that is fitted anew where its linearisation no longer holds; older ones leave it as information on
+//! all positions and velocities together.
+
+mod joint_information;
+mod motion;
+mod search;
+mod sequence_estimator;
+mod snapshot;
+mod subspace;
+mod window;
+
+pub(crate) use sequence_estimator::SequenceEstimator;

@@ -1,0 +1,74 @@
+//! What is reported of the emitters' motion: velocities, drawn towards zero as far as all of them together are no more than their errors.
+
+use nalgebra::{DMatrix, DVector};
+
+use crate::estimate::sequence::joint_information::{JointInformation, STATE};
+use crate::estimate::sequence::window::SPEED_STD_M_S;
+
+/// Standard deviations of a speed along an axis, m/s, that emitters of a scene may have: all stand still, walk, cycle, drive.
+const SPEEDS_M_S: [f64; 4] = [0.01, 0.7, 2.5, SPEED_STD_M_S];
+/// A hypothesis of less weight is left out.
+const LEAST_WEIGHT: f64 = 1e-3;
+
+/// Positions and velocities with their covariance.
+pub(crate) struct Posterior {
+    pub state: DVector<f64>,
+    pub covariance: DMatrix<f64>,
+}
+
+/// The posterior of `total` over hypotheses of how fast the emitters of a scene are, each weighed by its evidence: people who all stand still
+/// cost no information for velocities that are not there, and people who walk are not held back. `unit` is 1 m/s in σ/s. `None` where
+/// the information is singular.
+pub(crate) fn posterior(total: &JointInformation, unit: f64) -> Option<Posterior> {
+    let n = total.len();
+    if n == 0 {
+        return None;
+    }
+    let covariance = total.factor(1e-13)?.inverse();
+    let state = &total.at + &covariance * &total.gradient;
+    let velocity = |k: usize| STATE * (k / 2) + 2 + k % 2;
+    let speeds = DVector::from_fn(2 * n, |k, _| state[velocity(k)]);
+    let errors = DMatrix::from_fn(2 * n, 2 * n, |r, c| covariance[(velocity(r), velocity(c))]);
+    // −2 ln of the velocities' probability where they are N(0, variance) and measured with these errors.
+    let cost = |speed: f64| -> Option<f64> {
+        let mut sum = errors.clone();
+        for k in 0..2 * n {
+            sum[(k, k)] += (speed * unit).powi(2);
+        }
+        let factor = sum.cholesky()?;
+        let spread: f64 = factor.l_dirty().diagonal().iter().map(|d| 2.0 * d.ln()).sum();
+        Some(spread + speeds.dot(&factor.solve(&speeds)))
+    };
+    let costs = SPEEDS_M_S.map(|s| cost(s).unwrap_or(f64::INFINITY));
+    let best = costs.into_iter().fold(f64::INFINITY, f64::min);
+    let weights = costs.map(|c| (0.5 * (best - c)).exp());
+    let sum: f64 = weights.iter().filter(|w| **w > LEAST_WEIGHT).sum();
+    let mut mean = DVector::zeros(STATE * n);
+    let mut second = DMatrix::zeros(STATE * n, STATE * n);
+    for (speed, weight) in SPEEDS_M_S.into_iter().zip(weights).filter(|(_, w)| *w > LEAST_WEIGHT) {
+        let of = held(total, speed * unit)?;
+        // Relative to the unrestrained state, against rounding.
+        let shift = &of.state - &state;
+        mean += weight / sum * &shift;
+        second += weight / sum * (of.covariance + &shift * shift.transpose());
+    }
+    Some(Posterior {
+        covariance: second - &mean * mean.transpose(),
+        state: state + mean,
+    })
+}
+
+/// The posterior with velocities of standard deviation `speed`.
+fn held(total: &JointInformation, speed: f64) -> Option<Posterior> {
+    let mut held = total.clone();
+    let precision = 1.0 / (speed * speed);
+    for e in 0..total.len() {
+        for i in [STATE * e + 2, STATE * e + 3] {
+            held.information[(i, i)] += precision;
+            held.gradient[i] -= held.at[i] * precision;
+        }
+    }
+    let covariance = held.factor(1e-13)?.inverse();
+    let state = &held.at + &covariance * &held.gradient;
+    Some(Posterior { state, covariance })
+}

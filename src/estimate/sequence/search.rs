@@ -1,0 +1,314 @@
+//! The number of emitters of a window: births where the residuals of all frames together peak, deaths and merges where the light of a
+//! target is no more than noise, and a start from the subspace where frames suffice.
+
+use nalgebra::DMatrix;
+
+use crate::estimate::detect::matched_filter::MatchedFilter;
+use crate::estimate::model::hypothesis::{Nuisances, OVERLAPPING};
+use crate::estimate::sequence::snapshot::{Engine, LocalQuadratic, Snapshot, residual};
+use crate::estimate::sequence::subspace::Subspace;
+use crate::estimate::sequence::window::{Target, Window};
+
+/// Steps of a fit before a hypothesis is compared, and before it is kept.
+const TRIAL_STEPS: usize = 40;
+const CONVERGE_STEPS: usize = 100;
+/// A residual peak is tried from this share of the penalty beyond the noise on: what other emitters have absorbed comes back in the joint fit.
+const TRIED: f64 = 0.6;
+/// Residual peaks tried in a round.
+const PEAKS: usize = 3;
+/// Rounds of births and deaths.
+const ROUNDS: usize = 12;
+/// Targets that are moved to the residual's peaks, the weakest first.
+const RELOCATED: usize = 3;
+/// Least share of a spot that lies outside the emitters' span for a birth there: nearer, it is the same emitter.
+const LEAST_OUTSIDE: f64 = 1e-6;
+
+/// Least decrease of the deviance that a source must bring when its energy is free in each of `frames` frames: the bound of χ² with that
+/// many degrees of freedom (Laurent and Massart, 2000, eq. 4.3) that one frame exceeds as rarely as `single`, the penalty in a lone frame.
+pub(crate) fn penalty(single: f64, frames: f64) -> f64 {
+    let root = 0.5 * ((2.0 * single - 1.0).sqrt() - 1.0);
+    frames + 2.0 * frames.sqrt() * root + 2.0 * root * root
+}
+
+/// The penalised −2 ln L of a fitted window; the lower, the better.
+pub(crate) fn score(window: &Window, single: f64) -> f64 {
+    let penalties: f64 = window.counts().iter().map(|&k| penalty(single, k)).sum();
+    window.cost - window.dropped * window.len() as f64 + penalties
+}
+
+/// A search of one window.
+pub(crate) struct WindowSearch<'s, 'a, 'b> {
+    pub engine: &'s mut Engine<'a, 'b>,
+    pub matched_filter: &'s mut MatchedFilter,
+    /// The penalty of a source in a lone frame.
+    pub penalty: f64,
+}
+
+impl WindowSearch<'_, '_, '_> {
+    pub fn score(&self, window: &Window) -> f64 {
+        score(window, self.penalty)
+    }
+
+    /// Maxima of the light that the residuals of all frames leave for one more emitter, Σ (fᵀr)²/‖P⊥f‖², the highest first.
+    pub fn residual_peaks(&mut self, window: &Window) -> Vec<(f64, [f64; 2])> {
+        let Some(last) = window.snapshots.last() else {
+            return Vec::new();
+        };
+        let filter = &mut *self.matched_filter;
+        let mut sum: Vec<f64> = Vec::new();
+        for s in &window.snapshots {
+            let positions = window.positions(&window.state, s.time_s);
+            let (left, _) = residual(self.engine, &s.compressed, s.nuisances, &positions);
+            filter.respond(left, s.compressed.mx, s.compressed.my);
+            sum.resize(filter.map().len(), 0.0);
+            for (total, v) in sum.iter_mut().zip(filter.map()) {
+                *total += v * v;
+            }
+        }
+        // The share of a spot that lies outside the emitters' span: one minus cᵀG⁻¹c, from the emitters' own responses.
+        let positions = window.positions(&window.state, last.time_s);
+        let n = positions.len() / 2;
+        let (mx, my) = (last.compressed.mx, last.compressed.my);
+        let mut responses = DMatrix::zeros(n, sum.len());
+        let mut spots = Vec::new();
+        for i in 0..n {
+            let spot = unit_spot(self.engine, last, [positions[2 * i], positions[2 * i + 1]]);
+            filter.respond(&spot, mx, my);
+            for (k, v) in filter.map().iter().enumerate() {
+                responses[(i, k)] = *v;
+            }
+            spots.push(spot);
+        }
+        let inner = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(x, y)| x * y).sum::<f64>();
+        let mut gram = DMatrix::from_fn(n, n, |i, j| inner(&spots[i], &spots[j]));
+        for i in 0..n {
+            gram[(i, i)] *= 1.0 + 1e-12;
+        }
+        if n > 0 {
+            let Some(factor) = gram.cholesky() else {
+                return Vec::new();
+            };
+            for (k, total) in sum.iter_mut().enumerate() {
+                let c = responses.column(k).into_owned();
+                let outside = 1.0 - c.dot(&factor.solve(&c));
+                *total = if outside > LEAST_OUTSIDE { *total / outside } else { 0.0 };
+            }
+        }
+        let width = filter.width();
+        let height = sum.len() / width;
+        let mut found = Vec::new();
+        for (k, &value) in sum.iter().enumerate() {
+            let (i, j) = (k % width, k / width);
+            let mut around = (j.saturating_sub(1)..(j + 2).min(height))
+                .flat_map(|b| (i.saturating_sub(1)..(i + 2).min(width)).map(move |a| b * width + a))
+                .filter(|o| *o != k);
+            if around.all(|o| sum[o] < value) {
+                found.push((value, filter.position(k)));
+            }
+        }
+        found.sort_by(|a, b| b.0.total_cmp(&a.0));
+        found
+    }
+
+    /// Adds targets at residual peaks while the score improves. Returns whether any was added.
+    pub fn grow(&mut self, window: &mut Window, born_s: f64) -> bool {
+        let mut has_grown = false;
+        for _ in 0..ROUNDS {
+            if self.engine.budget.is_exhausted() {
+                break;
+            }
+            let frames = window.snapshots.iter().filter(|s| s.time_s >= born_s).count() as f64;
+            let least = frames + TRIED * (penalty(self.penalty, frames) - frames);
+            let peaks = self.residual_peaks(window);
+            let before = self.score(window);
+            let mut best: Option<Window> = None;
+            for (value, at) in peaks.into_iter().take(PEAKS) {
+                if value < least {
+                    break;
+                }
+                let mut next = window.clone();
+                next.insert(Target::born(born_s), at, [0.0; 2]);
+                next.fit(self.engine, TRIAL_STEPS);
+                let bar = best.as_ref().map_or(before - 1e-6, |b| self.score(b));
+                if self.score(&next) < bar {
+                    best = Some(next);
+                }
+            }
+            let Some(best) = best else { break };
+            *window = best;
+            has_grown = true;
+        }
+        has_grown
+    }
+
+    /// Removes targets while the score improves: those near another, and those of least light.
+    pub fn shrink(&mut self, window: &mut Window) -> bool {
+        let mut has_shrunk = false;
+        while window.len() > 0 && !self.engine.budget.is_exhausted() {
+            let before = self.score(window);
+            let mut best: Option<Window> = None;
+            for e in self.doubtful(window) {
+                let mut next = window.clone();
+                next.remove(e);
+                next.fit(self.engine, TRIAL_STEPS);
+                let bar = best.as_ref().map_or(before, |b| self.score(b));
+                if self.score(&next) < bar {
+                    best = Some(next);
+                }
+            }
+            let Some(best) = best else { break };
+            *window = best;
+            has_shrunk = true;
+        }
+        has_shrunk
+    }
+
+    /// Targets that may not be: the farther one of each close pair, and those whose light is little against its errors.
+    fn doubtful(&self, window: &Window) -> Vec<usize> {
+        let evidence = light(window);
+        let counts = window.counts();
+        let place = |e: usize| [window.state[4 * e], window.state[4 * e + 1]];
+        let mut doubtful: Vec<usize> = (0..window.len())
+            .filter(|&e| {
+                let is_near = (0..window.len()).any(|f| {
+                    let (a, b) = (place(e), place(f));
+                    f != e && (a[0] - b[0]).hypot(a[1] - b[1]) < OVERLAPPING && (evidence[e], e) <= (evidence[f], f)
+                });
+                is_near || evidence[e] < 2.0 * penalty(self.penalty, counts[e])
+            })
+            .collect();
+        doubtful.sort_by(|&a, &b| evidence[a].total_cmp(&evidence[b]));
+        doubtful.truncate(4);
+        doubtful
+    }
+
+    /// Moves weak targets to where the residual peaks without them.
+    fn relocate(&mut self, window: &mut Window) -> bool {
+        let evidence = light(window);
+        let mut order: Vec<usize> = (0..window.len()).collect();
+        order.sort_by(|&a, &b| evidence[a].total_cmp(&evidence[b]));
+        let before = self.score(window);
+        for e in order.into_iter().take(RELOCATED) {
+            if self.engine.budget.is_exhausted() {
+                break;
+            }
+            let target = window.targets[e];
+            let mut without = window.clone();
+            without.remove(e);
+            without.fit(self.engine, TRIAL_STEPS);
+            for (_, at) in self.residual_peaks(&without).into_iter().take(2) {
+                let mut next = without.clone();
+                next.insert(target, at, [0.0; 2]);
+                next.fit(self.engine, TRIAL_STEPS);
+                if self.score(&next) < before - 1.0 {
+                    *window = next;
+                    return true;
+                }
+            }
+        }
+        false
+    }
+
+    /// Grows, shrinks and relocates until nothing improves.
+    pub fn refine(&mut self, window: &mut Window, born_s: f64) {
+        for _ in 0..4 {
+            let has_grown = self.grow(window, born_s);
+            let has_shrunk = self.shrink(window);
+            if !has_grown && !has_shrunk && !self.relocate(window) {
+                break;
+            }
+        }
+    }
+
+    /// A window from the subspace of the frames alone, if it explains them better than `window` does.
+    pub fn restart(&mut self, window: &mut Window) -> bool {
+        let frames: Vec<_> = window.snapshots.iter().map(|s| &*s.compressed).collect();
+        let Some(subspace) = Subspace::new(&frames) else {
+            return false;
+        };
+        let first = window.snapshots.first().map_or(0.0, |s| s.time_s);
+        let middle = 0.5 * (first + window.time_s);
+        let still = Window {
+            time_s: middle,
+            snapshots: subspace
+                .components
+                .iter()
+                .map(|c| Snapshot {
+                    time_s: middle,
+                    compressed: c.clone(),
+                    nuisances: Nuisances::default(),
+                    local: LocalQuadratic::default(),
+                })
+                .collect(),
+            dropped: subspace.dropped as f64,
+            unknown: window.unknown,
+            ..Window::default()
+        };
+        let mut best: Option<Window> = None;
+        let peaks = subspace.music(self.engine.bases, subspace.count);
+        let current = {
+            let positions = window.positions(&window.state, middle);
+            (0..positions.len() / 2)
+                .map(|i| [positions[2 * i], positions[2 * i + 1]])
+                .collect()
+        };
+        for start in [peaks.into_iter().take(subspace.count).collect::<Vec<_>>(), current] {
+            let mut next = still.clone();
+            for at in start {
+                next.insert(Target::born(f64::NEG_INFINITY), at, [0.0; 2]);
+            }
+            next.fit(self.engine, TRIAL_STEPS);
+            self.refine(&mut next, f64::NEG_INFINITY);
+            if best.as_ref().is_none_or(|b| self.score(&next) < self.score(b)) {
+                best = Some(next);
+            }
+        }
+        let Some(best) = best else { return false };
+        let mut next = window.clone();
+        while next.len() > 0 {
+            next.remove(next.len() - 1);
+        }
+        for e in 0..best.len() {
+            next.insert(
+                Target::born(first),
+                [best.state[4 * e], best.state[4 * e + 1]],
+                [0.0; 2],
+            );
+        }
+        next.fit(self.engine, CONVERGE_STEPS);
+        let is_better = self.score(&next) < self.score(window) - 1.0;
+        if is_better {
+            *window = next;
+        }
+        is_better
+    }
+}
+
+/// Σ a²/var(a) of each target over the snapshots: what its light weighs against its errors.
+pub(crate) fn light(window: &Window) -> Vec<f64> {
+    let mut evidence = vec![0.0; window.len()];
+    for s in &window.snapshots {
+        for (i, e) in window.present(s.time_s).into_iter().enumerate() {
+            evidence[e] += s.local.energies[i].powi(2) / s.local.energy_variances[i];
+        }
+    }
+    evidence
+}
+
+/// A spot of unit norm at `u`, in the coefficients of a snapshot.
+fn unit_spot(engine: &mut Engine, snapshot: &Snapshot, u: [f64; 2]) -> Vec<f64> {
+    let axes = engine.bases.axes();
+    let sizes = [snapshot.compressed.mx, snapshot.compressed.my];
+    let profiles: [Vec<f64>; 2] = [0, 1].map(|k| {
+        let (m, mut scratch) = (sizes[k], vec![0.0; 3 * axes[k].n]);
+        let mut out = vec![0.0; 3 * m];
+        axes[k].profile(u[k], 1.0, snapshot.compressed.reach, m, &mut scratch, &mut out);
+        out.truncate(m);
+        let norm = out.iter().map(|v| v * v).sum::<f64>().sqrt().max(1e-12);
+        out.iter().map(|v| v / norm).collect()
+    });
+    profiles[1]
+        .iter()
+        .flat_map(|y| profiles[0].iter().map(move |x| x * y))
+        .collect()
+}

@@ -1,0 +1,277 @@
+//! The joint fit of all emitters' positions and velocities to the frames of a window, on top of what older frames have left behind.
+
+use nalgebra::DVector;
+
+use crate::estimate::sequence::joint_information::{JointInformation, STATE};
+use crate::estimate::sequence::snapshot::{Engine, LocalQuadratic, Snapshot};
+
+/// Damping λ: first value and range, as in the fit of one frame.
+const LAMBDA_START: f64 = 1e-3;
+const LAMBDA_FLOOR: f64 = 1e-12;
+const LAMBDA_CEILING: f64 = 1e8;
+/// Converged when the predicted decrease of the next step is below this: 3 % of a standard deviation.
+const NEGLIGIBLE_DECREASE: f64 = 1e-3;
+/// Longest step of a position in one iteration, σ: the model is not linear farther out.
+const LONGEST_STEP: f64 = 0.5;
+/// Standard deviation of a speed that is not known, m/s: cars in town. It only keeps the first frames' normal equations regular.
+pub(crate) const SPEED_STD_M_S: f64 = 8.0;
+
+/// Frames from which a target's mean energy is known well enough to miss it, and over how many it is averaged.
+const FEW: f64 = 3.0;
+const MANY: f64 = 100.0;
+
+/// An emitter that the window follows.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Target {
+    /// Earlier frames do not hold it, s.
+    pub born_s: f64,
+    /// Mean energy of its frames, and their number up to the length of the memory.
+    pub mean_energy: f64,
+    pub frames: f64,
+    /// ln of the evidence that it has gone dark over that it has not, never below zero.
+    pub darkness: f64,
+}
+
+impl Target {
+    pub fn born(born_s: f64) -> Self {
+        Self {
+            born_s,
+            mean_energy: 0.0,
+            frames: 0.0,
+            darkness: 0.0,
+        }
+    }
+
+    /// Takes the energy that a frame measured, with its variance, at `weight` of an independent draw of the fading. The evidence is
+    /// between no light and light that is exponentially distributed about its mean, which no fading exceeds by much in the dark.
+    pub fn weigh(&mut self, energy: f64, variance: f64, weight: f64) {
+        let std = variance.sqrt();
+        if self.frames >= FEW && self.mean_energy > 0.0 && std.is_finite() {
+            let z = energy / std - std / self.mean_energy;
+            // e^{z²/2}·Φ(z), by its asymptote where Φ underflows.
+            let tail = if z < -6.0 {
+                -1.0 / (z * (2.0 * std::f64::consts::PI).sqrt())
+            } else {
+                (0.5 * z * z).min(600.0).exp() * 0.5 * libm::erfc(-z * std::f64::consts::FRAC_1_SQRT_2)
+            };
+            let alive = ((2.0 * std::f64::consts::PI).sqrt() * std / self.mean_energy * tail).ln();
+            self.darkness = (self.darkness - weight * alive).max(0.0);
+        }
+        self.frames = (self.frames + 1.0).min(MANY);
+        self.mean_energy += (energy - self.mean_energy) / self.frames;
+    }
+}
+
+/// All that is remembered.
+#[derive(Clone, Default)]
+pub(crate) struct Window {
+    pub targets: Vec<Target>,
+    /// The time of `state`, s since the epoch.
+    pub time_s: f64,
+    /// Position, σ, and velocity, σ/s, of each target.
+    pub state: DVector<f64>,
+    /// What frames that have left the window say, at `time_s`.
+    pub prior: JointInformation,
+    pub snapshots: Vec<Snapshot>,
+    /// The prior and all snapshots, about `state`.
+    pub total: JointInformation,
+    /// Snapshots of noise alone that were left out; see `subspace`.
+    pub dropped: f64,
+    /// −2 ln L of the last fit.
+    pub cost: f64,
+    /// Variances of position, σ², and velocity, σ²/s², of an emitter of which nothing is known.
+    pub unknown: [f64; 2],
+}
+
+impl Window {
+    pub fn len(&self) -> usize {
+        self.targets.len()
+    }
+
+    /// Indices of the targets that a frame at `time_s` may hold.
+    pub fn present(&self, time_s: f64) -> Vec<usize> {
+        (0..self.len()).filter(|&e| self.targets[e].born_s <= time_s).collect()
+    }
+
+    /// Positions of the targets that a frame at `time_s` may hold.
+    pub fn positions(&self, state: &DVector<f64>, time_s: f64) -> DVector<f64> {
+        let dt = time_s - self.time_s;
+        let at = self.present(time_s).into_iter();
+        let at: Vec<f64> = at
+            .flat_map(|e| [0, 1].map(|k| state[STATE * e + k] + dt * state[STATE * e + 2 + k]))
+            .collect();
+        DVector::from_vec(at)
+    }
+
+    /// Moves state and knowledge to `time_s`; what has left the window fades with the time constant `memory_s`.
+    pub fn advance(&mut self, time_s: f64, memory_s: f64) {
+        let dt = time_s - self.time_s;
+        let lost = 1.0 - (-dt / memory_s).exp();
+        self.total.gradient -= lost * self.prior.gradient_at(&self.total.at);
+        self.total.information -= lost * &self.prior.information;
+        self.prior.gradient *= 1.0 - lost;
+        self.prior.information *= 1.0 - lost;
+        self.time_s = time_s;
+        for e in 0..self.len() {
+            for k in STATE * e..STATE * e + 2 {
+                self.state[k] += dt * self.state[k + 2];
+            }
+        }
+        self.prior.propagate(dt);
+        self.total.propagate(dt);
+    }
+
+    /// Adds a target; every snapshot from `target.born_s` on may hold it.
+    pub fn insert(&mut self, target: Target, position: [f64; 2], velocity: [f64; 2]) {
+        let n = self.state.len();
+        self.state = self.state.clone().resize_vertically(n + STATE, 0.0);
+        let state = [position[0], position[1], velocity[0], velocity[1]];
+        self.state.as_mut_slice()[n..].copy_from_slice(&state);
+        self.prior.insert(state, self.unknown);
+        self.total.insert(state, self.unknown);
+        self.targets.push(target);
+    }
+
+    /// Forgets a target, and that any snapshot held it. The caller fits again.
+    pub fn remove(&mut self, e: usize) {
+        self.targets.remove(e);
+        let kept = self.state.as_slice().chunks_exact(STATE).enumerate();
+        let kept: Vec<f64> = kept.filter(|(k, _)| *k != e).flat_map(|(_, s)| s.to_vec()).collect();
+        self.state = DVector::from_vec(kept);
+        self.prior.marginalise(e);
+        self.total.marginalise(e);
+    }
+
+    /// Moves the `count` oldest snapshots into the prior.
+    pub fn fold(&mut self, count: usize) {
+        let mut prior = std::mem::take(&mut self.prior);
+        prior.recentre(&self.state);
+        for snapshot in self.snapshots.drain(..count).collect::<Vec<_>>() {
+            self.absorb(&mut prior, &snapshot.local, snapshot.time_s);
+        }
+        self.prior = prior;
+    }
+
+    /// Adds a snapshot's likelihood to `knowledge`.
+    pub fn absorb(&self, knowledge: &mut JointInformation, local: &LocalQuadratic, time_s: f64) {
+        let present = self.present(time_s);
+        let dt = time_s - self.time_s;
+        let shift = self.positions(&knowledge.at, time_s) - &local.positions;
+        let gradient = &local.gradient - &local.information * shift;
+        for (i, &e) in present.iter().enumerate() {
+            for k in 0..2 {
+                let row = STATE * e + k;
+                knowledge.gradient[row] += gradient[2 * i + k];
+                knowledge.gradient[row + 2] += dt * gradient[2 * i + k];
+            }
+            for (j, &f) in present.iter().enumerate() {
+                for k in 0..2 {
+                    for l in 0..2 {
+                        let v = local.information[(2 * i + k, 2 * j + l)];
+                        let (r, c) = (STATE * e + k, STATE * f + l);
+                        knowledge.information[(r, c)] += v;
+                        knowledge.information[(r + 2, c)] += dt * v;
+                        knowledge.information[(r, c + 2)] += dt * v;
+                        knowledge.information[(r + 2, c + 2)] += dt * dt * v;
+                    }
+                }
+            }
+        }
+    }
+
+    /// Linearises all snapshots at `state`. Returns −2 ln L, and prior and snapshots together.
+    fn linearise(&self, engine: &mut Engine, state: &DVector<f64>, locals: &mut Vec<LocalQuadratic>) -> f64 {
+        locals.clear();
+        let mut cost = self.prior.cost(state);
+        for s in &self.snapshots {
+            let positions = self.positions(state, s.time_s);
+            let local = LocalQuadratic::new(engine, &s.compressed, s.nuisances, positions);
+            cost += local.deviance;
+            locals.push(local);
+        }
+        cost
+    }
+
+    fn sum(&self, state: &DVector<f64>, locals: &[LocalQuadratic]) -> JointInformation {
+        let mut total = self.prior.clone();
+        total.recentre(state);
+        for (s, local) in self.snapshots.iter().zip(locals) {
+            self.absorb(&mut total, local, s.time_s);
+        }
+        total
+    }
+
+    /// Fits all snapshots and the prior together by Levenberg–Marquardt, at most `steps` steps from `state` on. Sets `total` and `cost`, and
+    /// returns whether it has converged.
+    pub fn fit(&mut self, engine: &mut Engine, steps: usize) -> bool {
+        let mut locals = Vec::new();
+        let mut trial = Vec::new();
+        let mut cost = self.linearise(engine, &self.state.clone(), &mut locals);
+        let mut total = self.sum(&self.state, &locals);
+        let mut lambda = LAMBDA_START;
+        let mut has_converged = self.len() == 0;
+        let span = self.snapshots.first().map_or(0.0, |s| (self.time_s - s.time_s).abs());
+        for _ in 0..if has_converged { 0 } else { steps } {
+            if engine.budget.is_exhausted() {
+                break;
+            }
+            let Some(factor) = total.factor(lambda) else {
+                lambda *= 4.0;
+                if lambda > LAMBDA_CEILING {
+                    break;
+                }
+                continue;
+            };
+            let mut step = factor.solve(&total.gradient);
+            if step.dot(&total.gradient) < NEGLIGIBLE_DECREASE && lambda <= LAMBDA_START {
+                has_converged = true;
+                break;
+            }
+            shorten(&mut step, span);
+            let next = &self.state + &step;
+            let next_cost = self.linearise(engine, &next, &mut trial);
+            if next_cost <= cost {
+                cost = next_cost;
+                self.state = next;
+                std::mem::swap(&mut locals, &mut trial);
+                total = self.sum(&self.state, &locals);
+                lambda = (0.15 * lambda).max(LAMBDA_FLOOR);
+            } else {
+                lambda *= 4.0;
+                if lambda > LAMBDA_CEILING {
+                    has_converged = true;
+                    break;
+                }
+            }
+        }
+        for (s, local) in self.snapshots.iter_mut().zip(locals) {
+            s.local = local;
+        }
+        self.total = total;
+        self.cost = cost;
+        has_converged
+    }
+
+    /// Covariance of the state given all that is known; `None` where it is singular.
+    pub fn covariance(&self) -> Option<nalgebra::DMatrix<f64>> {
+        Some(self.total.factor(1e-13)?.inverse())
+    }
+
+    /// Number of snapshots that hold each target.
+    pub fn counts(&self) -> Vec<f64> {
+        self.targets
+            .iter()
+            .map(|t| self.dropped + self.snapshots.iter().filter(|s| t.born_s <= s.time_s).count() as f64)
+            .collect()
+    }
+}
+
+/// Shortens each emitter's step to what the model is linear over.
+fn shorten(step: &mut DVector<f64>, span: f64) {
+    for s in step.as_mut_slice().chunks_exact_mut(STATE) {
+        let longest = s[0].abs().max(s[1].abs()).max(span * s[2].abs()).max(span * s[3].abs());
+        if longest > LONGEST_STEP {
+            s.iter_mut().for_each(|v| *v *= LONGEST_STEP / longest);
+        }
+    }
+}

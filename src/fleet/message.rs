@@ -1,0 +1,70 @@
+//! What stations publish, as JSON. A reader refuses other versions.
+
+use jiff::Timestamp;
+use serde::{Deserialize, Serialize};
+
+use crate::claim::Claim;
+use crate::journal::Recorded;
+use crate::monitor::{AlertEvent, StationName, TrackedPosition};
+
+/// Version of the messages. Readers ignore fields that they do not know, so only a change of meaning raises it.
+pub const VERSION: u32 = 1;
+
+/// Of topic `alert`: one event of an alert's life. The header `Nats-Msg-Id` holds the event's id.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub struct AlertMessage {
+    pub version: u32,
+    #[serde(flatten)]
+    pub name: StationName,
+    /// The station's journal; a station that starts with a new one begins to count anew.
+    pub journal: String,
+    /// Grows with every event of this journal.
+    pub seq: u64,
+    /// When it happened, on the frames' clock.
+    pub at: Timestamp,
+    #[serde(flatten)]
+    pub event: AlertEvent,
+}
+
+/// Of topic `positions`: the newest frame, or one of the newest where frames come faster than they are published.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub struct PositionsMessage {
+    pub version: u32,
+    #[serde(flatten)]
+    pub name: StationName,
+    pub time: Timestamp,
+    pub frame: u64,
+    pub emitters: Vec<TrackedPosition>,
+    pub unseen: Vec<String>,
+    /// The claims in view.
+    pub claims: Vec<Claim>,
+    /// Half-widths of the watched area on the ground, m.
+    pub field_of_view_m: [f64; 2],
+}
+
+/// Of topic `health`: once a second.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub struct HealthMessage {
+    pub version: u32,
+    #[serde(flatten)]
+    pub name: StationName,
+    /// The station's wall clock.
+    pub time: Timestamp,
+    /// As `GET /v1/status`; null before the first frame.
+    pub status: serde_json::Value,
+    /// Alert events that wait for the server.
+    pub alerts_waiting: u64,
+}
+
+impl AlertMessage {
+    pub fn new(name: StationName, journal: &str, recorded: Recorded) -> Self {
+        Self {
+            version: VERSION,
+            name,
+            journal: journal.to_owned(),
+            seq: recorded.seq,
+            at: recorded.at,
+            event: recorded.event,
+        }
+    }
+}

@@ -1,0 +1,11 @@
+//! Places on the earth and on the ground: WGS-84 and local axes, and the camera's rays to the ground with their Jacobians.
+
+mod config;
+mod sight;
+mod view;
+mod wgs84;
+
+pub use config::{Config, ConfigError, Datum, Origin};
+pub use sight::{GroundPoint, Sight};
+pub use view::{Placed, View};
+pub use wgs84::{Geodetic, LocalAxes};

@@ -1,0 +1,126 @@
+//! What the camera sees of the world in one frame: from a fixed, level platform by the camera's own map, else by a sight.
+
+use nalgebra::{Matrix2, Matrix2x6, Vector2};
+
+use super::sight::Sight;
+use crate::optics::Camera;
+
+/// The camera, and where it is and looks where that is not level over (0, 0) at its own altitude.
+#[derive(Clone, Debug)]
+pub struct View {
+    pub camera: Camera,
+    pub sight: Option<Sight>,
+}
+
+/// A spot placed on the ground.
+#[derive(Clone, Copy, Debug)]
+pub struct Placed {
+    /// East, north, m.
+    pub position_m: Vector2<f64>,
+    /// Without the pose's error, m².
+    pub cov_m2: [[f64; 2]; 2],
+    /// ∂position/∂pose, as [`GroundPoint::by_pose`](super::GroundPoint); zero for a fixed platform.
+    pub by_pose: Matrix2x6<f64>,
+}
+
+impl View {
+    /// Places a spot that a level camera at its own altitude would see at `level_m`, m, with the covariance `level_cov`, m²;
+    /// `None` where its ray does not come down to the ground.
+    pub fn place(&self, sensor_m: [f64; 2], level_m: [f64; 2], level_cov: [[f64; 2]; 2]) -> Option<Placed> {
+        let Some(sight) = &self.sight else {
+            return Some(Placed {
+                position_m: level_m.into(),
+                cov_m2: level_cov,
+                by_pose: Matrix2x6::zeros(),
+            });
+        };
+        let point = sight.ground(&self.camera, sensor_m)?;
+        let [[a, b], [_, c]] = self.camera.cov_to_sensor(sensor_m, level_cov);
+        let cov = point.by_sensor * Matrix2::new(a, b, b, c) * point.by_sensor.transpose();
+        Some(Placed {
+            position_m: point.horizontal_m(),
+            cov_m2: [[cov[(0, 0)], cov[(0, 1)]], [cov[(0, 1)], cov[(1, 1)]]],
+            by_pose: point.by_pose,
+        })
+    }
+
+    /// That of a fixed, level platform.
+    pub fn level(camera: &Camera) -> Self {
+        Self {
+            camera: camera.clone(),
+            sight: None,
+        }
+    }
+
+    /// The sensor position, m, of a place on the ground, m; infinite behind the camera.
+    pub fn to_sensor(&self, [x, y]: [f64; 2]) -> [f64; 2] {
+        match &self.sight {
+            None => self.camera.to_sensor([x, y]),
+            Some(sight) => sight.sensor(&self.camera, [x, y, 0.0]).unwrap_or([f64::INFINITY; 2]),
+        }
+    }
+
+    /// Where on the ground a beam from a place appears to come from, m; the place itself where it is on the ground or no ray from
+    /// it comes down.
+    pub fn apparent(&self, x_m: f64, y_m: f64, z_m: Option<f64>) -> Vector2<f64> {
+        let place = Vector2::new(x_m, y_m);
+        let Some(z_m) = z_m.filter(|z| *z != 0.0) else {
+            return place;
+        };
+        let height_m = self.height_m();
+        if !(z_m < height_m) {
+            return place;
+        }
+        let nadir = self.nadir_m();
+        nadir + (place - nadir) * (height_m / (height_m - z_m))
+    }
+
+    /// The lens above the ground, m.
+    pub fn height_m(&self) -> f64 {
+        self.sight.as_ref().map_or(self.camera.altitude_m, |s| s.lens_m().z)
+    }
+
+    /// The place below the lens, m.
+    pub fn nadir_m(&self) -> Vector2<f64> {
+        self.sight.as_ref().map_or(Vector2::zeros(), |s| s.lens_m().xy())
+    }
+
+    /// Ground metres per sensor metre straight below.
+    pub fn ground_scale(&self) -> f64 {
+        match &self.sight {
+            None => self.camera.ground_scale(),
+            Some(sight) => sight.lens_m().z / (self.camera.plane_distance_m * self.camera.distortion.focal_scale),
+        }
+    }
+
+    /// The ground in the middle of the view and at its four edges, m; those that there are.
+    pub fn middle_and_edges_m(&self) -> Vec<Vector2<f64>> {
+        let camera = &self.camera;
+        let corners = [[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]];
+        match &self.sight {
+            None => {
+                let [w, h] = [&camera.x, &camera.y].map(|axis| axis.half_width() * camera.ground_scale());
+                corners.map(|[x, y]| Vector2::new(x * w, y * h)).to_vec()
+            }
+            Some(sight) => {
+                let sensor = corners.map(|[x, y]| [x * camera.x.half_width(), y * camera.y.half_width()]);
+                let points = sensor.into_iter().filter_map(|s| sight.ground(camera, s));
+                points.map(|p| p.horizontal_m()).collect()
+            }
+        }
+    }
+
+    /// ∂place/∂pose of a place on the ground, as [`GroundPoint::by_pose`](super::GroundPoint) has it; zero for a fixed platform.
+    pub fn by_pose(&self, p: Vector2<f64>) -> Matrix2x6<f64> {
+        let point = self.sight.as_ref().and_then(|s| s.apparent([p.x, p.y, 0.0]));
+        point.map_or(Matrix2x6::zeros(), |point| point.by_pose)
+    }
+
+    /// Covariance that the pose's error makes of a place on the ground, m²; zero for a fixed platform.
+    pub fn pose_cov(&self, p: Vector2<f64>) -> Matrix2<f64> {
+        self.sight.as_ref().map_or(Matrix2::zeros(), |sight| {
+            let by_pose = self.by_pose(p);
+            by_pose * sight.cov() * by_pose.transpose()
+        })
+    }
+}

@@ -1,0 +1,269 @@
+//! The alerts of all access points as one list: one alert for one cause, whoever reports it, and the hub's own.
+
+use std::collections::{BTreeMap, HashMap, HashSet};
+
+use jiff::Timestamp;
+use serde_json::{Value, json};
+
+use crate::monitor::{
+    Acknowledgement, Alert, AlertEvent, AlertEventKind, AlertKind, AlertSource, AlertState, Severity, StationName,
+    Withdrawal,
+};
+
+/// Key of the evidence that lists the stations' own alerts.
+const REPORTED: &str = "reported_by";
+
+/// A station's own alert.
+type Member = (StationName, String);
+
+/// What only the hub can see.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum OwnCause {
+    StationLost(StationName),
+    UserInTwoPlaces(String),
+}
+
+/// Place and evidence of one of the hub's own alerts.
+#[derive(Clone, Debug, Default)]
+pub struct Finding {
+    pub place_m: Option<[f64; 2]>,
+    pub evidence: Value,
+}
+
+#[derive(Debug, Default)]
+pub struct HubAlerts {
+    /// By the hub's ids.
+    open: BTreeMap<String, Open>,
+    own: BTreeMap<OwnCause, String>,
+    of_member: HashMap<Member, String>,
+    /// Alerts that another station's sight explains: they are not passed on.
+    withheld: HashSet<Member>,
+}
+
+#[derive(Debug)]
+struct Open {
+    alert: Alert,
+    members: Vec<Member>,
+}
+
+impl HubAlerts {
+    /// Goes on with the alerts that an earlier run left open.
+    pub fn restore(&mut self, alerts: Vec<Alert>) {
+        for alert in alerts {
+            let members: Vec<Member> = serde_json::from_value(alert.evidence[REPORTED].clone()).unwrap_or_default();
+            for member in &members {
+                self.of_member.insert(member.clone(), alert.id.clone());
+            }
+            let cause = match (alert.kind, &alert.station, &alert.user) {
+                (AlertKind::StationLost, Some(name), _) => Some(OwnCause::StationLost(name.clone())),
+                (AlertKind::UserInTwoPlaces, _, Some(user)) => Some(OwnCause::UserInTwoPlaces(user.clone())),
+                _ => None,
+            };
+            if let Some(cause) = cause {
+                self.own.insert(cause, alert.id.clone());
+            }
+            self.open.insert(alert.id.clone(), Open { alert, members });
+        }
+    }
+
+    /// Number of alerts that are not cleared, by kind.
+    pub fn open_by_kind(&self) -> BTreeMap<AlertKind, u64> {
+        let mut counts = BTreeMap::new();
+        for open in self.open.values() {
+            *counts.entry(open.alert.kind).or_default() += 1;
+        }
+        counts
+    }
+
+    /// Takes one event of a station's alert; gives what it means for the list, if anything. `is_seen_elsewhere` says whether another
+    /// station sees a user now.
+    pub fn take(
+        &mut self,
+        name: &StationName,
+        event: AlertEvent,
+        is_seen_elsewhere: impl Fn(&str) -> bool,
+    ) -> Option<AlertEvent> {
+        let member = (name.clone(), event.alert.id.clone());
+        if event.event == AlertEventKind::Cleared {
+            return self.clear_member(&member, event.alert);
+        }
+        if self.withheld.contains(&member) {
+            return None;
+        }
+        match self.of_member.get(&member).cloned() {
+            Some(id) => self.update(&id, &member, event),
+            None => self.add(member, event.alert, is_seen_elsewhere),
+        }
+    }
+
+    fn add(&mut self, member: Member, alert: Alert, is_seen_elsewhere: impl Fn(&str) -> bool) -> Option<AlertEvent> {
+        let is_unseen = alert.kind == AlertKind::UserUnseen;
+        if is_unseen && alert.user.as_deref().is_some_and(is_seen_elsewhere) {
+            self.withheld.insert(member);
+            return None;
+        }
+        if let Some(open) = self.open.values_mut().find(|open| is_shared(open, &member.0, &alert)) {
+            self.of_member.insert(member.clone(), open.alert.id.clone());
+            open.members.push(member);
+            open.alert.evidence[REPORTED] = json!(open.members);
+            if alert.severity <= open.alert.severity {
+                return None;
+            }
+            open.alert.severity = alert.severity;
+            return Some(event(AlertEventKind::Updated, &open.alert));
+        }
+        let members = vec![member.clone()];
+        let alert = adopted(&member, alert, &members);
+        let raised = event(AlertEventKind::Raised, &alert);
+        self.of_member.insert(member, alert.id.clone());
+        self.open.insert(alert.id.clone(), Open { alert, members });
+        Some(raised)
+    }
+
+    fn update(&mut self, id: &str, member: &Member, update: AlertEvent) -> Option<AlertEvent> {
+        let open = self.open.get_mut(id)?;
+        if open.members.first() != Some(member) {
+            return None;
+        }
+        let mut alert = adopted(member, update.alert, &open.members);
+        if update.event == AlertEventKind::Updated {
+            // What was acknowledged here stays so.
+            alert.acknowledgement = alert.acknowledgement.or(open.alert.acknowledgement.take());
+            if open.alert.state == AlertState::Acknowledged {
+                alert.state = AlertState::Acknowledged;
+            }
+        }
+        open.alert = alert;
+        Some(event(update.event, &open.alert))
+    }
+
+    fn clear_member(&mut self, member: &Member, alert: Alert) -> Option<AlertEvent> {
+        if self.withheld.remove(member) {
+            return None;
+        }
+        let Some(id) = self.of_member.remove(member) else {
+            // Raised before this hub began to listen: its end is history all the same.
+            return Some(event(
+                AlertEventKind::Cleared,
+                &adopted(member, alert, std::slice::from_ref(member)),
+            ));
+        };
+        let open = self.open.get_mut(&id)?;
+        open.members.retain(|other| other != member);
+        if !open.members.is_empty() {
+            return None;
+        }
+        let mut open = self.open.remove(&id)?;
+        open.alert.state = AlertState::Cleared;
+        open.alert.cleared_at = alert.cleared_at;
+        Some(event(AlertEventKind::Cleared, &open.alert))
+    }
+
+    /// Raises one of the hub's own alerts, once.
+    pub fn raise(&mut self, cause: OwnCause, finding: Finding, now: Timestamp) -> Option<AlertEvent> {
+        if self.own.contains_key(&cause) {
+            return None;
+        }
+        let (kind, user, station) = match &cause {
+            OwnCause::StationLost(name) => (AlertKind::StationLost, None, Some(name.clone())),
+            OwnCause::UserInTwoPlaces(user) => (AlertKind::UserInTwoPlaces, Some(user.clone()), None),
+        };
+        let word = serde_json::to_value(kind).ok();
+        let word = word.as_ref().and_then(Value::as_str).unwrap_or("alert").to_owned();
+        let about = station.as_ref().map(|name| format!(".{name}")).unwrap_or_default();
+        let stem = format!("hub{about}.{word}-{}", now.strftime("%Y%m%dT%H%M%S%6fZ"));
+        let free = |n: &u32| !self.open.contains_key(&format!("{stem}-{n}"));
+        let number = (0..).find(free).expect("some number is free");
+        let alert = Alert {
+            id: format!("{stem}-{number}"),
+            kind,
+            severity: Severity::Critical,
+            state: AlertState::Open,
+            raised_at: now,
+            cleared_at: None,
+            user,
+            x_m: finding.place_m.map(|p| p[0]),
+            y_m: finding.place_m.map(|p| p[1]),
+            cov_m2: None,
+            claimed: None,
+            evidence: finding.evidence,
+            source: AlertSource {
+                kind: "fleet".to_owned(),
+                frame: 0,
+                file: None,
+            },
+            zone: None,
+            webhooks: None,
+            maintenance: None,
+            acknowledgement: None,
+            station,
+        };
+        let raised = event(AlertEventKind::Raised, &alert);
+        self.own.insert(cause, alert.id.clone());
+        let members = Vec::new();
+        self.open.insert(alert.id.clone(), Open { alert, members });
+        Some(raised)
+    }
+
+    /// Clears one of the hub's own alerts, where it is open.
+    pub fn clear(&mut self, cause: &OwnCause, now: Timestamp) -> Option<AlertEvent> {
+        let mut open = self.open.remove(&self.own.remove(cause)?)?;
+        open.alert.state = AlertState::Cleared;
+        open.alert.cleared_at = Some(now);
+        Some(event(AlertEventKind::Cleared, &open.alert))
+    }
+
+    /// Open conflicts of users and lost stations.
+    pub fn own_causes(&self) -> Vec<OwnCause> {
+        self.own.keys().cloned().collect()
+    }
+
+    /// `None` for an alert that is not open; the event where it changes anything.
+    pub fn acknowledge(&mut self, id: &str, note: Acknowledgement) -> Option<(Alert, Option<AlertEvent>)> {
+        let open = self.open.get_mut(id)?;
+        let changed = open.alert.acknowledge(note);
+        let told = changed.then(|| event(AlertEventKind::Acknowledged, &open.alert));
+        Some((open.alert.clone(), told))
+    }
+
+    pub fn withdraw(&mut self, id: &str, withdrawal: Withdrawal) -> Option<(Alert, Option<AlertEvent>)> {
+        let open = self.open.get_mut(id)?;
+        let changed = open.alert.withdraw(withdrawal);
+        let told = changed.then(|| event(AlertEventKind::Unacknowledged, &open.alert));
+        Some((open.alert.clone(), told))
+    }
+}
+
+/// Whether an alert of one station is open already for another station's.
+fn is_shared(open: &Open, name: &StationName, alert: &Alert) -> bool {
+    let is_of_place = matches!(
+        alert.kind,
+        AlertKind::UnclaimedEmitter | AlertKind::UserUnseen | AlertKind::PositionMismatch
+    );
+    let is_of_another = !open.members.is_empty() && open.members.iter().all(|(other, _)| other != name);
+    is_of_place && is_of_another && open.alert.has_cause_of(alert)
+}
+
+/// A station's alert under the hub's id.
+fn adopted(member: &Member, mut alert: Alert, members: &[Member]) -> Alert {
+    let (name, id) = member;
+    alert.id = format!("{name}.{id}");
+    alert.station = Some(name.clone());
+    // The station's zones name webhooks of its own; its maintenance is the hub's too.
+    alert.webhooks = alert.maintenance.is_some().then(Vec::new);
+    if let Value::Object(evidence) = &mut alert.evidence {
+        evidence.insert(REPORTED.to_owned(), json!(members));
+    }
+    alert
+}
+
+fn event(event: AlertEventKind, alert: &Alert) -> AlertEvent {
+    AlertEvent {
+        event,
+        alert: alert.clone(),
+    }
+}
+
+#[cfg(test)]
+#[path = "alerts_test.rs"]
+mod tests;

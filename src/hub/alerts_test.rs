@@ -1,0 +1,139 @@
+//! Each rule of the hub's list on alerts made by hand.
+
+use jiff::Timestamp;
+use serde_json::json;
+
+use super::*;
+
+fn name(station: &str) -> StationName {
+    StationName {
+        site: "harbour".to_owned(),
+        station: station.to_owned(),
+    }
+}
+
+fn told(kind: AlertEventKind, id: &str, alert: AlertKind, user: Option<&str>, x_m: f64) -> AlertEvent {
+    let alert = json!({
+        "id": id, "kind": alert, "severity": "warning", "state": "open", "raised_at": Timestamp::UNIX_EPOCH,
+        "cleared_at": null, "user": user, "x_m": x_m, "y_m": 0.0, "cov_m2": null, "claimed": null, "evidence": {},
+        "source": { "kind": "simulator", "frame": 0 },
+    });
+    AlertEvent {
+        event: kind,
+        alert: serde_json::from_value(alert).unwrap(),
+    }
+}
+
+fn stranger(kind: AlertEventKind, id: &str, x_m: f64) -> AlertEvent {
+    told(kind, id, AlertKind::UnclaimedEmitter, None, x_m)
+}
+
+const NOBODY: fn(&str) -> bool = |_| false;
+
+#[test]
+fn one_cause_at_two_stations_is_one_alert_until_both_clear_it() {
+    let mut alerts = HubAlerts::default();
+    let raised = alerts
+        .take(&name("a"), stranger(AlertEventKind::Raised, "1", 0.0), NOBODY)
+        .unwrap();
+    assert_eq!(raised.alert.id, "harbour.a.1");
+    assert_eq!(raised.alert.station, Some(name("a")));
+    let second = alerts.take(&name("b"), stranger(AlertEventKind::Raised, "1", 5.0), NOBODY);
+    assert!(second.is_none(), "within ten metres it is the same stranger");
+    let third = alerts.take(&name("b"), stranger(AlertEventKind::Raised, "2", 50.0), NOBODY);
+    assert_eq!(third.unwrap().alert.id, "harbour.b.2");
+    assert!(
+        alerts
+            .take(&name("a"), stranger(AlertEventKind::Cleared, "1", 0.0), NOBODY)
+            .is_none()
+    );
+    let cleared = alerts
+        .take(&name("b"), stranger(AlertEventKind::Cleared, "1", 5.0), NOBODY)
+        .unwrap();
+    assert_eq!(
+        (cleared.event, cleared.alert.id.as_str()),
+        (AlertEventKind::Cleared, "harbour.a.1")
+    );
+    assert_eq!(alerts.open_by_kind()[&AlertKind::UnclaimedEmitter], 1);
+}
+
+#[test]
+fn a_user_whom_another_station_sees_is_not_unseen() {
+    let mut alerts = HubAlerts::default();
+    let unseen = |kind| told(kind, "1", AlertKind::UserUnseen, Some("u-1"), 0.0);
+    let elsewhere = |user: &str| user == "u-1";
+    assert!(
+        alerts
+            .take(&name("a"), unseen(AlertEventKind::Raised), elsewhere)
+            .is_none()
+    );
+    assert!(
+        alerts
+            .take(&name("a"), unseen(AlertEventKind::Updated), NOBODY)
+            .is_none()
+    );
+    assert!(
+        alerts
+            .take(&name("a"), unseen(AlertEventKind::Cleared), NOBODY)
+            .is_none()
+    );
+    assert!(
+        alerts
+            .take(&name("a"), unseen(AlertEventKind::Raised), NOBODY)
+            .is_some()
+    );
+}
+
+#[test]
+fn what_was_acknowledged_at_the_hub_stays_so_when_the_station_updates_it() {
+    let mut alerts = HubAlerts::default();
+    alerts.take(&name("a"), stranger(AlertEventKind::Raised, "1", 0.0), NOBODY);
+    let note = Acknowledgement {
+        at: Timestamp::UNIX_EPOCH,
+        by: Some("guard".to_owned()),
+        note: None,
+        withdrawn: None,
+    };
+    assert!(alerts.acknowledge("harbour.a.1", note).unwrap().1.is_some());
+    let updated = alerts
+        .take(&name("a"), stranger(AlertEventKind::Updated, "1", 0.0), NOBODY)
+        .unwrap();
+    assert_eq!(updated.alert.state, AlertState::Acknowledged);
+    assert_eq!(updated.alert.acknowledgement.unwrap().by.as_deref(), Some("guard"));
+}
+
+#[test]
+fn after_a_restart_the_list_goes_on() {
+    let mut alerts = HubAlerts::default();
+    let raised = alerts
+        .take(&name("a"), stranger(AlertEventKind::Raised, "1", 0.0), NOBODY)
+        .unwrap();
+    let lost = alerts
+        .raise(
+            OwnCause::StationLost(name("b")),
+            Finding::default(),
+            Timestamp::UNIX_EPOCH,
+        )
+        .unwrap();
+    let mut again = HubAlerts::default();
+    again.restore(vec![raised.alert, lost.alert]);
+    assert!(
+        again
+            .raise(
+                OwnCause::StationLost(name("b")),
+                Finding::default(),
+                Timestamp::UNIX_EPOCH
+            )
+            .is_none()
+    );
+    assert!(
+        again
+            .clear(&OwnCause::StationLost(name("b")), Timestamp::UNIX_EPOCH)
+            .is_some()
+    );
+    let cleared = again
+        .take(&name("a"), stranger(AlertEventKind::Cleared, "1", 0.0), NOBODY)
+        .unwrap();
+    assert_eq!(cleared.alert.id, "harbour.a.1");
+    assert!(again.open_by_kind().is_empty());
+}

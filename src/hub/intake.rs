@@ -1,0 +1,94 @@
+//! Messages of the fleet, checked: who may have sent them, and whether they can be read.
+
+use async_nats::Message;
+use metrics::counter;
+use serde::de::DeserializeOwned;
+
+use crate::fleet::message::VERSION;
+use crate::fleet::{Subject, Topic};
+use crate::metric;
+use crate::monitor::StationName;
+
+/// Largest message, bytes: what a server takes by default.
+const LARGEST: usize = 1 << 20;
+
+/// What every message holds.
+#[derive(serde::Deserialize)]
+struct Head {
+    version: u32,
+    #[serde(flatten)]
+    name: StationName,
+}
+
+/// Reads a message of this topic. One that cannot be used is counted by reason: it is another version, malformed, too large, or in
+/// the name of another station than its subject's, which is the one that the server lets its sender use.
+pub fn read<T: DeserializeOwned>(message: &Message, topic: Topic) -> Option<T> {
+    let outcome = parse(message, topic);
+    let word = match &outcome {
+        Ok(_) => "taken",
+        Err(reason) => reason,
+    };
+    count(topic, word);
+    outcome
+        .inspect_err(|reason| tracing::warn!(subject = %message.subject, reason, "a fleet message is refused"))
+        .ok()
+}
+
+pub fn count(topic: Topic, outcome: &'static str) {
+    counter!(metric::FLEET_MESSAGES, "topic" => topic.name(), "outcome" => outcome).increment(1);
+}
+
+fn parse<T: DeserializeOwned>(message: &Message, topic: Topic) -> Result<T, &'static str> {
+    let subject = Subject::parse(&message.subject).filter(|subject| subject.topic == topic);
+    let subject = subject.ok_or("wrong_subject")?;
+    if message.payload.len() > LARGEST {
+        return Err("too_large");
+    }
+    let head: Head = serde_json::from_slice(&message.payload).map_err(|_| "malformed")?;
+    if head.version != VERSION {
+        return Err("other_version");
+    }
+    if head.name != subject.name {
+        return Err("other_station");
+    }
+    serde_json::from_slice(&message.payload).map_err(|_| "malformed")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::fleet::message::HealthMessage;
+
+    fn message(subject: &str, payload: &str) -> Message {
+        Message {
+            subject: subject.into(),
+            reply: None,
+            payload: payload.to_owned().into(),
+            headers: None,
+            status: None,
+            description: None,
+            length: payload.len(),
+        }
+    }
+
+    #[test]
+    fn a_message_in_another_name_or_version_is_refused() {
+        let body = |version: u32, station: &str| {
+            format!(
+                r#"{{"version":{version},"site":"a","station":"{station}","time":"2026-11-21T08:00:00Z","status":null,"alerts_waiting":0}}"#
+            )
+        };
+        let parsed = |subject: &str, body: &str| {
+            parse::<HealthMessage>(&message(subject, body), Topic::Health).map(|m| m.name.station)
+        };
+        assert_eq!(parsed("oapwatch.a.b.health", &body(1, "b")), Ok("b".to_owned()));
+        assert_eq!(parsed("oapwatch.a.b.health", &body(2, "b")), Err("other_version"));
+        assert_eq!(parsed("oapwatch.a.b.health", &body(1, "c")), Err("other_station"));
+        assert_eq!(parsed("oapwatch.a.b.pose", &body(1, "b")), Err("wrong_subject"));
+        assert_eq!(parsed("oapwatch.a.b.health", "{"), Err("malformed"));
+        assert_eq!(
+            parsed("oapwatch.a.b.health", &" ".repeat(LARGEST + 1)),
+            Err("too_large")
+        );
+    }
+}

@@ -1,0 +1,134 @@
+//! `oapwatch fleet`: the alerts and positions of many access points as one, with what only all of them together show.
+
+mod alerts;
+mod conflicts;
+mod intake;
+mod run;
+mod stations;
+
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+
+use anyhow::{Context, Result};
+use jiff::Timestamp;
+use metrics_exporter_prometheus::PrometheusHandle;
+use tokio::signal::unix::{SignalKind, signal};
+use tokio::sync::{mpsc, watch};
+
+use crate::config::Config;
+use crate::journal::Journal;
+use crate::{api, export, fleet, logging, metric, notify};
+use run::Run;
+
+/// Requests that wait for the hub; further ones are answered 503.
+const COMMANDS: usize = 64;
+
+/// A hub whose config has been checked and whose files have been opened; no port is bound yet.
+pub struct Hub {
+    config: Config,
+    server: api::Server,
+    endpoints: Vec<notify::Endpoint>,
+    exports: Vec<export::Export>,
+    journal: Journal,
+    metrics: PrometheusHandle,
+}
+
+impl Hub {
+    /// Checks and opens everything a config names.
+    pub fn new(config: Config) -> Result<Self> {
+        config.fleet.validate_hub()?;
+        config.journal.validate()?;
+        let recorder = metric::recorder()?;
+        let metrics = recorder.handle();
+        // A second daemon in one process (a test) counts into the first one's recorder.
+        let _ = metrics::set_global_recorder(recorder);
+        metric::describe();
+        let server = api::Server::new(config.api.clone())?;
+        let endpoints = notify::load(&config.webhook)?;
+        let exports = export::load(&config.export, &endpoints, &config.world)?;
+        let receivers = endpoints.iter().chain(exports.iter().map(|export| &export.endpoint));
+        let subscriptions = receivers.map(notify::Endpoint::subscription).collect();
+        let journal = Journal::open(&config.journal, subscriptions)?;
+        Ok(Self {
+            config,
+            server,
+            endpoints,
+            exports,
+            journal,
+            metrics,
+        })
+    }
+
+    /// Runs until SIGTERM or SIGINT.
+    pub async fn run(self, _logging: logging::Handle) -> Result<()> {
+        let listen = &self.config.api.listen;
+        let listener = api::Listener::bind(listen).with_context(|| format!("api.listen: cannot listen on {listen}"))?;
+        let client = fleet::connect(&self.config.fleet, "hub".to_owned()).await?;
+        let started_at = Timestamp::now();
+        let (stop, stopped) = watch::channel(false);
+        let stops = || {
+            let mut stopped = stopped.clone();
+            async move {
+                // An error would mean that the sender is gone, which is a stop too.
+                let _ = stopped.wait_for(|s| *s).await;
+            }
+        };
+        let micros = u64::try_from(started_at.as_microsecond()).unwrap_or(0);
+        let feed = Arc::new(api::Feed::new(self.journal.last_seq(), micros));
+        let clock = notify::Clock::wall();
+        let (commands, orders) = mpsc::channel(COMMANDS);
+        let mut exports = export::Running::new(export::Context {
+            journal: self.journal.clone(),
+            feed: feed.clone(),
+            commands: commands.clone(),
+            clock,
+        });
+        let mut endpoints = self.endpoints;
+        endpoints.extend(exports.replace(self.exports));
+        let (notifier, deliveries) = notify::spawn(endpoints, self.journal.clone(), clock, micros, stops());
+        let ready = Arc::new(AtomicBool::new(false));
+        let state = api::State::new(
+            feed.clone(),
+            commands,
+            self.journal.clone(),
+            self.metrics.clone(),
+            ready.clone(),
+        );
+        let state = state.with_webhooks(notifier.clone());
+        tracing::info!(
+            site = self.config.fleet.site.as_deref().unwrap_or("all"),
+            url = self.config.fleet.url.as_deref().unwrap_or_default(),
+            "hub of a fleet; API and page on {}",
+            listener.url(self.server.scheme())?,
+        );
+        let run = Run::new(&self.config, self.journal.clone(), feed, notifier, ready, started_at)?;
+        let mut working = tokio::spawn(run.run(client, orders, stops()));
+        let mut serving = tokio::spawn(self.server.serve(listener, state, stops()));
+        let mut terminate = signal(SignalKind::terminate())?;
+        let mut interrupt = signal(SignalKind::interrupt())?;
+        let outcome = tokio::select! {
+            _ = terminate.recv() => Ok(()),
+            _ = interrupt.recv() => Ok(()),
+            ended = &mut working => Err(anyhow::anyhow!("the hub ended by itself: {ended:?}")),
+            served = &mut serving => match served? {
+                Ok(()) => Err(anyhow::anyhow!("the API ended by itself")),
+                Err(error) => Err(error.into()),
+            },
+        };
+        stop.send_replace(true);
+        if !working.is_finished() {
+            working.await?;
+        }
+        if !serving.is_finished() {
+            serving.await??;
+        }
+        if tokio::time::timeout(LAST_DELIVERIES, deliveries).await.is_err() {
+            tracing::info!("webhook deliveries are left for the next start");
+        }
+        tracing::info!("stopped");
+        outcome
+    }
+}
+
+/// Time that deliveries under way have when the hub stops.
+const LAST_DELIVERIES: std::time::Duration = std::time::Duration::from_millis(800);

@@ -1,0 +1,12 @@
+//! Known lights: emitters that nobody claims and that an operator has approved. They are tracked like users, and tested for change.
+
+mod light;
+mod range;
+mod registry;
+
+pub use light::{Config, KnownLight, LightError, LightSource, MAX_LIGHTS, Request, from_config};
+pub use range::Learned;
+pub use registry::{KnownLightStatus, LightRecord};
+
+pub(super) use range::Change;
+pub(super) use registry::{KnownLights, LightState};

@@ -1,0 +1,252 @@
+//! What the light of a beam says of its source: whether it scintillates as a beam through the air does, flickers as a lamp on the mains
+//! does, or fades with another beam as a reflection of that does. Evidence in alerts; it decides nothing.
+
+use std::collections::{BTreeMap, VecDeque};
+
+use nalgebra::Vector2;
+use serde_json::{Value, json};
+
+use crate::estimate::Flags;
+use crate::monitor::track::beam_track::Track;
+use crate::monitor::track::tracker::Tracker;
+
+/// Frames that are kept of each track, and frames from which anything is said.
+const FRAMES: usize = 128;
+const MIN_FRAMES: usize = 30;
+/// Standard deviations of ln energy that lamps and beams have, each as likely as the other: a lamp is steady to a few per cent; a beam of
+/// ten coherence times a frame has 0.3, at weak turbulence and slow frames less. Assumed.
+const LAMP_STD: [f64; 4] = [0.01, 0.02, 0.04, 0.08];
+const BEAM_STD: [f64; 4] = [0.12, 0.2, 0.3, 0.45];
+/// Share of the frames that count as independent.
+const INDEPENDENT: f64 = 0.5;
+/// Largest likelihood ratio that is stated: the models are no better.
+const LARGEST_RATIO: f64 = 1e6;
+/// Twice the mains' frequencies, Hz.
+const FLICKER_HZ: [f64; 2] = [100.0, 120.0];
+/// −ln p from which a line in the spectrum or a correlation is named: one in 10⁵ for each of the pairs that are looked at.
+const NAMED: f64 = 15.0;
+/// Scatter of a reflection's offset from its beam, m, at most. Larger names neighbours, smaller misses ghosts of beams that move.
+const OFFSET_STD_M: f64 = 0.5;
+
+/// A track's light in one frame.
+#[derive(Clone, Copy, Debug)]
+struct Shown {
+    frame: u64,
+    ln_energy: f64,
+    /// Of ln energy, by the detector's noise.
+    noise: f64,
+    position: Vector2<f64>,
+}
+
+/// The newest frames of every track.
+#[derive(Debug, Default)]
+pub struct LightHistory {
+    frame: u64,
+    tracks: BTreeMap<u64, VecDeque<Shown>>,
+}
+
+/// A beam that another is a reflection of.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Ghost {
+    /// The track of the beam.
+    pub of: u64,
+    pub offset_m: f64,
+    pub correlation: f64,
+    pub neg_log_p: f64,
+}
+
+impl LightHistory {
+    /// Takes a frame.
+    pub fn update(&mut self, tracker: &Tracker) {
+        self.frame += 1;
+        self.tracks.retain(|id, _| tracker.get(*id).is_some());
+        let incomplete = Flags::SATURATED | Flags::MASKED | Flags::NEAR_EDGE | Flags::OUT_OF_TIME;
+        for track in tracker.tracks.iter().filter(|t| t.hit) {
+            let detection = &track.detection;
+            if !(detection.energy_j > 0.0) || detection.flags.intersects(incomplete) {
+                continue;
+            }
+            let shown = Shown {
+                frame: self.frame,
+                ln_energy: detection.energy_j.ln(),
+                noise: 1.0 / detection.snr.max(1.0),
+                position: detection.position,
+            };
+            let known = self.tracks.entry(track.id).or_default();
+            known.push_back(shown);
+            if known.len() > FRAMES {
+                known.pop_front();
+            }
+        }
+    }
+
+    /// Scintillation and flicker, with the likelihood of a beam's light over a lamp's.
+    pub fn lamp_or_beam(&self, track: &Track, rate_hz: f64) -> Option<Value> {
+        let shown = self.tracks.get(&track.id).filter(|s| s.len() >= MIN_FRAMES)?;
+        let n = shown.len() as f64;
+        let mean = shown.iter().map(|s| s.ln_energy).sum::<f64>() / n;
+        let variance = shown.iter().map(|s| (s.ln_energy - mean).powi(2)).sum::<f64>() / (n - 1.0);
+        let noise = shown.iter().map(|s| s.noise * s.noise).sum::<f64>() / n;
+        let flicker: Vec<Value> = FLICKER_HZ
+            .into_iter()
+            .filter_map(|hz| {
+                let neg_log_p = line(shown, mean, variance, hz, rate_hz)?;
+                (neg_log_p > NAMED).then(|| json!({ "mains_hz": 0.5 * hz, "surprise": neg_log_p }))
+            })
+            .collect();
+        Some(json!({
+            "frames": shown.len(),
+            "scintillation_index": (variance - noise).max(0.0),
+            "likelihood_ratio": beam_over_lamp(variance, noise, INDEPENDENT * n),
+            "mains_flicker": flicker,
+        }))
+    }
+
+    /// The beam that the track fades with at a fixed offset.
+    pub fn ghost_of(&self, track: &Track, tracker: &Tracker) -> Option<Ghost> {
+        let own = self.tracks.get(&track.id).filter(|s| s.len() >= MIN_FRAMES)?;
+        let brighter = tracker.tracks.iter().filter(|t| t.id != track.id);
+        let brighter = brighter.filter(|t| t.detection.energy_j > track.detection.energy_j);
+        let ghosts = brighter.filter_map(|t| reflection(own, self.tracks.get(&t.id)?, t.id));
+        ghosts.max_by(|a, b| a.neg_log_p.total_cmp(&b.neg_log_p))
+    }
+}
+
+/// Likelihood of a sample variance of `n` normal deviates under a beam's over a lamp's standard deviations.
+fn beam_over_lamp(variance: f64, noise: f64, n: f64) -> f64 {
+    let ln_likelihood = |std: &f64| {
+        let expected = std * std + noise;
+        -0.5 * (n - 1.0) * (expected.ln() + variance / expected)
+    };
+    let mean = |stds: &[f64], most: f64| stds.iter().map(|s| (ln_likelihood(s) - most).exp()).sum::<f64>();
+    let most = LAMP_STD
+        .iter()
+        .chain(&BEAM_STD)
+        .map(ln_likelihood)
+        .fold(f64::NEG_INFINITY, f64::max);
+    let (beam, lamp) = (mean(&BEAM_STD, most), mean(&LAMP_STD, most));
+    (beam / lamp.max(1e-300)).clamp(1.0 / LARGEST_RATIO, LARGEST_RATIO)
+}
+
+/// −ln p of the line that light at `hz` makes in frames of `rate_hz`; none where it cannot be told from slow changes. White noise's
+/// periodogram over its mean is exponential (Schuster, 1898).
+fn line(shown: &VecDeque<Shown>, mean: f64, variance: f64, hz: f64, rate_hz: f64) -> Option<f64> {
+    let alias_hz = (hz - rate_hz * (hz / rate_hz).round()).abs();
+    let duration_s = shown.len() as f64 / rate_hz;
+    // The mains' frequency wanders by 0.2 % at most, and so does its alias by as many Hz.
+    if alias_hz * duration_s < 4.0 || variance <= 0.0 {
+        return None;
+    }
+    let (mut re, mut im) = (0.0, 0.0);
+    for s in shown {
+        let (sin, cos) = (std::f64::consts::TAU * alias_hz * s.frame as f64 / rate_hz).sin_cos();
+        re += (s.ln_energy - mean) * cos;
+        im += (s.ln_energy - mean) * sin;
+    }
+    Some((re * re + im * im) / (shown.len() as f64 * variance))
+}
+
+/// Whether `own` is a reflection of `other`. Fisher (1921): artanh r of n pairs has variance 1/(n − 3).
+fn reflection(own: &VecDeque<Shown>, other: &VecDeque<Shown>, of: u64) -> Option<Ghost> {
+    let mut theirs = other.iter().peekable();
+    let mut pairs: Vec<(Shown, Shown)> = Vec::with_capacity(own.len());
+    for s in own {
+        while theirs.next_if(|o| o.frame < s.frame).is_some() {}
+        if let Some(o) = theirs.next_if(|o| o.frame == s.frame) {
+            pairs.push((*s, *o));
+        }
+    }
+    let n = pairs.len() as f64;
+    if pairs.len() < MIN_FRAMES {
+        return None;
+    }
+    let mean = |f: &dyn Fn(&(Shown, Shown)) -> f64| pairs.iter().map(f).sum::<f64>() / n;
+    let (a, b) = (mean(&|p| p.0.ln_energy), mean(&|p| p.1.ln_energy));
+    let product = mean(&|p| (p.0.ln_energy - a) * (p.1.ln_energy - b));
+    let (aa, bb) = (
+        mean(&|p| (p.0.ln_energy - a).powi(2)),
+        mean(&|p| (p.1.ln_energy - b).powi(2)),
+    );
+    let correlation = product / (aa * bb).sqrt().max(1e-12);
+    let offset = |p: &(Shown, Shown)| p.0.position - p.1.position;
+    let usual = pairs.iter().map(offset).sum::<Vector2<f64>>() / n;
+    let scatter = mean(&|p| (offset(p) - usual).norm_squared()).sqrt();
+    let z = correlation.clamp(-0.999_999, 0.999_999).atanh() * (INDEPENDENT * n - 3.0).max(0.0).sqrt();
+    let neg_log_p = if z > 0.0 { 0.5 * z * z } else { 0.0 };
+    (neg_log_p > NAMED && scatter < OFFSET_STD_M).then_some(Ghost {
+        of,
+        offset_m: usual.norm(),
+        correlation,
+        neg_log_p,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use jiff::Timestamp;
+    use rand::SeedableRng;
+    use rand_chacha::ChaCha8Rng;
+    use rand_distr::{Distribution, StandardNormal};
+
+    use super::*;
+    use crate::monitor::track::detection::fixture::detection;
+
+    /// 128 frames of lights at these x, whose ln energies `light` gives.
+    fn watched(places: &[f64], rate_hz: f64, light: impl Fn(f64, &[f64]) -> Vec<f64>) -> (LightHistory, Tracker) {
+        let mut rng = ChaCha8Rng::seed_from_u64(3);
+        let (mut history, mut tracker) = (LightHistory::default(), Tracker::new(50.0));
+        for k in 0..128i64 {
+            let t = k as f64 / rate_hz;
+            let noise: Vec<f64> = (0..3).map(|_| StandardNormal.sample(&mut rng)).collect();
+            let ln_energies = light(t, &noise);
+            let beams = places.iter().zip(ln_energies).map(|(x, ln)| {
+                let mut beam = detection(*x, 0.0);
+                beam.energy_j = ln.exp();
+                beam
+            });
+            let beams: Vec<_> = beams.collect();
+            tracker.step(
+                Timestamp::from_microsecond((t * 1e6) as i64).unwrap(),
+                &beams,
+                1.0 / rate_hz,
+            );
+            history.update(&tracker);
+        }
+        (history, tracker)
+    }
+
+    #[test]
+    fn a_lamp_is_steady_and_a_beam_scintillates() {
+        let (history, tracker) = watched(&[0.0, 50.0], 10.0, |_, z| vec![0.02 * z[0], 0.3 * z[1]]);
+        let ratio = |k: usize| {
+            let said = history.lamp_or_beam(&tracker.tracks[k], 10.0).unwrap();
+            assert_eq!(said["mains_flicker"], json!([]));
+            said["likelihood_ratio"].as_f64().unwrap()
+        };
+        assert!(ratio(0) < 1e-5 && ratio(1) > 1e5, "{} {}", ratio(0), ratio(1));
+    }
+
+    #[test]
+    fn flicker_shows_where_the_frame_rate_does_not_hide_it() {
+        let shows = |rate_hz: f64| {
+            let flicker = |t: f64, z: &[f64]| vec![0.05 * (std::f64::consts::TAU * 100.0 * t).sin() + 0.02 * z[0]];
+            let (history, tracker) = watched(&[0.0], rate_hz, flicker);
+            history.lamp_or_beam(&tracker.tracks[0], rate_hz).unwrap()["mains_flicker"].clone()
+        };
+        assert_eq!(shows(70.0)[0]["mains_hz"], 50.0);
+        assert_eq!(shows(330.0)[0]["mains_hz"], 50.0);
+        assert_eq!(shows(100.0), json!([]));
+    }
+
+    #[test]
+    fn a_ghost_fades_with_its_beam() {
+        let (history, tracker) = watched(&[0.0, 20.0, 60.0], 10.0, |_, z| {
+            vec![0.3 * z[0], 0.3 * z[0] + 0.05 * z[1] - 3.0, 0.3 * z[2] - 3.0]
+        });
+        let ghost = history.ghost_of(&tracker.tracks[1], &tracker).unwrap();
+        assert_eq!((ghost.of, ghost.offset_m.round()), (1, 20.0));
+        assert!(ghost.correlation > 0.95);
+        assert_eq!(history.ghost_of(&tracker.tracks[2], &tracker), None);
+        assert_eq!(history.ghost_of(&tracker.tracks[0], &tracker), None);
+    }
+}

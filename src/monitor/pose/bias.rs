@@ -1,0 +1,155 @@
+//! What the poses' source and the users' claims together say of the pose error that lasts: the source's own covariance is the
+//! prior, each claim that a beam answers is a measurement.
+
+use nalgebra::{Matrix2, Matrix2x6, Matrix6, Vector2, Vector6};
+
+use crate::monitor::stats::gaussian::mahalanobis2;
+
+/// Time over which claims are averaged, s. Longer is more exact, shorter follows a heading or a place that wanders. Not measured.
+const SMOOTHING_S: f64 = 10.0;
+/// Distance, in standard deviations, at which a user's weight is a half (Cauchy): liars move nothing by much.
+const HALF_WEIGHT: f64 = 2.0;
+/// Distance beyond which a user does not count, standard deviations.
+const OUTSIDE: f64 = 5.0;
+/// Variances below which no pose is taken to be known, rad² and m²: keeps the prior regular.
+const LEAST: [f64; 2] = [1e-12, 1e-8];
+
+/// The lasting error of the pose, about north, east, down (rad), then east, north, up (m).
+#[derive(Clone, Debug, Default)]
+pub struct PoseBias {
+    information: Matrix6<f64>,
+    vector: Vector6<f64>,
+    error: Vector6<f64>,
+    cov: Matrix6<f64>,
+}
+
+/// A claim that a beam answers: how far apart the two are, m, the claim's variance per axis, m², and how the pose moves the beam.
+pub struct Residual {
+    pub offset: Vector2<f64>,
+    pub variance: f64,
+    pub by_pose: Matrix2x6<f64>,
+}
+
+impl PoseBias {
+    pub fn error(&self) -> &Vector6<f64> {
+        &self.error
+    }
+
+    pub fn cov(&self) -> &Matrix6<f64> {
+        &self.cov
+    }
+
+    /// Takes one frame's residuals, `dt` seconds after the last one's; each user claims every `period_s`. `prior` is the
+    /// covariance of the pose.
+    pub fn update(&mut self, residuals: &[Residual], prior: &Matrix6<f64>, dt: f64, period_s: f64) {
+        let [turn, shift] = LEAST;
+        let prior = prior + Matrix6::from_diagonal(&[turn, turn, turn, shift, shift, shift].into());
+        let Some(prior_information) = prior.cholesky().map(|c| c.inverse()) else {
+            return;
+        };
+        let keep = (-dt / SMOOTHING_S).exp();
+        self.information *= keep;
+        self.vector *= keep;
+        self.solve(&prior_information, &prior);
+        let share = (dt / period_s.max(0.01)).min(1.0);
+        let is_outside = |r: &&Residual| !(self.distance2(r) < OUTSIDE * OUTSIDE);
+        if 2 * residuals.iter().filter(is_outside).count() > residuals.len() {
+            // Most users are elsewhere: what was learned is of another pose.
+            *self = Self::default();
+            self.solve(&prior_information, &prior);
+        }
+        for r in residuals {
+            let d2 = self.distance2(r);
+            if !(d2 < OUTSIDE * OUTSIDE) {
+                continue;
+            }
+            let weight = share / (r.variance * (1.0 + d2 / (HALF_WEIGHT * HALF_WEIGHT)));
+            self.information += r.by_pose.transpose() * r.by_pose * weight;
+            self.vector += r.by_pose.transpose() * r.offset * weight;
+        }
+        self.solve(&prior_information, &prior);
+    }
+
+    /// Squared distance of a claim from its beam, standard deviations.
+    fn distance2(&self, r: &Residual) -> f64 {
+        let spread = r.by_pose * self.cov * r.by_pose.transpose() + Matrix2::identity() * r.variance;
+        mahalanobis2(r.offset - r.by_pose * self.error, spread)
+    }
+
+    fn solve(&mut self, prior_information: &Matrix6<f64>, prior: &Matrix6<f64>) {
+        let posterior = (prior_information + self.information).cholesky().map(|c| c.inverse());
+        self.cov = posterior.unwrap_or(*prior);
+        self.error = self.cov * self.vector;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use jiff::Timestamp;
+
+    use super::*;
+    use crate::geo::Sight;
+    use crate::pose::{Mount, Pose, PoseSigmas};
+
+    const USERS: [[f64; 2]; 6] = [
+        [60.0, 10.0],
+        [-50.0, 40.0],
+        [0.0, -70.0],
+        [80.0, -60.0],
+        [-70.0, -50.0],
+        [20.0, 60.0],
+    ];
+
+    /// The bias after a minute in which the beams of `users` are displaced by a pose error, and those of the first `liars` by 8 m
+    /// more.
+    fn found(users: usize, liars: usize, error: &Vector6<f64>) -> PoseBias {
+        let pose = Pose::level(Timestamp::UNIX_EPOCH, [5.0, -8.0, 300.0]);
+        let sight = Sight::new(&pose, &Mount::default());
+        let prior = PoseSigmas {
+            attitude_rad: 0.02,
+            position_m: 1.0,
+        };
+        let residual = |(k, [x, y]): (usize, &[f64; 2])| {
+            let by_pose = sight.apparent([*x, *y, 0.0]).expect("below").by_pose;
+            let lie = Vector2::new(if k < liars { 8.0 } else { 0.0 }, 0.0);
+            Residual {
+                offset: by_pose * error + lie,
+                variance: 0.09,
+                by_pose,
+            }
+        };
+        let residuals: Vec<_> = USERS[..users].iter().enumerate().map(residual).collect();
+        let mut bias = PoseBias::default();
+        (0..600).for_each(|_| bias.update(&residuals, &prior.cov(), 0.1, 1.0));
+        bias
+    }
+
+    /// Largest displacement that is left at the users' places, m.
+    fn left(bias: &PoseBias, error: &Vector6<f64>) -> f64 {
+        let pose = Pose::level(Timestamp::UNIX_EPOCH, [5.0, -8.0, 300.0]);
+        let sight = Sight::new(&pose, &Mount::default());
+        let at = |[x, y]: [f64; 2]| sight.apparent([x, y, 0.0]).expect("below").by_pose * (error - bias.error());
+        USERS.into_iter().map(|p| at(p).norm()).fold(0.0, f64::max)
+    }
+
+    #[test]
+    fn a_tilt_a_heading_and_a_shift_are_found_from_six_users() {
+        let error = Vector6::new(0.003, -0.004, 0.026, 1.2, -0.7, 1.0);
+        let bias = found(6, 0, &error);
+        assert!(left(&bias, &error) < 0.1, "{}", left(&bias, &error));
+        // The prior alone leaves what the error makes.
+        assert!(left(&found(0, 0, &error), &error) > 2.0);
+    }
+
+    #[test]
+    fn one_user_corrects_their_own_place_and_liars_few() {
+        let error = Vector6::new(0.003, -0.004, 0.0, 1.2, -0.7, 0.0);
+        assert!(left(&found(1, 0, &error), &error) < 1.0);
+        let honest = Vector6::zeros();
+        assert!(
+            left(&found(6, 1, &honest), &honest) < 0.6,
+            "{}",
+            left(&found(6, 1, &honest), &honest)
+        );
+    }
+}

@@ -1,0 +1,286 @@
+//! The platform that the camera is mounted on: where its poses come from (none for a fixed one, a recording, an autopilot), and
+//! the camera's sight at a frame's time.
+
+mod buffer;
+mod config;
+mod delay;
+#[allow(
+    clippy::disallowed_methods,
+    reason = "telemetry is dated when it arrives, and waits have an end"
+)]
+pub mod mavlink;
+mod place;
+pub mod px4_log;
+mod replay;
+mod telemetry;
+
+use std::collections::VecDeque;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use jiff::{SignedDuration, Timestamp};
+use nalgebra::Vector6;
+
+pub use buffer::{Counts, Outcome, PoseAt, PoseBuffer};
+pub use config::{Config, ConfigError, Kind};
+pub use place::{Geodetic, Origin, Place, Unplaced};
+pub use replay::{Error as ReplayError, LineError};
+pub use telemetry::{Error as TelemetryError, Telemetry, open as open_telemetry};
+
+use crate::claim::seconds;
+use crate::geo::{self, Sight};
+use crate::pose::{Mount, Pose};
+use delay::DelayEstimate;
+use replay::Replay;
+
+/// Age of a pose, s, beyond which its error is not the delay's.
+const MAX_LEARNING_AGE_S: f64 = 0.1;
+
+/// Why there are no poses.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    #[error(transparent)]
+    Config(#[from] ConfigError),
+    #[error("platform.poses: {0}")]
+    Replay(#[from] ReplayError),
+}
+
+/// Rates are taken over this time to either side of a frame, s: much longer than from pose to pose, so that the poses' own noise
+/// is little of them, and short against a sway.
+const RATES_OVER_S: f64 = 0.1;
+/// Frames that wait for the poses after them.
+const MOST_WAITING: usize = 64;
+
+/// The platform and the camera's mount on it.
+pub struct Platform {
+    source: Source,
+    mount: Mount,
+    delay_s: Option<f64>,
+    lost_s: f64,
+    /// What is learned of the delay where none is configured.
+    learned: DelayEstimate,
+    /// When a pose was first asked for in vain.
+    waiting_since: Option<Timestamp>,
+    /// The newest frame that has been learned from.
+    learned_at: Option<Timestamp>,
+    /// Pose errors by the time of their pose, until the poses after them are there.
+    unlearned: VecDeque<(Timestamp, Vector6<f64>)>,
+}
+
+/// Poses as they come in, shared with the thread that receives them.
+pub type SharedPoses = Arc<Mutex<PoseBuffer>>;
+
+#[allow(clippy::large_enum_variant, reason = "a platform has one")]
+enum Source {
+    /// Level over (0, 0) at the camera's own altitude.
+    Level,
+    Fixed(Pose),
+    Replay(Box<Replay>, PoseBuffer),
+    Live(SharedPoses),
+}
+
+impl Source {
+    /// Reads the poses so far; `None` where there is no buffer of them.
+    fn read<T>(&self, reader: impl FnOnce(&PoseBuffer) -> T) -> Option<T> {
+        match self {
+            Self::Level | Self::Fixed(_) => None,
+            Self::Replay(_, poses) => Some(reader(poses)),
+            Self::Live(poses) => Some(reader(&poses.lock().unwrap_or_else(PoisonError::into_inner))),
+        }
+    }
+}
+
+/// Where the camera is in one frame.
+#[derive(Clone, Debug)]
+#[allow(
+    clippy::large_enum_variant,
+    reason = "a frame has one, and boxing it would allocate in each"
+)]
+pub enum Placement {
+    /// Level over (0, 0) at the camera's own altitude.
+    Level,
+    At {
+        sight: Sight,
+        pose: Box<PoseAt>,
+        /// The newest pose is older than is tolerated.
+        is_lost: bool,
+    },
+    /// No pose has come yet.
+    Unknown { waited_s: f64, is_lost: bool },
+}
+
+impl Platform {
+    /// Opens what a config names; `altitude_m` is a fixed platform's. An autopilot's poses come in through [`Platform::live`].
+    pub fn open(config: &Config, world: &geo::Config, altitude_m: f64) -> Result<Self, Error> {
+        config.validate()?;
+        let source = match (config.kind, &config.poses) {
+            (Kind::Replay, Some(path)) => {
+                let replay = Replay::open(path, world, config.poses_start)?;
+                Source::Replay(Box::new(replay), PoseBuffer::default())
+            }
+            (Kind::Fixed, _) if config.mount.is_none() => Source::Level,
+            (Kind::Fixed, _) => Source::Fixed(Pose::level(Timestamp::UNIX_EPOCH, [0.0, 0.0, altitude_m])),
+            _ => Source::Live(SharedPoses::default()),
+        };
+        Ok(Self {
+            source,
+            mount: config.mount,
+            delay_s: config.delay_s,
+            lost_s: config.pose_lost_s,
+            learned: DelayEstimate::default(),
+            waiting_since: None,
+            learned_at: None,
+            unlearned: VecDeque::new(),
+        })
+    }
+
+    /// A fixed, level platform.
+    pub fn level() -> Self {
+        Self {
+            source: Source::Level,
+            mount: Mount::default(),
+            delay_s: None,
+            lost_s: Config::default().pose_lost_s,
+            learned: DelayEstimate::default(),
+            waiting_since: None,
+            learned_at: None,
+            unlearned: VecDeque::new(),
+        }
+    }
+
+    /// The buffer that a receiver of poses fills; none but for an autopilot's.
+    pub fn live(&self) -> Option<SharedPoses> {
+        match &self.source {
+            Source::Live(poses) => Some(poses.clone()),
+            _ => None,
+        }
+    }
+
+    /// Pose stamps minus frame stamps, s: as configured, or as learned so far.
+    pub fn delay_s(&self) -> f64 {
+        self.delay_s.unwrap_or(self.learned.delay_s())
+    }
+
+    /// Learns the delay from the pose error that the beams of a frame share, where it is not configured. `pose` is that of the
+    /// frame.
+    pub fn learn(&mut self, error: &Vector6<f64>, pose: &PoseAt) {
+        if self.delay_s.is_some() || pose.age_s >= MAX_LEARNING_AGE_S {
+            return;
+        }
+        if self.unlearned.len() == MOST_WAITING {
+            self.unlearned.pop_front();
+        }
+        self.unlearned.push_back((pose.pose.time, *error));
+        let Some(newest) = self.source.read(|poses| poses.newest().map(|pose| pose.time)).flatten() else {
+            return;
+        };
+        while let Some((time, error)) = self.unlearned.front().copied()
+            && seconds(time, newest) >= RATES_OVER_S
+        {
+            self.unlearned.pop_front();
+            let rates = self.source.read(|poses| poses.rates_about(time, RATES_OVER_S));
+            if let Some(rates) = rates.flatten() {
+                let dt_s = self.learned_at.map_or(0.0, |t| seconds(t, time));
+                self.learned_at = Some(time);
+                self.learned.learn(&error, &rates, dt_s);
+            }
+        }
+    }
+
+    /// Where the camera is at a frame's `time`.
+    pub fn at(&mut self, time: Timestamp) -> Placement {
+        let stamp = time.saturating_add(SignedDuration::from_secs_f64(self.delay_s()));
+        let stamp = stamp.unwrap_or(time);
+        let found = match &mut self.source {
+            Source::Level => return Placement::Level,
+            Source::Fixed(pose) => Some(PoseAt {
+                pose: pose.clone(),
+                age_s: 0.0,
+                rates: Vector6::zeros(),
+            }),
+            Source::Replay(replay, buffer) => {
+                replay.advance(stamp, buffer);
+                buffer.at(stamp)
+            }
+            Source::Live(poses) => poses.lock().unwrap_or_else(PoisonError::into_inner).at(stamp),
+        };
+        let Some(mut pose) = found else {
+            let waited_s = seconds(*self.waiting_since.get_or_insert(time), time).max(0.0);
+            return Placement::Unknown {
+                waited_s,
+                is_lost: waited_s > self.lost_s,
+            };
+        };
+        if self.delay_s.is_none() {
+            pose.pose.cov += pose.rates * pose.rates.transpose() * self.learned.std_s().powi(2);
+        }
+        let is_lost = pose.age_s > self.lost_s;
+        Placement::At {
+            sight: Sight::new(&pose.pose, &self.mount),
+            pose: Box::new(pose),
+            is_lost,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::UnitQuaternion;
+    use rand::SeedableRng;
+    use rand_chacha::ChaCha8Rng;
+    use rand_distr::{Distribution, StandardNormal};
+
+    use super::*;
+
+    /// The delay as learned in a minute of sway, where poses are `late_s` late and their tilt has white noise, rad.
+    fn learned(late_s: f64, noise_rad: f64) -> (f64, f64) {
+        let mut rng = ChaCha8Rng::seed_from_u64(7);
+        let mut noise = || {
+            let value: f64 = StandardNormal.sample(&mut rng);
+            value * noise_rad
+        };
+        let at = |s: f64| Timestamp::UNIX_EPOCH + SignedDuration::from_nanos(((100.0 + s) * 1e9).round() as i64);
+        let tilt = |s: f64| [0.05 * (0.785 * s).sin(), 0.05 * (0.63 * s + 1.0).sin()];
+        let poses = SharedPoses::default();
+        let mut platform = Platform {
+            source: Source::Live(poses.clone()),
+            ..Platform::level()
+        };
+        // Stamps at 50 Hz that coincide with those of the frames at 10 Hz.
+        for k in 0..3000_u32 {
+            let s = 0.02 * f64::from(k);
+            let [north, east] = tilt(s - late_s);
+            let attitude = UnitQuaternion::from_scaled_axis([north + noise(), east + noise(), 0.0].into());
+            let pose = Pose {
+                attitude,
+                ..Pose::level(at(s), [0.0, 0.0, 300.0])
+            };
+            poses.lock().expect("one thread").insert(pose);
+            // A frame that is seen when the next poses are there.
+            let frame_s = s - 0.04;
+            if k % 5 == 2 && frame_s > 0.0 {
+                let Placement::At { pose, .. } = platform.at(at(frame_s)) else {
+                    panic!("poses are there");
+                };
+                let truth = tilt(frame_s);
+                let found = pose.pose.attitude.scaled_axis();
+                let error = Vector6::new(found.x - truth[0], found.y - truth[1], 0.0, 0.0, 0.0, 0.0);
+                platform.learn(&error, &pose);
+            }
+        }
+        (platform.delay_s(), platform.learned.std_s())
+    }
+
+    #[test]
+    fn a_delay_is_learned_from_poses_with_noise_too() {
+        for late_s in [0.0, 0.03] {
+            for noise_rad in [0.0, 0.001, 0.003] {
+                let (found, std_s) = learned(late_s, noise_rad);
+                assert!(
+                    (found - late_s).abs() < 4.0 * std_s,
+                    "{late_s} {noise_rad}: {found} ± {std_s}"
+                );
+                assert!(std_s < 0.005, "{std_s}");
+            }
+        }
+    }
+}

@@ -1,0 +1,69 @@
+//! An autopilot's poses in a running daemon.
+
+use std::net::UdpSocket;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use super::process::{Daemon, alerts};
+
+fn bytes(hex: &str) -> Vec<u8> {
+    let hex = hex.trim();
+    let byte = |k: usize| u8::from_str_radix(&hex[2 * k..2 * k + 2], 16).unwrap();
+    (0..hex.len() / 2).map(byte).collect()
+}
+
+#[test]
+fn an_autopilot_s_poses_are_used_shown_and_missed() {
+    let dir = tempfile::tempdir().unwrap();
+    let port = UdpSocket::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+    let config = format!("[platform]\nkind = \"mavlink\"\nendpoint = \"udpin:127.0.0.1:{port}\"\n");
+    let daemon = Daemon::start(dir.path(), &config);
+    let before = daemon.wait_for("/v1/pose", "a status", |v| v["source"] == "mavlink");
+    assert!(before["pose"].is_null(), "{before}");
+
+    // A heartbeat of system 7 and one pose, again and again until the pose is seen.
+    let stop = Arc::new(AtomicBool::new(false));
+    let flying = stop.clone();
+    let sender = std::thread::spawn(move || {
+        let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
+        let frames = [
+            include_str!("../platform/heartbeat.hex"),
+            include_str!("../platform/odometry.hex"),
+        ]
+        .map(bytes);
+        while !flying.load(Ordering::Relaxed) {
+            for frame in &frames {
+                let _ = socket.send_to(frame, ("127.0.0.1", port));
+            }
+            std::thread::sleep(Duration::from_millis(20));
+        }
+    });
+    let seen = daemon.wait_for("/v1/pose", "a pose", |v| v["pose"].is_object());
+    let pose = &seen["pose"];
+    assert_eq!(
+        [&pose["x_m"], &pose["y_m"], &pose["z_m"], &pose["heading_deg"]],
+        [20.0, 10.0, 100.0, 0.0],
+        "{seen}"
+    );
+    // The autopilot falls silent.
+    stop.store(true, Ordering::Relaxed);
+    sender.join().unwrap();
+    daemon.wait_for("/v1/alerts?kind=pose_lost", "that poses are lost", |v| {
+        !alerts(v).is_empty()
+    });
+    daemon.wait_for("/v1/pose", "that the pose is old", |v| {
+        v["is_lost"] == true && v["pose"]["age_s"].as_f64() > Some(1.0)
+    });
+    let metrics = daemon.get("/metrics").1;
+    for expected in [
+        "oapwatch_poses_total",
+        "oapwatch_pose_refused_total{reason=\"duplicate\"}",
+        "oapwatch_pose_age_seconds",
+    ] {
+        assert!(
+            metrics.lines().any(|l| l.starts_with(expected) && !l.ends_with(" 0")),
+            "{expected}: {metrics}"
+        );
+    }
+}
