@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use jiff::Timestamp;
 use metrics::counter;
-use tokio::io::{AsyncWriteExt, ReadHalf, WriteHalf};
+use tokio::io::{AsyncWriteExt, BufReader, ReadHalf, WriteHalf};
 use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
 
@@ -28,6 +28,7 @@ const MOST_ALERTS: usize = 10_000;
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(1);
 
 type Stream = Box<dyn Duplex>;
+type Reading = BufReader<ReadHalf<Stream>>;
 
 /// What a node knows, shared with the reader of its connection.
 #[derive(Debug)]
@@ -125,7 +126,8 @@ impl Inner {
     /// Connects and registers.
     async fn open(self: &Arc<Self>, now: Timestamp) -> Result<Session, Failure> {
         let stream = self.link.connect().await.map_err(Failure::Unreachable)?;
-        let (mut reading, mut writing) = tokio::io::split(stream);
+        let (reading, mut writing) = tokio::io::split(stream);
+        let mut reading = BufReader::new(reading);
         let registration = reports::registration(&self.station, self.interval);
         let bytes = frame::encode(&self.wrap(Content::Registration(registration), now));
         writing.write_all(&bytes).await.map_err(Failure::Interrupted)?;
@@ -137,7 +139,7 @@ impl Inner {
         })
     }
 
-    async fn await_acceptance(&self, reading: &mut ReadHalf<Stream>) -> Result<(), Failure> {
+    async fn await_acceptance(&self, reading: &mut Reading) -> Result<(), Failure> {
         for _ in 0..MOST_BEFORE_ANSWER {
             let read = frame::read(reading).await;
             let message = read.map_err(|e| Failure::Protocol(e.to_string()))?;
@@ -159,8 +161,17 @@ impl Inner {
         ))
     }
 
-    /// Reads until the connection ends. Waits for nobody but the compute thread, by way of a bounded queue.
-    async fn listen(self: Arc<Self>, mut reading: ReadHalf<Stream>) {
+    /// Reads until the other side closes the connection or cannot be understood, and then closes it.
+    async fn listen(self: Arc<Self>, reading: Reading) {
+        self.hear(reading).await;
+        let mut place = self.session.lock().await;
+        if place.as_ref().is_some_and(|s| s.reader.id() == tokio::task::id()) {
+            place.take();
+        }
+    }
+
+    /// Waits for nobody but the compute thread, by way of a bounded queue.
+    async fn hear(self: &Arc<Self>, mut reading: Reading) {
         loop {
             let message = match frame::read(&mut reading).await {
                 Ok(Some(message)) => message,

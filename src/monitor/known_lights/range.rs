@@ -12,13 +12,13 @@ const BLOCK_FRAMES: usize = 30;
 /// Blocks from which there is a range to hold a light to, and with which it is complete: 12 s and two minutes at 10 frames/s. Fewer
 /// begin sooner and know the range less well; more learn a stranger's arrival for longer.
 const BLOCKS: [u32; 2] = [4, 40];
-/// Windows of newest frames that are tested: a large change is found within one second, a small one within eight.
-const WINDOWS: [usize; 3] = [10, 20, 80];
+/// Windows of newest frames that are tested: a large change is found within one second, a small one within sixteen.
+const WINDOWS: [usize; 4] = [10, 20, 80, 160];
 /// Smallest standard deviation of ln energy, as for users: what gains and the fit leave however steady the light.
 const MIN_LN_STD: f64 = 0.05;
 /// Factor by which the variance of ln energies may leave its range: the blocks of a steady light are few. Larger hides a beam that
 /// takes a lamp's place, smaller takes a change of the air for one. Not tuned.
-const VARIANCE_RATIO: f64 = 2.0;
+const VARIANCE_RATIO: f64 = 1.5;
 /// Share of a window's frames that count as independent: scintillation and flicker last longer than a frame. Assumed.
 const INDEPENDENT: f64 = 0.5;
 /// What a light may leave its learned place by: half of its movement again, and a share of a metre for what moves the platform.
@@ -203,9 +203,11 @@ fn moments(values: impl Iterator<Item = f64>) -> (f64, f64) {
 }
 
 /// Student's test of a window's mean against the nearest end of the range, as for a user's brightness, to both sides: gives how far
-/// outside of it the mean is, and −ln p.
+/// outside of it the mean is, and −ln p. The ends are those of blocks' means, less what the noise of these adds to them.
 fn energy_change(learned: &Learned, mean: f64, n: usize, allowed: f64) -> (f64, f64) {
-    let [low, high] = learned.energy_j.map(f64::ln);
+    let noise = learned.variance_within / BLOCK_FRAMES as f64;
+    let own = (learned.variance_between / (learned.variance_between + noise)).sqrt();
+    let [low, high] = learned.energy_j.map(|end| learned.ln_energy + own * (end.ln() - learned.ln_energy));
     let off = if mean > high {
         mean - high
     } else {
@@ -302,7 +304,7 @@ mod tests {
 
     #[test]
     fn twice_or_half_of_the_light_is_found_in_seconds() {
-        for (ln_energy, std, frames) in [(0.69, 0.05, 10), (-0.69, 0.05, 10), (0.69, 0.3, 80), (-0.69, 0.3, 80)] {
+        for (ln_energy, std, frames) in [(0.69, 0.05, 10), (-0.69, 0.05, 10), (0.69, 0.3, 160), (-0.69, 0.3, 160)] {
             let found = Lamp::new(std, 4).frames_until_found(ln_energy, std);
             assert!(found.is_some_and(|f| f <= frames), "{ln_energy} {std}: {found:?}");
         }
