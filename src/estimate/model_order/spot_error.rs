@@ -22,6 +22,8 @@ const ROUNDS: usize = 3;
 const STRONG_PEAK: f64 = 0.1;
 /// Peaks of the frame above this share of the highest one are taken for spots of their own: higher than any ring or tail.
 const HIGH_PEAK: f64 = 0.2;
+/// Spots from which what stands beside them may be a lens's though sources explain it: a single pair is two sources.
+const LEAST_SPOTS: usize = 3;
 /// Share of the variance that the halo of other spots adds to a position: their misfit is smooth across a spot, while the weights must hold
 /// at its worst place. Found from Airy discs at SNR 1000, the kind of spot whose positions others move most.
 const POSITION_SHARE: f64 = 0.1;
@@ -63,7 +65,7 @@ pub(crate) fn inspect_shape(
     let mut alternatives = match is_explained {
         false => vec![merged, separate],
         true if has_width || are_pairs_alike(hypothesis) => vec![merged],
-        true if separate.len() < hypothesis.sources.len() => vec![separate],
+        true if separate.len() >= LEAST_SPOTS && separate.len() < hypothesis.sources.len() => vec![separate],
         true => return Shape::AsModelled,
     };
     compressed.load(frame, &space.bases.x, &space.bases.y);
