@@ -353,8 +353,6 @@ impl AnalyticEstimator {
                 Some(error) => Shape::of_spot_error(error, &hypothesis),
                 None => inspect_shape(space, compressed, frame, &hypothesis, is_explained, budget),
             };
-            if std::env::var_os("OAPDBG").is_some() && let Shape::Different(e, b) = &shape { eprintln!("DBG different {e:.4} explained {is_explained} n {} bright {} dev {} dof {}", hypothesis.sources.len(), b.sources.len(), hypothesis.deviance, self.compressed.data_count); }
-            if std::env::var_os("OAPDBG").is_some() && let Shape::Simpler(b) = &shape { eprintln!("DBG simpler explained {is_explained} n {} -> {}", hypothesis.sources.len(), b.sources.len()); }
             match shape {
                 Shape::AsModelled => {}
                 Shape::Simpler(simpler) => {

@@ -216,9 +216,6 @@ fn compare(
         }
     }
     let is_common = left < MAX_LEFT * whole && following > LEAST_FOLLOWING * visible;
-    if std::env::var_os("OAPDBG").is_some() {
-        eprintln!("DBG views {} whole {whole:.0} left {left:.0} core {core:.3} visible {visible} following {following} largest {largest:.4}", views.len());
-    }
     if is_common && core < MAX_CORE {
         (strongest * largest / LEFT).min(MAX_SPOT_ERROR)
     } else {

@@ -207,7 +207,9 @@ fn moments(values: impl Iterator<Item = f64>) -> (f64, f64) {
 fn energy_change(learned: &Learned, mean: f64, n: usize, allowed: f64) -> (f64, f64) {
     let noise = learned.variance_within / BLOCK_FRAMES as f64;
     let own = (learned.variance_between / (learned.variance_between + noise)).sqrt();
-    let [low, high] = learned.energy_j.map(|end| learned.ln_energy + own * (end.ln() - learned.ln_energy));
+    let [low, high] = learned
+        .energy_j
+        .map(|end| learned.ln_energy + own * (end.ln() - learned.ln_energy));
     let off = if mean > high {
         mean - high
     } else {
