@@ -20,16 +20,13 @@ const MAX_SPOTS: usize = 12;
 const SIGNIFICANT: f64 = 36.0;
 /// Significance at which a spot that does not follow the common misfit shows it.
 const VISIBLE: f64 = 5.0;
-/// Distance from which bright spots stand apart, σ. In a crowd whose sources are not all found yet, what is missing beside one spot is
-/// missing beside others: the misfit is looked at where half of the spots stand apart.
-const APART: f64 = 5.0;
 /// Largest share of the squared residual that the common misfit may leave, of all spots together and of one that follows it: lenses of
 /// the kinds above leave a tenth, nine in ten frames less than a third; unfinished searches of crowds two fifths and more.
 const MAX_LEFT: f64 = 0.35;
 const MAX_LEFT_OF_ONE: f64 = 0.5;
 /// Least share of the spots whose misfit is seen that follow the common one.
 const LEAST_FOLLOWING: f64 = 0.6;
-/// Largest ratio of a spot's misfit to the common one that is allowed for.
+/// Largest ratio of a spot's misfit to the common one with which it follows that.
 const MAX_GROWTH: f64 = 2.5;
 /// Significance that the common misfit keeps under the weights: well below a source's threshold (5.5), so that spots that differ from
 /// the common one are covered too.
@@ -38,7 +35,7 @@ const LEFT: f64 = 2.0;
 pub(crate) const MAX_SPOT_ERROR: f64 = 0.1;
 /// Largest common misfit, as a share of the light, within the core. Two equal sources 2 σ apart, taken for one, show 0.14 and more; Airy
 /// discs, Moffat profiles, defocus, coma and astigmatism up to 0.06.
-const MAX_CORE: f64 = 0.1;
+const MAX_CORE: f64 = 0.07;
 
 /// Sources nearer than this to a brighter one, σ, may be a part of its spot whatever their energy.
 pub(crate) const CORE: f64 = 2.5;
@@ -106,13 +103,6 @@ pub(crate) fn common_misfit(search: &mut Search, candidate: &mut Candidate) -> f
     let mut bright: Vec<&PointSource> = sources.iter().filter(|s| s.a > BRIGHT * brightest).collect();
     bright.sort_by(|a, b| b.a.total_cmp(&a.a));
     bright.truncate(MAX_SPOTS);
-    let stands_apart = |s: &&&PointSource| {
-        let is_near = |t: &&PointSource| distance2(s.u, t.u) < APART * APART;
-        bright.iter().filter(|t| is_near(t)).count() == 1
-    };
-    if 2 * bright.iter().filter(stands_apart).count() < bright.len() {
-        return 0.0;
-    }
     let ends = bases.axes().map(|b| [b.edges[0], b.edges[b.n]]);
     let middle = ends.map(|[low, high]| 0.5 * (low + high));
     let radial = |s: &&PointSource| {
@@ -211,7 +201,7 @@ fn compare(
         visible += f64::from(rr > SIGNIFICANT);
         // Aberrations grow towards the edge: a spot may show the common misfit more strongly than most.
         if rr - follows < MAX_LEFT_OF_ONE * rr {
-            following += f64::from(rr > SIGNIFICANT);
+            following += f64::from(rr > SIGNIFICANT && rt < MAX_GROWTH * tt);
             strongest = strongest.max((rt / tt).min(MAX_GROWTH));
         }
     }
