@@ -1,7 +1,7 @@
 //! Common misfit: what the residuals around bright spots have in common, which is the lens's and not the sky's.
 //!
 //! A stranger stands beside one user; a lens makes the same rings, tails and ghosts beside all. The share of its light by which a spot
-//! misses the model at an offset is therefore taken to be what more than half of the bright spots show there at least.
+//! misses the model at an offset is therefore taken to be what three quarters of the bright spots show there at least.
 
 use crate::estimate::model::halo;
 use crate::estimate::model::hypothesis::{Hypothesis, PointSource};
@@ -24,8 +24,11 @@ const VISIBLE: f64 = 5.0;
 /// the kinds above leave a tenth, nine in ten frames less than a third; unfinished searches of crowds two fifths and more.
 const MAX_LEFT: f64 = 0.35;
 const MAX_LEFT_OF_ONE: f64 = 0.5;
-/// Least share of the spots whose misfit is seen that follow the common one.
-const LEAST_FOLLOWING: f64 = 0.6;
+/// Share of the spots that a misfit is common to, at an offset and in all. Half agree by chance where a crowd is not resolved yet.
+const COMMON: f64 = 0.75;
+/// Other bright spots within [`NEAR`] σ of half of the spots, up to which these are no crowd.
+const MAX_NEAR: usize = 1;
+const NEAR: f64 = 5.0;
 /// Largest ratio of a spot's misfit to the common one with which it follows that.
 const MAX_GROWTH: f64 = 2.5;
 /// Significance that the common misfit keeps under the weights: well below a source's threshold (5.5), so that spots that differ from
@@ -35,7 +38,7 @@ const LEFT: f64 = 2.0;
 pub(crate) const MAX_SPOT_ERROR: f64 = 0.1;
 /// Largest common misfit, as a share of the light, within the core. Two equal sources 2 σ apart, taken for one, show 0.14 and more; Airy
 /// discs, Moffat profiles, defocus, coma and astigmatism up to 0.06.
-const MAX_CORE: f64 = 0.07;
+const MAX_CORE: f64 = 0.1;
 
 /// Sources nearer than this to a brighter one, σ, may be a part of its spot whatever their energy.
 pub(crate) const CORE: f64 = 2.5;
@@ -102,6 +105,10 @@ pub(crate) fn common_misfit(search: &mut Search, candidate: &mut Candidate) -> f
     let brightest = sources.iter().fold(0.0, |m: f64, s| m.max(s.a));
     let mut bright: Vec<&PointSource> = sources.iter().filter(|s| s.a > BRIGHT * brightest).collect();
     bright.sort_by(|a, b| b.a.total_cmp(&a.a));
+    let near = |s: &&PointSource| bright.iter().filter(|t| distance2(s.u, t.u) < NEAR * NEAR).count() - 1;
+    if 2 * bright.iter().filter(|s| near(s) > MAX_NEAR).count() > bright.len() {
+        return 0.0;
+    }
     bright.truncate(MAX_SPOTS);
     let ends = bases.axes().map(|b| [b.edges[0], b.edges[b.n]]);
     let middle = ends.map(|[low, high]| 0.5 * (low + high));
@@ -167,7 +174,7 @@ fn compare(
             if values.len() < 2 || 2 * values.len() < views.len() {
                 continue;
             }
-            let need = values.len() / 2 + 1;
+            let need = (COMMON * values.len() as f64).ceil() as usize;
             let mut common = 0.0f64;
             for sign in [1.0, -1.0] {
                 values.sort_by(|a, b| (sign * b.0).total_cmp(&(sign * a.0)));
@@ -205,7 +212,7 @@ fn compare(
             strongest = strongest.max((rt / tt).min(MAX_GROWTH));
         }
     }
-    let is_common = left < MAX_LEFT * whole && following > LEAST_FOLLOWING * visible;
+    let is_common = left < MAX_LEFT * whole && following > COMMON * visible;
     if is_common && core < MAX_CORE {
         (strongest * largest / LEFT).min(MAX_SPOT_ERROR)
     } else {
