@@ -4,6 +4,7 @@ use rayon::prelude::*;
 
 use super::constraints::{self, norm};
 use super::detection::{self, MatchedFilter, Peak};
+use super::flashes;
 use super::grouping::{self, Image};
 use super::patch::{Linearised, Patch, Source};
 use super::solve;
@@ -240,6 +241,23 @@ impl<'a> Learner<'a> {
             self.cut(found.into_iter().map(|f| f.0).collect());
         }
         added
+    }
+
+    /// Takes single bright pixels in spots out of use; returns (index of the image, index of the pixel in it).
+    pub fn mask_flashes(&mut self) -> Vec<(usize, usize)> {
+        let (camera, model, noise_j) = (self.camera, &self.model, self.noise_j);
+        let mask = |patch: &mut Patch| -> Vec<(usize, usize)> {
+            let found = flashes::in_spots(camera, model, noise_j, patch);
+            for (j, i) in &found {
+                patch.weight[(j - patch.y.start) * patch.x.len() + i - patch.x.start] = 0.0;
+            }
+            if !found.is_empty() {
+                patch.fit(camera, model, 6);
+            }
+            let index = |(j, i)| (patch.frame, j * camera.x.n + i);
+            found.into_iter().map(index).collect()
+        };
+        self.patches.par_iter_mut().flat_map_iter(mask).collect()
     }
 
     /// Takes pixels out of use around spots that the template does not explain although it explains most: two in one, a saturated

@@ -84,8 +84,8 @@ impl Learned {
     }
 }
 
-/// Change of the noise that is worth a calibration: 2 % is within what a hundred frames measure.
-const NOISE_CHANGE: f64 = 0.02;
+/// Change of the noise that is worth a calibration: 3 % is within what sixty frames of overlapping spots measure.
+const NOISE_CHANGE: f64 = 0.03;
 /// Fall of χ² that is more than chance.
 const BETTER: f64 = 30.0;
 
@@ -119,6 +119,16 @@ pub fn learn(
     let chosen: Vec<(usize, &Array2<f64>)> = frames.iter().step_by(step).copied().collect();
     let mut prepared = prepare::prepare(camera, &chosen);
     check_pixels(&prepared, &chosen)?;
+    // Each pass shows what the flashes that it masks have hidden.
+    for _ in 0..FLASH_PASSES {
+        let mut first = Learner::new(camera, &prepared.images, prepared.noise_j);
+        first.fit(15);
+        let flashes = first.mask_flashes();
+        if flashes.is_empty() {
+            break;
+        }
+        prepared.mask_flashes(&flashes);
+    }
     let is_held = |k: usize| k % HELD_OUT == HELD_OUT / 2;
     let split = |images: &[Image]| -> (Vec<Image>, Vec<Image>) {
         let part = |held: bool| {
@@ -146,9 +156,11 @@ pub fn learn(
     check_spots(&learner, &prepared, chosen.len())?;
     let needed = Coverage::needed(camera);
     // Places that were spread over the pixel and are not any more follow a template that is none.
-    if learner.misfit > UNLIKE || coverage.phases < needed && detected.phases >= needed {
+    let unexplained = statistics::unexplained(&learner);
+    let is_locked = coverage.phases < needed && detected.phases >= needed && unexplained > UNEXPLAINED;
+    if learner.misfit > UNLIKE || is_locked {
         return Err(Error::NotAlike {
-            share: 100.0 * learner.misfit.max(statistics::unexplained(&learner)),
+            share: 100.0 * learner.misfit.max(unexplained),
         });
     }
     if coverage.phases < needed {
@@ -167,9 +179,7 @@ pub fn learn(
     drop(learner);
     prepared.scale_noise(factor);
     let noise_j = prepared.noise_j;
-    let all = Learner::with_model(camera, &prepared.images, noise_j, &model, misfit);
-    let flashes = flashes::in_spots(&all);
-    drop(all);
+    let flashes = Learner::with_model(camera, &prepared.images, noise_j, &model, misfit).mask_flashes();
     prepared.mask_flashes(&flashes);
     let (train, held) = split(&prepared.images);
     let mut learner = Learner::with_model(camera, &train, noise_j, &model, misfit);
@@ -298,6 +308,7 @@ pub fn learn(
     })
 }
 
+const FLASH_PASSES: usize = 3;
 /// Degrees that are tried in turn while the held-out frames gain by them.
 const FIELD_DEGREES: [usize; 3] = [2, 3, 4];
 const FIELD_ROUNDS: usize = 4;
