@@ -21,6 +21,7 @@ struct Sums {
 }
 
 /// One frame as the maps see it: expected values of ideal pixels and recorded ones, J, and which are used; row by row.
+#[derive(Clone)]
 pub struct Pixels<'a> {
     pub ideal: Vec<f64>,
     pub recorded: &'a [f64],

@@ -17,7 +17,7 @@ pub struct Coverage {
 
 /// Least share of all spots that makes a cell count, and least number.
 const SHARE: f64 = 0.01;
-const LEAST: usize = 3;
+const LEAST: usize = 2;
 /// Phases needed where the spot is narrower than [`WELL_SAMPLED`] pixels, and where it is wider: pixels then overlap it more finely, but
 /// a few places cannot tell the shape from the pixels' gains.
 const PHASES_NARROW: usize = 12;

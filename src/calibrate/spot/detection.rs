@@ -1,5 +1,6 @@
 //! Finds spots without knowing their shape, and what only looks like one: hot pixels and the halo of a brighter spot.
 
+use super::patch::Source;
 use crate::optics::{Axis, Camera, psf};
 
 /// Significance of a detection in standard deviations. Fainter spots teach nothing about the shape.
@@ -10,6 +11,24 @@ const SIGMAS: f64 = 8.0;
 pub struct Peak {
     pub at: [f64; 2],
     pub energy_j: f64,
+}
+
+impl From<&Peak> for Source {
+    fn from(peak: &Peak) -> Self {
+        Self {
+            at: peak.at,
+            energy_j: peak.energy_j,
+        }
+    }
+}
+
+impl From<&Source> for Peak {
+    fn from(source: &Source) -> Self {
+        Self {
+            at: source.at,
+            energy_j: source.energy_j,
+        }
+    }
 }
 
 /// Matched filter with the camera's Gaussian on images of its shape.

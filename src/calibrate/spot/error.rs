@@ -23,8 +23,15 @@ pub enum Error {
         CELLS
     )]
     Phases { covered: usize, needed: usize },
-    #[error("the spots are not alike: the best common shape leaves {share:.0} % of a spot's light unexplained")]
+    #[error(
+        "the spots are not alike: no common shape explains them (the best leaves {share:.0} % of their light unexplained); are all of \
+         them beams, below saturation, and none always beside another?"
+    )]
     NotAlike { share: f64 },
+    #[error("no pixel of the {frames} frames has a finite value")]
+    NotFinite { frames: usize },
+    #[error("the pixels of the {frames} frames hardly differ, not even by noise: is there a picture in them?")]
+    NoNoise { frames: usize },
 }
 
 /// Fewest frames and spots: a fifth is held out, and each pixel phase wants several spots.

@@ -2,7 +2,9 @@
 
 use rayon::prelude::*;
 
+use super::constraints::{self, norm};
 use super::detection::{self, MatchedFilter, Peak};
+use super::flashes;
 use super::grouping::{self, Image};
 use super::patch::{Linearised, Patch, Source};
 use super::solve;
@@ -24,10 +26,8 @@ const MOST_SPLINES: usize = 97;
 const EDGE_LIGHT: f64 = 0.3;
 /// Support of what changes over the field, σ: aberrations that change widely are near the core.
 const FIELD_RADIUS: f64 = 7.0;
-/// Width of the margin over which the prior fades out, share of the support.
-const TAPER: f64 = 0.2;
-/// Rounds at most, and the relative fall of χ² per degree of freedom below which there are no more.
-const ROUNDS: usize = 12;
+/// Default number of rounds, and the relative fall of χ² per degree of freedom below which there are no more.
+pub const MOST_ROUNDS: usize = 12;
 const SETTLED: f64 = 1e-3;
 /// Least matched signal-to-noise ratio of a source that a patch is used for.
 const LEAST_SNR: f64 = 12.0;
@@ -42,6 +42,13 @@ pub struct Learner<'a> {
     /// Share of a spot's norm that the template does not explain, median over the spots.
     pub misfit: f64,
     filter: MatchedFilter,
+}
+
+/// A spot that was left out because the template does not explain it.
+#[derive(Clone, Copy, Debug)]
+pub struct Odd {
+    pub frame: usize,
+    pub at: [f64; 2],
 }
 
 /// What a round reports.
@@ -121,7 +128,7 @@ impl<'a> Learner<'a> {
                     .collect();
                 let peaks = self.filter.peaks(camera, &above, noise);
                 let own = detection::own_spots(&peaks, &[], halo);
-                grouping::patches(camera, k, image, own.iter().map(source).collect(), radius)
+                grouping::patches(camera, k, image, own.iter().map(Source::from).collect(), radius)
             })
             .collect();
     }
@@ -174,31 +181,11 @@ impl<'a> Learner<'a> {
         self.patches.iter().map(|p| p.sources.len()).sum()
     }
 
-    /// Misfit of each source: √(excess of χ² within a few widths over the spot's own), patch by patch.
+    /// Misfit of each source, patch by patch.
     pub fn misfits(&self) -> Vec<Vec<f64>> {
         let (camera, model) = (self.camera, &self.model);
-        let reach = 3.0 * camera.spot_sigma_m;
-        self.patches
-            .par_iter()
-            .map(|patch| {
-                let expected = patch.expected(camera, model);
-                let of = |source: &Source| {
-                    let (mut excess, mut own) = (0.0, 0.0);
-                    for j in pixels(&camera.y, source.at[1], reach, &patch.y) {
-                        for i in pixels(&camera.x, source.at[0], reach, &patch.x) {
-                            let p = (j - patch.y.start) * patch.x.len() + i - patch.x.start;
-                            let w = patch.weight[p];
-                            if w > 0.0 {
-                                excess += ((patch.data[p] - expected[p]) * w).powi(2) - 1.0;
-                                own += ((expected[p] - patch.background) * w).powi(2);
-                            }
-                        }
-                    }
-                    (excess.max(0.0) / own.max(1.0)).sqrt()
-                };
-                patch.sources.iter().map(of).collect()
-            })
-            .collect()
+        let of = |patch: &Patch| patch.misfits(camera, model);
+        self.patches.par_iter().map(of).collect()
     }
 
     fn median_misfit(&self) -> f64 {
@@ -236,7 +223,7 @@ impl<'a> Learner<'a> {
                     }
                 });
                 let known: Vec<Source> = patches.iter().flat_map(|p| p.sources.iter().cloned()).collect();
-                let brighter: Vec<Peak> = known.iter().map(peak).collect();
+                let brighter: Vec<Peak> = known.iter().map(Peak::from).collect();
                 let peaks = self.filter.peaks(camera, &residual, noise);
                 // A spot's core is where its misfit is.
                 let halo = |d: f64| match d {
@@ -246,7 +233,7 @@ impl<'a> Learner<'a> {
                 };
                 let own = detection::own_spots(&peaks, &brighter, halo);
                 let count = own.len();
-                (known.into_iter().chain(own.iter().map(source)).collect(), count)
+                (known.into_iter().chain(own.iter().map(Source::from)).collect(), count)
             })
             .collect();
         let added = found.iter().map(|f| f.1).sum();
@@ -256,16 +243,33 @@ impl<'a> Learner<'a> {
         added
     }
 
+    /// Takes single bright pixels in spots out of use; returns (index of the image, index of the pixel in it).
+    pub fn mask_flashes(&mut self) -> Vec<(usize, usize)> {
+        let (camera, model, noise_j) = (self.camera, &self.model, self.noise_j);
+        let mask = |patch: &mut Patch| -> Vec<(usize, usize)> {
+            let found = flashes::in_spots(camera, model, noise_j, patch);
+            for (j, i) in &found {
+                patch.weight[(j - patch.y.start) * patch.x.len() + i - patch.x.start] = 0.0;
+            }
+            if !found.is_empty() {
+                patch.fit(camera, model, 6);
+            }
+            let index = |(j, i)| (patch.frame, j * camera.x.n + i);
+            found.into_iter().map(index).collect()
+        };
+        self.patches.par_iter_mut().flat_map_iter(mask).collect()
+    }
+
     /// Takes pixels out of use around spots that the template does not explain although it explains most: two in one, a saturated
-    /// one, something that is no spot. Returns their number.
-    pub fn mask_odd(&mut self) -> usize {
+    /// one, something that is no spot. Returns them.
+    pub fn mask_odd(&mut self) -> Vec<Odd> {
         let limit = (4.0 * self.misfit).max(0.02);
         let camera = self.camera;
         let reach = 4.0 * camera.spot_sigma_m;
         let noise_share = |e: f64, norm: f64| 4.0 * self.noise_j / (e * norm);
         let norm = norm(camera, &self.model);
         let misfits = self.misfits();
-        let mut count = 0;
+        let mut found = Vec::new();
         for (patch, misfits) in self.patches.iter_mut().zip(misfits) {
             let is_odd: Vec<bool> = patch
                 .sources
@@ -274,60 +278,25 @@ impl<'a> Learner<'a> {
                 .map(|(s, m)| *m > limit.hypot(noise_share(s.energy_j, norm)))
                 .collect();
             for (source, _) in patch.sources.iter().zip(&is_odd).filter(|(_, odd)| **odd) {
-                count += 1;
-                for j in pixels(&camera.y, source.at[1], reach, &patch.y) {
-                    for i in pixels(&camera.x, source.at[0], reach, &patch.x) {
-                        patch.weight[(j - patch.y.start) * patch.x.len() + i - patch.x.start] = 0.0;
-                    }
+                found.push(Odd {
+                    frame: patch.frame,
+                    at: source.at,
+                });
+                for p in patch.near(camera, source.at, reach) {
+                    patch.weight[p] = 0.0;
                 }
             }
             let mut odd = is_odd.iter();
             patch.sources.retain(|_| !odd.next().expect("one flag a source"));
         }
         self.patches.retain(|p| !p.sources.is_empty());
-        count
-    }
-
-    /// Inverse prior variances of the coefficients: three times what the template has at that distance, fading at the edge.
-    fn prior(&self, is_first: bool) -> Vec<f64> {
-        let model = &self.model;
-        let n = model.n;
-        let peak = model.coefficients[..n * n].iter().fold(0.0f64, |a, b| a.max(b.abs()));
-        let rings = n / 2 + 2;
-        let ring = |j: usize, i: usize| (model.knot(i).hypot(model.knot(j)) / model.knot_m) as usize;
-        let (mut sum, mut count) = (vec![0.0; rings * 2], vec![0.0; rings * 2]);
-        for j in 0..n {
-            for i in 0..n {
-                sum[ring(j, i)] += model.coefficients[j * n + i].powi(2);
-                count[ring(j, i)] += 1.0;
-            }
-        }
-        let floor = if is_first { 0.03 } else { 1e-3 } * peak;
-        let edge = model.radius_m();
-        let mut prior = Vec::with_capacity(model.coefficients.len());
-        for c in 0..model.components() {
-            let (_, m) = model.block(c);
-            let margin = (n - m) / 2;
-            let reach = edge - margin as f64 * model.knot_m;
-            for j in 0..m {
-                for i in 0..m {
-                    let (j, i) = (j + margin, i + margin);
-                    let k = ring(j, i);
-                    let rms = (sum[k] / f64::max(count[k], 1.0)).sqrt();
-                    let std = floor.max(3.0 * rms) * if c > 0 { 0.5 } else { 1.0 };
-                    let out = model.knot(i).hypot(model.knot(j));
-                    let t = ((reach - out) / (TAPER * reach)).clamp(0.02, 1.0);
-                    prior.push(1.0 / (std * t * t * (3.0 - 2.0 * t)).powi(2));
-                }
-            }
-        }
-        prior
+        found
     }
 
     /// One step of the template and of everything else at once.
     pub fn step(&mut self, is_first: bool) {
         let (camera, model) = (self.camera, &self.model);
-        let prior = self.prior(is_first);
+        let prior = constraints::prior(model, is_first);
         let linear: Vec<(&Patch, Linearised)> = self
             .patches
             .par_iter()
@@ -337,7 +306,7 @@ impl<'a> Learner<'a> {
         drop(linear);
         let mut model = self.model.clone();
         model.coefficients.iter_mut().zip(&step).for_each(|(c, s)| *c += s);
-        let shift = centre(&mut model, camera.spot_sigma_m);
+        let shift = constraints::centre(&mut model, camera.spot_sigma_m);
         let light = model.normalise();
         for patch in &mut self.patches {
             for source in &mut patch.sources {
@@ -352,30 +321,9 @@ impl<'a> Learner<'a> {
 
     /// Whether light at the edge of the support matters, and there is room for more.
     fn is_cut_short(&self) -> bool {
-        let model = &self.model;
-        let n = model.n;
-        let brightest = self
-            .patches
-            .iter()
-            .flat_map(|p| &p.sources)
-            .map(|s| s.energy_j)
-            .fold(0.0, f64::max);
-        // By octants: a tail may point one way, and the mean of many splines is free of their noise.
-        let (mut sum, mut count) = ([0.0f64; 8], [0.0f64; 8]);
-        for j in 0..n {
-            for i in 0..n {
-                let (x, y) = (model.knot(i), model.knot(j));
-                if (0.6..0.8).contains(&(x.hypot(y) / model.radius_m())) {
-                    let octant = usize::from(x > 0.0) + 2 * usize::from(y > 0.0) + 4 * usize::from(x.abs() > y.abs());
-                    sum[octant] += model.coefficients[j * n + i];
-                    count[octant] += 1.0;
-                }
-            }
-        }
-        let means = sum.iter().zip(count).map(|(s, c)| s.abs() / c.max(1.0));
-        let pixel = self.camera.x.pitch_m * self.camera.y.pitch_m / model.knot_m.powi(2);
-        let per_pixel = pixel * means.fold(0.0, f64::max);
-        per_pixel * brightest > EDGE_LIGHT * self.noise_j
+        let energies = self.patches.iter().flat_map(|p| &p.sources).map(|s| s.energy_j);
+        let brightest = energies.fold(0.0, f64::max);
+        constraints::light_at_edge(self.camera, &self.model) * brightest > EDGE_LIGHT * self.noise_j
     }
 
     /// Rounds until χ² settles; the support grows while there is light at its edge.
@@ -390,8 +338,10 @@ impl<'a> Learner<'a> {
             if round >= 2 && round % 2 == 0 && self.find_missing() > 0 {
                 self.fit(8);
             }
-            if round >= 2 {
-                self.mask_odd();
+            // From the start: two spots in one bend the template, and places that follow it lock to the pixels.
+            self.mask_odd();
+            if self.patches.is_empty() {
+                return;
             }
             let chi2 = self.reduced_chi2();
             progress(Round {
@@ -437,105 +387,4 @@ impl<'a> Learner<'a> {
             .for_each(|patch| patch.fit(camera, model, 15));
         other
     }
-
-    /// Standard deviation of most pixels' weighted residuals, 1 where the noise is as assumed.
-    pub fn residual_scale(&self) -> f64 {
-        let (camera, model) = (self.camera, &self.model);
-        let magnitudes = self.patches.iter().flat_map(|patch| {
-            let expected = patch.expected(camera, model).into_iter().zip(&patch.data);
-            let weighted = expected.zip(&patch.weight).filter(|(_, w)| **w > 0.0);
-            weighted.map(|((e, d), w)| ((d - e) * w).abs()).collect::<Vec<f64>>()
-        });
-        // A median magnitude is 0.6745 standard deviations of a Gaussian.
-        median(magnitudes.collect()).map_or(1.0, |m| m / 0.6745).max(1e-6)
-    }
-
-    /// Matched signal-to-noise ratio of all spots together.
-    pub fn information(&self) -> f64 {
-        let energies = self.patches.iter().flat_map(|p| &p.sources).map(|s| s.energy_j.powi(2));
-        energies.sum::<f64>().sqrt() * norm(self.camera, &self.model) / self.noise_j
-    }
-
-    /// Signal-to-noise ratio of the brightest pixel of a spot in the middle of a pixel: median and largest over the spots.
-    pub fn peak_snr(&self) -> [f64; 2] {
-        let model = &self.model;
-        let peak = model.coefficients[..model.n * model.n]
-            .iter()
-            .fold(0.0f64, |a, b| a.max(*b));
-        let pixel = self.camera.x.pitch_m * self.camera.y.pitch_m / model.knot_m.powi(2);
-        let energies: Vec<f64> = self
-            .patches
-            .iter()
-            .flat_map(|p| &p.sources)
-            .map(|s| s.energy_j)
-            .collect();
-        let largest = energies.iter().copied().fold(0.0, f64::max);
-        [median(energies).unwrap_or(0.0), largest].map(|e| e * (peak * pixel).min(1.0) / self.noise_j)
-    }
-}
-
-/// Default number of rounds.
-pub const MOST_ROUNDS: usize = ROUNDS;
-
-fn source(peak: &Peak) -> Source {
-    Source {
-        at: peak.at,
-        energy_j: peak.energy_j,
-    }
-}
-
-fn peak(source: &Source) -> Peak {
-    Peak {
-        at: source.at,
-        energy_j: source.energy_j,
-    }
-}
-
-fn pixels(axis: &crate::optics::Axis, at: f64, reach: f64, within: &std::ops::Range<usize>) -> std::ops::Range<usize> {
-    let near = super::template_model::pixels_within(axis, at, reach);
-    near.start.max(within.start)..near.end.min(within.end)
-}
-
-/// √Σ over the pixels of a unit-energy spot's square, about.
-pub fn norm(camera: &Camera, model: &TemplateModel) -> f64 {
-    let n = model.n;
-    let area = model.knot_m.powi(2) / (camera.x.pitch_m * camera.y.pitch_m);
-    (model.coefficients[..n * n].iter().map(|c| c * c).sum::<f64>() / area).sqrt()
-}
-
-/// Brings the centroid under a Gaussian window to zero, to first order in the shift; returns the shift of places with the given field
-/// values, m.
-fn centre(model: &mut TemplateModel, sigma_m: f64) -> impl Fn(&[f64]) -> [f64; 2] + use<> {
-    let n = model.n;
-    let window = |x: f64, y: f64| (-0.5 * (x * x + y * y) / (sigma_m * sigma_m)).exp();
-    let mut shifts = vec![[0.0; 2]; model.components()];
-    let mut rate = 0.0;
-    for (c, shift) in shifts.iter_mut().enumerate() {
-        let (start, m) = model.block(c);
-        let margin = (n - m) / 2;
-        for (k, value) in model.coefficients[start..start + m * m].iter().enumerate() {
-            let (x, y) = (model.knot(k % m + margin), model.knot(k / m + margin));
-            let w = window(x, y) * value;
-            shift[0] += w * x;
-            shift[1] += w * y;
-            if c == 0 {
-                rate += w * (1.0 - 0.5 * (x * x + y * y) / (sigma_m * sigma_m));
-            }
-        }
-    }
-    shifts.iter_mut().flatten().for_each(|s| *s /= rate);
-    let first = model.coefficients[..n * n].to_vec();
-    let at = |j: usize, i: usize| if j < n && i < n { first[j * n + i] } else { 0.0 };
-    let (h, components) = (model.knot_m, model.components());
-    for c in 0..components {
-        let (start, m) = model.block(c);
-        let margin = (n - m) / 2;
-        for k in 0..m * m {
-            let (j, i) = (k / m + margin, k % m + margin);
-            let along_x = (at(j, i + 1) - at(j, i.wrapping_sub(1))) / (2.0 * h);
-            let along_y = (at(j + 1, i) - at(j.wrapping_sub(1), i)) / (2.0 * h);
-            model.coefficients[start + k] += shifts[c][0] * along_x + shifts[c][1] * along_y;
-        }
-    }
-    move |values: &[f64]| std::array::from_fn(|k| shifts.iter().zip(values).map(|(s, p)| s[k] * p).sum())
 }

@@ -1,8 +1,10 @@
 //! Learns the spot's shape over the field, the noise and the pixel maps from frames whose positions nobody knows.
 
+mod constraints;
 mod coverage;
 mod detection;
 mod error;
+mod flashes;
 mod grouping;
 mod learn;
 mod patch;
@@ -60,6 +62,8 @@ pub struct Learned {
     pub noise_std_j: f64,
     pub gain_j: Option<f64>,
     pub bad_pixels: usize,
+    /// Whether the pixel maps explain the held-out frames better than the camera's, or name bad pixels that those do not.
+    pub are_pixels_better: bool,
     /// Pixels that were hot in a single frame, over all frames.
     pub flashes: usize,
     /// Relative scatter of the gains, none where no gain map helps.
@@ -76,12 +80,12 @@ impl Learned {
     /// Whether anything is better than what the camera says now.
     pub fn is_better(&self, camera: &Camera) -> bool {
         let noise = (self.noise_std_j / camera.noise_std_j).ln().abs() > NOISE_CHANGE;
-        self.is_shape_better || noise || self.bad_pixels > 0 || self.gain_scatter.is_some()
+        self.is_shape_better || noise || self.are_pixels_better
     }
 }
 
-/// Change of the noise that is worth a calibration: 2 % is within what a hundred frames measure.
-const NOISE_CHANGE: f64 = 0.02;
+/// Change of the noise that is worth a calibration: 3 % is within what sixty frames of overlapping spots measure.
+const NOISE_CHANGE: f64 = 0.03;
 /// Fall of χ² that is more than chance.
 const BETTER: f64 = 30.0;
 
@@ -89,8 +93,9 @@ const BETTER: f64 = 30.0;
 const MOST_FRAMES: usize = 250;
 /// One frame in this many is held out.
 const HELD_OUT: usize = 5;
-/// Misfit of the final template beyond which spots have no common shape.
+/// Misfit of most spots in training, and of all that are not odd on the held-out frames, beyond which spots have no common shape.
 const UNLIKE: f64 = 0.25;
+const UNEXPLAINED: f64 = 0.05;
 
 /// Progress of the learning.
 #[derive(Clone, Copy, Debug)]
@@ -113,8 +118,19 @@ pub fn learn(
     let step = frames.len().div_ceil(MOST_FRAMES);
     let chosen: Vec<(usize, &Array2<f64>)> = frames.iter().step_by(step).copied().collect();
     let mut prepared = prepare::prepare(camera, &chosen);
+    check_pixels(&prepared, &chosen)?;
+    // Each pass shows what the flashes that it masks have hidden.
+    for _ in 0..FLASH_PASSES {
+        let mut first = Learner::new(camera, &prepared.images, prepared.noise_j);
+        first.fit(15);
+        let flashes = first.mask_flashes();
+        if flashes.is_empty() {
+            break;
+        }
+        prepared.mask_flashes(&flashes);
+    }
+    let is_held = |k: usize| k % HELD_OUT == HELD_OUT / 2;
     let split = |images: &[Image]| -> (Vec<Image>, Vec<Image>) {
-        let is_held = |k: usize| k % HELD_OUT == HELD_OUT / 2;
         let part = |held: bool| {
             let images = images.iter().enumerate().filter(|(k, _)| is_held(*k) == held);
             images.map(|(_, image)| image.clone()).collect()
@@ -123,6 +139,7 @@ pub fn learn(
     };
     let (train, _) = split(&prepared.images);
     let mut learner = Learner::new(camera, &train, prepared.noise_j);
+    let detected = Coverage::of(&learner);
     check_spots(&learner, &prepared, chosen.len())?;
     let mut run = |learner: &mut Learner, rounds: usize, stage: &'static str| {
         learner.run(rounds, &mut |r| {
@@ -138,23 +155,32 @@ pub fn learn(
     let coverage = Coverage::of(&learner);
     check_spots(&learner, &prepared, chosen.len())?;
     let needed = Coverage::needed(camera);
+    // Places that were spread over the pixel and are not any more follow a template that is none.
+    let unexplained = statistics::unexplained(&learner);
+    let is_locked = coverage.phases < needed && detected.phases >= needed && unexplained > UNEXPLAINED;
+    if learner.misfit > UNLIKE || is_locked {
+        return Err(Error::NotAlike {
+            share: 100.0 * learner.misfit.max(unexplained),
+        });
+    }
     if coverage.phases < needed {
         return Err(Error::Phases {
             covered: coverage.phases,
             needed,
         });
     }
-    if learner.misfit > UNLIKE {
-        return Err(Error::NotAlike {
-            share: 100.0 * learner.misfit,
-        });
-    }
 
     // The first estimate of the noise counts some of the spots' light; what the shape leaves does not.
-    let (model, misfit, factor) = (learner.model.clone(), learner.misfit, learner.residual_scale());
+    let (model, misfit, factor) = (
+        learner.model.clone(),
+        learner.misfit,
+        statistics::residual_scale(&learner),
+    );
     drop(learner);
     prepared.scale_noise(factor);
     let noise_j = prepared.noise_j;
+    let flashes = Learner::with_model(camera, &prepared.images, noise_j, &model, misfit).mask_flashes();
+    prepared.mask_flashes(&flashes);
     let (train, held) = split(&prepared.images);
     let mut learner = Learner::with_model(camera, &train, noise_j, &model, misfit);
 
@@ -179,12 +205,19 @@ pub fn learn(
         }
     }
 
+    // Of a shape that changes over the field, the same one everywhere left some light in the noise.
+    let factor = statistics::residual_scale(&learner);
+    let (mut model, misfit) = (learner.model, learner.misfit);
+    prepared.scale_noise(factor);
+    let noise_j = prepared.noise_j;
+
     // Pixel maps, from all frames with the shape held fixed.
-    let mut model = learner.model.clone();
-    let misfit = learner.misfit;
-    let all = Learner::with_model(camera, &prepared.images, noise_j, &model, misfit);
-    let maps = pixel_maps::estimate(&all, &prepared);
-    drop((learner, all));
+    let mut all = Learner::with_model(camera, &prepared.images, noise_j, &model, misfit);
+    let odd = all.mask_odd();
+    all.fit(6);
+    let pixels = pixel_maps::estimate(&all, &odd, &prepared.hot, is_held, BETTER);
+    let maps = pixels.maps;
+    drop(all);
     let images = match &maps {
         Some(maps) => prepare::corrected(&prepared.images, maps),
         None => prepared.images.clone(),
@@ -198,31 +231,35 @@ pub fn learn(
 
     // The held-out frames decide.
     let mut after = Learner::with_model(camera, &held, noise_j, &model, misfit);
-    let odd_held = after.mask_odd();
+    let odd_held = after.mask_odd().len();
     after.fit(6);
     let count = terms::needed(&after);
     let after = after.refitted(terms::truncated(camera, &model, count));
-    let gaussian =
-        TemplateModel::gaussian(camera, model.knot_m, learn::FIRST_RADIUS * camera.spot_sigma_m).widened_to(&model);
-    let before = after.refitted(gaussian);
+    let before = after.refitted(TemplateModel::of_camera(camera, &model));
     let fit = |learner: &Learner| Fit {
         chi2: learner.patches.iter().map(|p| p.chi2).sum(),
         degrees_of_freedom: learner.patches.iter().map(|p| p.degrees_of_freedom()).sum(),
     };
     let (before_fit, after_fit) = (fit(&before), fit(&after));
+    let unexplained = statistics::unexplained(&after);
+    if unexplained > UNEXPLAINED || odd_held > after.sources() {
+        return Err(Error::NotAlike {
+            share: 100.0 * unexplained,
+        });
+    }
     let is_shape_better = before_fit.chi2 - after_fit.chi2 > BETTER;
     let judged = if is_shape_better { &after } else { &before };
     let variance = statistics::variance(judged);
-    let residuals = [&before, &after].map(|l| statistics::mean_residual(l, learn::norm(camera, &model)));
+    let residuals = [&before, &after].map(|l| statistics::mean_residual(l, constraints::norm(camera, &model)));
     drop((after, before));
 
     // What is written is learned from all frames.
     let mut last = Learner::with_model(camera, &images, noise_j, &model, misfit);
     run(&mut last, LAST_ROUNDS, "all frames");
-    let information = last.information();
+    let information = statistics::information(&last);
     let template = terms::truncated(camera, &last.model, count).template();
     let shape = SpotShape::from_template(&template, ROUNDING).expect("a normalised template has light");
-    let peak_snr = last.peak_snr();
+    let peak_snr = statistics::peak_snr(&last);
     let spots = last.sources();
     let spot_error = variance
         .spot_error
@@ -236,7 +273,10 @@ pub fn learn(
             camera.spot_sigma_m
         },
         spot_growth: if is_shape_better { 0.0 } else { camera.spot_growth },
-        spot_shape: is_shape_better.then(|| Arc::new(shape.clone())),
+        spot_shape: match is_shape_better {
+            true => Some(Arc::new(shape.clone())),
+            false => camera.spot_shape.clone(),
+        },
         spot_error: Some(spot_error),
         noise_std_j: variance.read_noise_j,
         pixels: maps.clone().map(Arc::new),
@@ -256,6 +296,7 @@ pub fn learn(
         bad_pixels: maps
             .as_ref()
             .map_or(0, |m: &PixelMaps| m.bad.iter().filter(|b| **b).count()),
+        are_pixels_better: pixels.are_better,
         flashes: prepared.flashes,
         gain_scatter,
         saturation_j: prepared.saturation_j,
@@ -267,6 +308,7 @@ pub fn learn(
     })
 }
 
+const FLASH_PASSES: usize = 3;
 /// Degrees that are tried in turn while the held-out frames gain by them.
 const FIELD_DEGREES: [usize; 3] = [2, 3, 4];
 const FIELD_ROUNDS: usize = 4;
@@ -274,6 +316,17 @@ const AGAIN_ROUNDS: usize = 4;
 const LAST_ROUNDS: usize = 3;
 /// Tolerance of the separable terms of a template that has few already.
 const ROUNDING: f64 = 1e-6;
+
+fn check_pixels(prepared: &prepare::Prepared, frames: &[(usize, &Array2<f64>)]) -> Result<(), Error> {
+    let is_finite = frames.iter().any(|(_, pixels)| pixels.iter().any(|v| v.is_finite()));
+    if !is_finite {
+        return Err(Error::NotFinite { frames: frames.len() });
+    }
+    if prepared.noise_j <= f64::MIN_POSITIVE {
+        return Err(Error::NoNoise { frames: frames.len() });
+    }
+    Ok(())
+}
 
 fn check_spots(learner: &Learner, prepared: &prepare::Prepared, frames: usize) -> Result<(), Error> {
     let spots = learner.sources();

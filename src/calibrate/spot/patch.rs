@@ -4,7 +4,7 @@ use std::ops::Range;
 
 use faer::Mat;
 
-use super::template_model::{Band, Scratch, TemplateModel, adjoint, forward};
+use super::template_model::{Band, Scratch, TemplateModel, adjoint, forward, pixels_within};
 use crate::calibrate::exposure::ScaledCholesky;
 use crate::optics::Camera;
 
@@ -34,6 +34,8 @@ pub struct Patch {
 
 /// Parameters a source: x, y, energy.
 const PER_SOURCE: usize = 3;
+/// Half-width of the square within which a source's misfit is measured, σ.
+const MISFIT_REACH: f64 = 3.0;
 
 /// The weighted Jacobian of a patch by its own parameters, and what the template needs at its present places.
 pub struct Linearised {
@@ -177,6 +179,33 @@ impl Patch {
             bands: all_bands,
             field_values,
         })
+    }
+
+    /// Indices of the pixels within `reach_m` of a place along both axes.
+    pub fn near(&self, camera: &Camera, at: [f64; 2], reach_m: f64) -> Vec<usize> {
+        let (nx, x0, y0) = (self.x.len(), self.x.start, self.y.start);
+        let within = |near: Range<usize>, range: &Range<usize>| near.start.max(range.start)..near.end.min(range.end);
+        let columns = within(pixels_within(&camera.x, at[0], reach_m), &self.x);
+        let rows = within(pixels_within(&camera.y, at[1], reach_m), &self.y);
+        rows.flat_map(|j| columns.clone().map(move |i| (j - y0) * nx + i - x0))
+            .collect()
+    }
+
+    /// Misfit of each source: √(excess of χ² within a few widths over the spot's own).
+    pub fn misfits(&self, camera: &Camera, model: &TemplateModel) -> Vec<f64> {
+        let expected = self.expected(camera, model);
+        let of = |source: &Source| {
+            let (mut excess, mut own) = (0.0, 0.0);
+            for p in self.near(camera, source.at, MISFIT_REACH * camera.spot_sigma_m) {
+                let w = self.weight[p];
+                if w > 0.0 {
+                    excess += ((self.data[p] - expected[p]) * w).powi(2) - 1.0;
+                    own += ((expected[p] - self.background) * w).powi(2);
+                }
+            }
+            (excess.max(0.0) / own.max(1.0)).sqrt()
+        };
+        self.sources.iter().map(of).collect()
     }
 
     /// Levenberg–Marquardt (Marquardt, 1963) on places, energies and background with the template held fixed.

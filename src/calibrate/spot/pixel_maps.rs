@@ -1,52 +1,151 @@
 //! Gain, dark level and bad pixels of frames whose spots were learned.
 
 use ndarray::Array2;
+use rayon::prelude::*;
 
-use super::learn::Learner;
-use super::prepare::Prepared;
+use super::learn::{Learner, Odd};
+use super::patch::Patch;
+use super::template_model::pixels_within;
 use crate::calibrate::maps::{self, Pixels};
 use crate::optics::PixelMaps;
 
-/// Gains and dark levels that scatter by less than this, relative and in σ, are left alone: what the maps gain is below the noise of a
-/// hundred frames.
-const LEAST_GAIN: f64 = 2e-3;
-const LEAST_DARK: f64 = 0.05;
-
-/// Pixel maps, none where the pixels are alike.
-pub fn estimate(learner: &Learner, prepared: &Prepared) -> Option<PixelMaps> {
-    let camera = learner.camera;
-    let (ny, nx) = camera.shape();
-    let mut expected: Vec<Vec<f64>> = learner.images.iter().map(|i| vec![i.level; i.pixels.len()]).collect();
-    for patch in &learner.patches {
-        let values = patch.expected(camera, &learner.model);
-        for (row, line) in patch.y.clone().zip(values.chunks_exact(patch.x.len())) {
-            let start = row * nx + patch.x.start;
-            expected[patch.frame][start..start + line.len()].copy_from_slice(line);
-        }
-    }
-    let frames = learner.images.iter().zip(&expected).map(|(image, ideal)| Pixels {
-        ideal: ideal.clone(),
-        recorded: &image.pixels,
-        used: image.weight.iter().map(|w| *w > 0.0).collect(),
-    });
-    let mut found = maps::estimate_from((ny, nx), learner.noise_j, frames)?;
-    for p in &prepared.hot {
-        found.bad[(p / nx, p % nx)] = true;
-    }
-    let n = (ny * nx) as f64;
-    let dark = (found.dark_j.iter().map(|d| d * d).sum::<f64>() / n).sqrt();
-    if gain_scatter(&found).is_none() {
-        found.gain = Array2::ones((ny, nx));
-    }
-    if dark < LEAST_DARK * learner.noise_j {
-        found.dark_j = Array2::zeros((ny, nx));
-    }
-    let is_ideal = found == PixelMaps::ideal((ny, nx));
-    (!is_ideal).then_some(found)
+/// Pixel maps that a recording leads to.
+pub struct Found {
+    /// None where the pixels are alike.
+    pub maps: Option<PixelMaps>,
+    /// Whether they are better than the camera's.
+    pub are_better: bool,
 }
 
-/// Relative scatter of the gains; none below what counts.
+/// The camera's maps with what is better: gains and dark levels are replaced where those of the other frames lower the χ² of the
+/// held-out ones by more than `better`. `odd` are spots that the learner's template does not explain: what it leaves there says
+/// nothing about the pixels. `hot` are pixels known to be bad.
+pub fn estimate(
+    learner: &Learner,
+    odd: &[Odd],
+    hot: &[usize],
+    is_held: impl Fn(usize) -> bool + Sync,
+    better: f64,
+) -> Found {
+    let shape = learner.camera.shape();
+    let ideal = PixelMaps::ideal(shape);
+    let own = learner.camera.pixels.as_deref().unwrap_or(&ideal);
+    let frames = expected(learner, odd);
+    let from = |frames: Vec<Pixels>| maps::estimate_from(shape, learner.noise_j, frames.into_iter());
+    let indexed = frames.iter().enumerate();
+    let others = indexed.filter(|(k, _)| !is_held(*k)).map(|(_, f)| f.clone()).collect();
+    let (Some(trial), Some(mut found)) = (from(others), from(frames)) else {
+        return Found {
+            maps: learner.camera.pixels.as_deref().cloned(),
+            are_better: false,
+        };
+    };
+    let nx = learner.camera.x.n;
+    hot.iter().for_each(|p| found.bad[(p / nx, p % nx)] = true);
+    found.bad.zip_mut_with(&own.bad, |new, old| *new |= *old);
+
+    // Bad pixels are left out of every sum.
+    let held: Vec<Patch> = learner.patches.iter().filter(|p| is_held(p.frame)).cloned().collect();
+    let chi2 = |gain: &Array2<f64>, dark_j: &Array2<f64>| {
+        let maps = PixelMaps {
+            gain: gain.clone(),
+            dark_j: dark_j.clone(),
+            bad: found.bad.clone(),
+        };
+        chi2(learner, &held, &maps)
+    };
+    let least = chi2(&own.gain, &own.dark_j);
+    let with_dark = chi2(&own.gain, &trial.dark_j);
+    let has_dark = least - with_dark > better;
+    let (dark_j, least) = match has_dark {
+        true => (&trial.dark_j, with_dark),
+        false => (&own.dark_j, least),
+    };
+    let has_gain = least - chi2(&trial.gain, dark_j) > better;
+    if !has_gain {
+        found.gain = own.gain.clone();
+    }
+    if !has_dark {
+        found.dark_j = own.dark_j.clone();
+    }
+    let are_better = has_gain || has_dark || found.bad != own.bad;
+    Found {
+        maps: (found != ideal).then_some(found),
+        are_better,
+    }
+}
+
+/// What each frame would be if all pixels were alike; pixels around odd spots are not used.
+fn expected<'a>(learner: &'a Learner, odd: &[Odd]) -> Vec<Pixels<'a>> {
+    let camera = learner.camera;
+    let nx = camera.x.n;
+    let mut frames: Vec<Pixels> = learner
+        .images
+        .iter()
+        .map(|image| Pixels {
+            ideal: vec![image.level; image.pixels.len()],
+            recorded: &image.pixels,
+            used: image.weight.iter().map(|w| *w > 0.0).collect(),
+        })
+        .collect();
+    for patch in &learner.patches {
+        let values = patch.expected(camera, &learner.model);
+        let frame = &mut frames[patch.frame];
+        for (row, line) in patch.y.clone().zip(values.chunks_exact(patch.x.len())) {
+            let start = row * nx + patch.x.start;
+            frame.ideal[start..start + line.len()].copy_from_slice(line);
+        }
+    }
+    let reach = learner.model.radius_m();
+    for odd in odd {
+        let columns = pixels_within(&camera.x, odd.at[0], reach);
+        for j in pixels_within(&camera.y, odd.at[1], reach) {
+            frames[odd.frame].used[j * nx + columns.start..j * nx + columns.end].fill(false);
+        }
+    }
+    leave_out_flashes(learner, &mut frames);
+    frames
+}
+
+/// Samples this many σ and this share of the light away are outliers. Where a pixel has few of them, they are not its own doing.
+const OUTLIER: f64 = 6.0;
+const OUTLIER_SHARE: f64 = 0.1;
+const FEW: f64 = 0.1;
+
+fn leave_out_flashes(learner: &Learner, frames: &mut [Pixels]) {
+    for p in 0..frames.first().map_or(0, |f| f.used.len()) {
+        let used = frames.iter().filter(|f| f.used[p]).count();
+        let is_outlier = |k: usize, frame: &Pixels| {
+            let light = frame.ideal[p] - learner.images[k].level;
+            (frame.recorded[p] - frame.ideal[p]).abs() > OUTLIER * learner.noise_j + OUTLIER_SHARE * light.abs()
+        };
+        let indexed = frames.iter().enumerate().filter(|(_, f)| f.used[p]);
+        let outliers: Vec<usize> = indexed.filter(|(k, f)| is_outlier(*k, f)).map(|(k, _)| k).collect();
+        if outliers.len() as f64 <= (FEW * used as f64).max(1.0) {
+            outliers.into_iter().for_each(|k| frames[k].used[p] = false);
+        }
+    }
+}
+
+/// χ² of patches whose pixels are corrected by maps, with their places, energies and backgrounds fitted again.
+fn chi2(learner: &Learner, patches: &[Patch], maps: &PixelMaps) -> f64 {
+    let one = |patch: &Patch| {
+        let mut patch = patch.clone();
+        let nx = patch.x.len();
+        for (k, (value, weight)) in patch.data.iter_mut().zip(&mut patch.weight).enumerate() {
+            let at = (patch.y.start + k / nx, patch.x.start + k % nx);
+            *value = (*value - maps.dark_j[at]) / maps.gain[at];
+            *weight *= if maps.bad[at] { 0.0 } else { maps.gain[at] };
+        }
+        patch.fit(learner.camera, &learner.model, 6);
+        patch.chi2
+    };
+    patches.par_iter().map(one).sum()
+}
+
+/// Relative scatter of the gains; none where they are alike.
 pub fn gain_scatter(maps: &PixelMaps) -> Option<f64> {
-    let scatter = (maps.gain.iter().map(|g| (g - 1.0).powi(2)).sum::<f64>() / maps.gain.len() as f64).sqrt();
-    (scatter > LEAST_GAIN).then_some(scatter)
+    let n = maps.gain.len() as f64;
+    let scatter = (maps.gain.iter().map(|g| (g - 1.0).powi(2)).sum::<f64>() / n).sqrt();
+    (scatter > 0.0).then_some(scatter)
 }

@@ -29,6 +29,12 @@ pub struct Prepared {
 }
 
 impl Prepared {
+    /// Takes pixels of single images, by their indices, out of use.
+    pub fn mask_flashes(&mut self, flashes: &[(usize, usize)]) {
+        self.flashes += flashes.len();
+        flashes.iter().for_each(|(k, p)| self.images[*k].weight[*p] = 0.0);
+    }
+
     /// Replaces the noise by `factor` times what it was taken for.
     pub fn scale_noise(&mut self, factor: f64) {
         self.noise_j *= factor;

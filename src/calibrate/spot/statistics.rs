@@ -3,8 +3,10 @@
 use faer::Mat;
 use ndarray::Array2;
 
-use super::learn::{Learner, norm};
+use super::constraints::norm;
+use super::learn::Learner;
 use crate::calibrate::exposure::ScaledCholesky;
+use crate::stats::median;
 
 /// Rings around spots, σ, within each of which the template's error is measured.
 const RINGS: [f64; 6] = [0.0, 1.5, 3.0, 5.0, 8.0, 12.0];
@@ -168,4 +170,56 @@ pub fn mean_residual(learner: &Learner, norm: f64) -> Array2<f64> {
     }
     sum.zip_mut_with(&weight, |s, w| *s = if *w > 0.0 { *s / w / norm } else { 0.0 });
     sum
+}
+
+/// Standard deviation of most pixels' weighted residuals, 1 where the noise is as assumed.
+pub fn residual_scale(learner: &Learner) -> f64 {
+    let (camera, model) = (learner.camera, &learner.model);
+    let magnitudes = learner.patches.iter().flat_map(|patch| {
+        let expected = patch.expected(camera, model).into_iter().zip(&patch.data);
+        let weighted = expected.zip(&patch.weight).filter(|(_, w)| **w > 0.0);
+        weighted.map(|((e, d), w)| ((d - e) * w).abs()).collect::<Vec<f64>>()
+    });
+    // A median magnitude is 0.6745 standard deviations of a Gaussian.
+    median(magnitudes.collect()).map_or(1.0, |m| m / 0.6745).max(1e-6)
+}
+
+/// Matched signal-to-noise ratio of all spots together.
+pub fn information(learner: &Learner) -> f64 {
+    let energies = learner
+        .patches
+        .iter()
+        .flat_map(|p| &p.sources)
+        .map(|s| s.energy_j.powi(2));
+    energies.sum::<f64>().sqrt() * norm(learner.camera, &learner.model) / learner.noise_j
+}
+
+/// Signal-to-noise ratio of the brightest pixel of a spot in the middle of a pixel: median and largest over the spots.
+pub fn peak_snr(learner: &Learner) -> [f64; 2] {
+    let model = &learner.model;
+    let peak = model.coefficients[..model.n * model.n]
+        .iter()
+        .fold(0.0f64, |a, b| a.max(*b));
+    let pixel = learner.camera.x.pitch_m * learner.camera.y.pitch_m / model.knot_m.powi(2);
+    let energies: Vec<f64> = learner
+        .patches
+        .iter()
+        .flat_map(|p| &p.sources)
+        .map(|s| s.energy_j)
+        .collect();
+    let largest = energies.iter().copied().fold(0.0, f64::max);
+    [median(energies).unwrap_or(0.0), largest].map(|e| e * (peak * pixel).min(1.0) / learner.noise_j)
+}
+
+/// Share of the spots' light, root mean square over their pixels, that the template leaves unexplained beyond the noise.
+pub fn unexplained(learner: &Learner) -> f64 {
+    let (mut excess, mut own) = (0.0, 0.0);
+    for patch in &learner.patches {
+        let expected = patch.expected(learner.camera, &learner.model);
+        for ((e, d), w) in expected.iter().zip(&patch.data).zip(&patch.weight) {
+            excess += ((d - e) * w).powi(2) - f64::from(u8::from(*w > 0.0));
+            own += ((e - patch.background) * w).powi(2);
+        }
+    }
+    (excess.max(0.0) / own.max(1.0)).sqrt()
 }

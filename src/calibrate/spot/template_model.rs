@@ -2,7 +2,7 @@
 
 use ndarray::Array2;
 
-use crate::optics::spot::{Component, Field, FieldPolynomial, Template};
+use crate::optics::spot::{Component, Field, FieldPolynomial, LEGENDRE, Template};
 use crate::optics::{Axis, Camera};
 
 /// Unit-energy template Σ_c p_c(u, v)·T_c(x, y), p_0 = 1, the others products of Legendre polynomials.
@@ -38,6 +38,62 @@ impl TemplateModel {
             degree: 0,
             coefficients: coefficients.iter().map(|c| c / total).collect(),
         }
+    }
+
+    /// The spot that a camera assumes, its own shape or a Gaussian, on the knots of another model.
+    pub fn of_camera(camera: &Camera, like: &Self) -> Self {
+        let n = like.n;
+        let at = |sensor_m: [f64; 2]| {
+            let density = |x: f64, y: f64| match &camera.spot_shape {
+                Some(shape) => shape.density(sensor_m, [x, y]),
+                None => (-0.5 * (x.hypot(y) / camera.spot_sigma_at(sensor_m)).powi(2)).exp(),
+            };
+            // A little less, so that rounding adds no knot.
+            let template = Template::of_density(like.field, like.knot_m, like.radius_m() * (1.0 - 1e-9), density);
+            let mut values = template
+                .components
+                .into_iter()
+                .flat_map(|c| c.coefficients)
+                .collect::<Vec<f64>>();
+            let total: f64 = values.iter().sum();
+            values.iter_mut().for_each(|v| *v /= total);
+            values
+        };
+        let is_uniform = match &camera.spot_shape {
+            Some(shape) => shape.is_uniform(),
+            None => camera.spot_growth == 0.0,
+        };
+        if is_uniform {
+            return Self {
+                inner: 0,
+                degree: 0,
+                coefficients: at([0.0; 2]),
+                ..*like
+            };
+        }
+        // Projected on the Legendre polynomials by Gauss's quadrature, exact to the degree that a calibration may have.
+        let mut model = Self {
+            inner: n,
+            degree: MOST_DEGREE,
+            coefficients: vec![0.0; FieldPolynomial::length(MOST_DEGREE) * n * n],
+            ..*like
+        };
+        let half = model.field.half_sensor_m;
+        for (u, wu) in LEGENDRE {
+            for (v, wv) in LEGENDRE {
+                let values = at([u * half[0], v * half[1]]);
+                let blocks = model
+                    .coefficients
+                    .chunks_exact_mut(n * n)
+                    .zip(FieldPolynomial::powers());
+                for (block, (i, j)) in blocks {
+                    let norm = 0.25 * f64::from((2 * i + 1) * (2 * j + 1));
+                    let share = norm * wu * wv * legendre(i, u) * legendre(j, v);
+                    block.iter_mut().zip(&values).for_each(|(b, value)| *b += share * value);
+                }
+            }
+        }
+        model
     }
 
     pub fn radius_m(&self) -> f64 {
@@ -90,26 +146,6 @@ impl TemplateModel {
             inner: 0,
             degree: 0,
             coefficients,
-            ..*self
-        }
-    }
-
-    /// The same first component on the support of another model, whose knots are the same.
-    pub fn widened_to(&self, other: &Self) -> Self {
-        match other.n > self.n {
-            true => self.widened(other.n),
-            false => self.cropped(other.n),
-        }
-    }
-
-    fn cropped(&self, n: usize) -> Self {
-        let margin = (self.n - n) / 2;
-        let line = |j: usize| &self.coefficients[(j + margin) * self.n + margin..][..n];
-        Self {
-            n,
-            inner: 0,
-            degree: 0,
-            coefficients: (0..n).flat_map(line).copied().collect(),
             ..*self
         }
     }

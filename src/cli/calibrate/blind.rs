@@ -47,6 +47,9 @@ pub fn run(args: &Args, camera: &Camera) -> Outcome {
     let lines = report(camera, &learned);
     if !args.json {
         writeln!(out, "{}", lines.join("\n")).map_err(Failure::other)?;
+        if let Some(path) = &args.picture {
+            writeln!(out, "picture: {}", path.display()).map_err(Failure::other)?;
+        }
     }
     let is_better = learned.is_better(camera);
     if is_better {
@@ -73,7 +76,13 @@ pub fn run(args: &Args, camera: &Camera) -> Outcome {
     }
     match args.json {
         true => Ok(()),
-        false => writeln!(out, "written to {}", args.out.display()).map_err(Failure::other),
+        false => writeln!(
+            out,
+            "written to {}; to use it, name it in [optics] calibration of {}",
+            args.out.display(),
+            args.config.display()
+        )
+        .map_err(Failure::other),
     }
 }
 
@@ -136,11 +145,14 @@ fn report(camera: &Camera, l: &Learned) -> Vec<String> {
         degree => format!("changing over the sensor (degree {degree})"),
     };
     lines.push(format!(
-        "spot: as wide as a Gaussian of {:.4} mm ({:.3} pixels), {:.1} % of its light within 2 σ (a Gaussian: 86.5 %), {field}; {} separable terms",
+        "spot: as wide as a Gaussian of {:.4} mm ({:.3} pixels; the config: {:.4} mm), {:.1} % of its light within 2 σ (a Gaussian: 86.5 %), {field}; {} separable terms. \
+         Shares are of the light within {:.2} mm: what lies further out cannot be told from the background",
         1e3 * sigma,
         sigma / pitch,
+        1e3 * camera.spot_sigma_m,
         100.0 * shape.encircled_energy([0.0; 2], 2.0 * sigma),
-        shape.terms()
+        shape.terms(),
+        1e3 * shape.radius_m()
     ));
     lines.push(format!(
         "held-out frames: reduced χ² {:.4} with the config's spot, {:.4} with the learned one{}",
@@ -198,6 +210,7 @@ fn object(args: &Args, camera: &Camera, l: &Learned) -> serde_json::Value {
             "terms": l.shape.terms(),
             "field_degree": l.field_degree,
             "sigma_equivalent_m": l.shape.sigma_equivalent_m(),
+            "reach_m": l.shape.radius_m(),
             "encircled_energy": radii.iter().map(|r| [*r, l.shape.encircled_energy([0.0; 2], *r)]).collect::<Vec<_>>(),
         },
         "spot_error": l.calibration.spot_error,

@@ -15,6 +15,8 @@ const REACH: f64 = 6.0;
 /// Weakest light that is drawn, share of the peak; colours are logarithmic.
 const FAINTEST: f64 = 1e-4;
 const FONT: (&str, u32) = ("sans-serif", 15);
+/// For a caption that is wider than its chart in [`FONT`].
+const SMALL: (&str, u32) = ("sans-serif", 11);
 
 /// An SVG text.
 pub fn draw(camera: &Camera, learned: &Learned) -> anyhow::Result<String> {
@@ -106,7 +108,7 @@ fn encircled(area: &Area, camera: &Camera, shape: &SpotShape, sigma: f64) -> any
     let pitch = camera.x.pitch_m;
     let widest = (10.0 * sigma).min(shape.radius_m());
     let mut chart = ChartBuilder::on(area)
-        .caption("Encircled energy: learned, Gaussian (grey)", FONT)
+        .caption("Encircled energy, share of the learned light (grey: Gaussian)", SMALL)
         .margin(6)
         .x_label_area_size(34)
         .y_label_area_size(40)
