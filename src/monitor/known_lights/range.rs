@@ -207,7 +207,9 @@ fn moments(values: impl Iterator<Item = f64>) -> (f64, f64) {
 fn energy_change(learned: &Learned, mean: f64, n: usize, allowed: f64) -> (f64, f64) {
     let noise = learned.variance_within / BLOCK_FRAMES as f64;
     let own = (learned.variance_between / (learned.variance_between + noise)).sqrt();
-    let [low, high] = learned.energy_j.map(|end| learned.ln_energy + own * (end.ln() - learned.ln_energy));
+    let [low, high] = learned
+        .energy_j
+        .map(|end| learned.ln_energy + own * (end.ln() - learned.ln_energy));
     let off = if mean > high {
         mean - high
     } else {
@@ -224,10 +226,17 @@ fn energy_change(learned: &Learned, mean: f64, n: usize, allowed: f64) -> (f64, 
     (off, 0.5 * (freedom + 1.0) * (t * t / freedom).ln_1p())
 }
 
-/// Chernoff's bound on the variance of n normal deviates: P(ratio beyond r) ≤ exp(−(n − 1)/2·(r − 1 − ln r)).
+/// Chernoff's bound on the variance of n normal deviates: P(ratio beyond r) ≤ exp(−(n − 1)/2·(r − 1 − ln r)). The ends of the range
+/// are those of blocks' variances, less what the noise of these adds to them.
 fn variance_change(learned: &Learned, variance: f64, n: usize) -> (f64, f64) {
     let floor = |v: f64| v.max(MIN_LN_STD * MIN_LN_STD);
-    let [low, high] = learned.ln_energy_std.map(|std| floor(std * std));
+    let middle = floor(learned.variance_within);
+    let noise = extreme_of_variances(learned.frames as f64 / BLOCK_FRAMES as f64);
+    let [low, high] = learned.ln_energy_std.map(|std| {
+        let off = (floor(std * std) / middle).ln();
+        let own = (off * off - noise * noise).max(0.0).sqrt();
+        middle * own.copysign(off).exp()
+    });
     let variance = floor(variance);
     let (ratio, beyond) = if variance > high {
         (variance / high, variance / high / VARIANCE_RATIO)
@@ -242,6 +251,16 @@ fn variance_change(learned: &Learned, variance: f64, n: usize) -> (f64, f64) {
         ),
         false => (ratio, 0.0),
     }
+}
+
+/// How far the largest (or smallest) of so many blocks' ln variances is from the middle where the light is steady: the mean of
+/// Gumbel's distribution, the limit for normal deviates; 0.1 of their standard deviation too large from 4 blocks to 40.
+fn extreme_of_variances(blocks: f64) -> f64 {
+    const EULER: f64 = 0.577_215_664_901_532_9;
+    let std = (2.0 / (INDEPENDENT * BLOCK_FRAMES as f64 - 1.0)).sqrt();
+    let log = blocks.max(2.0).ln();
+    let scale = 1.0 / (2.0 * log).sqrt();
+    std * (1.0 / scale + scale * (EULER - 0.5 * (4.0 * std::f64::consts::PI * log).ln()))
 }
 
 #[cfg(test)]
