@@ -94,8 +94,8 @@ pub async fn put(
     headers: HeaderMap,
     body: Result<Bytes, BytesRejection>,
 ) -> Result<Response, Problem> {
-    let unless_changed = wanted(&headers)?;
     let value: Value = body_of(&headers, body, LARGEST_BODY, &[MEDIA_TYPE, "application/json"])?;
+    let unless_changed = wanted(&headers)?;
     let zones = tokio::task::spawn_blocking(move || parse(&value))
         .await
         .expect("reading zones does not panic")?;
