@@ -2,7 +2,9 @@
 
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
-use utoipa::openapi::schema::{ArrayBuilder, KnownFormat, ObjectBuilder, OneOfBuilder, Schema, SchemaFormat, Type};
+use utoipa::openapi::schema::{
+    ArrayBuilder, KnownFormat, ObjectBuilder, OneOfBuilder, Schema, SchemaFormat, SchemaType, Type,
+};
 
 /// One line of the network's log.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, utoipa::ToSchema)]
@@ -173,7 +175,10 @@ fn user_schema() -> Schema {
 
 fn cov_schema() -> Schema {
     let two = || ArrayBuilder::new().min_items(Some(2)).max_items(Some(2));
-    let rows = two().items(two().items(number()));
+    // What is null counts as left out.
+    let rows = two()
+        .schema_type(SchemaType::from_iter([Type::Array, Type::Null]))
+        .items(two().items(number()));
     Schema::Array(rows.description(Some("Symmetric and not negative, m²")).build())
 }
 

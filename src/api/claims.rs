@@ -41,6 +41,7 @@ const CLAIMS_A_PLACE: usize = 500;
 #[serde(deny_unknown_fields)]
 pub struct ClaimsQuery {
     /// How the claims are written. Left out, the media type says: `text/csv` is "csv", XML is "cot", anything else "oapwatch"
+    #[param(inline)]
     format: Option<Format>,
 }
 

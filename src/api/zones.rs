@@ -94,12 +94,13 @@ pub async fn put(
     headers: HeaderMap,
     body: Result<Bytes, BytesRejection>,
 ) -> Result<Response, Problem> {
-    let unless_changed = wanted(&headers)?;
     let value: Value = body_of(&headers, body, LARGEST_BODY, &[MEDIA_TYPE, "application/json"])?;
     let zones = tokio::task::spawn_blocking(move || parse(&value))
         .await
         .expect("reading zones does not panic")?;
     check_webhooks(&state, &zones)?;
+    // Zones that cannot be used are refused as such, whatever was read before.
+    let unless_changed = wanted(&headers)?;
     let put = state.ask(|reply| Command::PutZones {
         zones,
         unless_changed,

@@ -110,7 +110,7 @@ async fn an_eavesdropper_comes_is_acknowledged_and_goes_and_a_restart_is_survive
         &format!("document.querySelector('{card} .thumbnail img').naturalWidth >= 256"),
     )
     .await;
-    page.eval(&format!("document.querySelector('{card} details').open = true"))
+    page.eval(&format!("document.querySelector('{card} details.numbers').open = true"))
         .await;
     until(
         &mut page,
@@ -118,6 +118,9 @@ async fn an_eavesdropper_comes_is_acknowledged_and_goes_and_a_restart_is_survive
         &format!("document.querySelector('{card} .fit img').naturalWidth > 3 * 512"),
     )
     .await;
+    page.eval("document.querySelector('.fit').scrollIntoView({ block: 'center' })")
+        .await;
+    page.screenshot("fit").await;
     until(
         &mut page,
         "the reader is warned of the simulator",

@@ -6,7 +6,7 @@ use oapwatch::frames::v4l2::{Bayer, PixelFormat};
 use oapwatch::scene::{Plan, Scene};
 
 use crate::output::Output;
-use crate::{CAPTURE, OUTPUT, Outcome, allow, camera, frame, source, start, v4l2_ctl, wait_for};
+use crate::{CAPTURE, OUTPUT, Outcome, allow_on, camera, frame, source, start, v4l2_ctl, wait_for};
 
 pub const SCENARIOS: &[(&str, fn(&PrometheusHandle) -> Outcome)] = &[
     ("bit-exact GREY", |_| round_trip(SINGLE, PixelFormat::GREY, 1)),
@@ -54,7 +54,7 @@ pub fn join(format: PixelFormat) -> Outcome {
 }
 
 fn join_nodes([capture, output]: [&str; 2], format: PixelFormat) -> Outcome {
-    allow(true)?;
+    allow_on(capture, true)?;
     let name = match format {
         PixelFormat::Y16_BE => "Y16 -BE".to_owned(),
         format => format!("{:4}", format.name()),

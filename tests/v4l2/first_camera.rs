@@ -28,8 +28,12 @@ const NOISE: f64 = 60.0;
 const IMAGES: u64 = 8;
 
 fn image(seed: u64) -> Vec<Vec<u8>> {
-    // Knuth's linear congruential generator, its upper bits as a number from -1 to 1.
-    let mut state = seed;
+    // Knuth's linear congruential generator, its upper bits as a number from -1 to 1. Streams that begin beside each other are not
+    // independent (some pixels would deviate alike in all images, as bad ones do): SplitMix64 spreads the seeds.
+    let mut state = seed.wrapping_add(1).wrapping_mul(0x9e37_79b9_7f4a_7c15);
+    state = (state ^ (state >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+    state = (state ^ (state >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+    state ^= state >> 31;
     let mut random = move || {
         state = state
             .wrapping_mul(6_364_136_223_846_793_005)

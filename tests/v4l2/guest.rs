@@ -68,13 +68,14 @@ fn main() -> ExitCode {
     }
 }
 
-/// Who may open the capture node: what udev decides elsewhere.
+/// Who may open the first camera's capture node: what udev decides elsewhere.
 pub fn allow(everybody: bool) -> Outcome {
+    allow_on(CAPTURE, everybody)
+}
+
+pub fn allow_on(node: &str, everybody: bool) -> Outcome {
     let mode = if everybody { 0o666 } else { 0o600 };
-    Ok(std::fs::set_permissions(
-        CAPTURE,
-        std::fs::Permissions::from_mode(mode),
-    )?)
+    Ok(std::fs::set_permissions(node, std::fs::Permissions::from_mode(mode))?)
 }
 
 /// Runs v4l2-ctl on a node.

@@ -161,8 +161,10 @@ impl LightRange {
             ..Change::default()
         };
         let Some(learned) = &self.learned else { return change };
-        for n in WINDOWS.into_iter().take_while(|n| *n <= self.recent.len()) {
-            let (mean, variance) = moments(self.recent.iter().rev().take(n).copied());
+        let newest: Vec<f64> = self.recent.iter().rev().copied().collect();
+        for window in WINDOWS.into_iter().filter_map(|n| newest.get(..n)) {
+            let n = window.len();
+            let (mean, _) = moments(window.iter().copied());
             let (off, energy) = energy_change(learned, mean - common, n, tolerated.ln());
             if energy >= change.energy {
                 (change.energy_ratio, change.energy) = (off.exp(), energy);
@@ -171,7 +173,7 @@ impl LightRange {
             if n == WINDOWS[0] {
                 continue;
             }
-            let (ratio, scintillation) = variance_change(learned, variance, n);
+            let (ratio, scintillation) = variance_change(learned, window);
             if scintillation >= change.scintillation {
                 (change.scintillation_ratio, change.scintillation) = (ratio, scintillation);
             }
@@ -226,10 +228,22 @@ fn energy_change(learned: &Learned, mean: f64, n: usize, allowed: f64) -> (f64, 
     (off, 0.5 * (freedom + 1.0) * (t * t / freedom).ln_1p())
 }
 
-/// Chernoff's bound on the variance of n normal deviates: P(ratio beyond r) ≤ exp(−(n − 1)/2·(r − 1 − ln r)).
-fn variance_change(learned: &Learned, variance: f64, n: usize) -> (f64, f64) {
+/// Chernoff's bound on a variance of ν degrees of freedom: P(ratio beyond r) ≤ exp(−ν/2·(r − 1 − ln r)). The ends of the range are
+/// those of blocks' variances, less what the noise of these adds to them; the window's is that within its own blocks, since what
+/// changes more slowly is in neither.
+fn variance_change(learned: &Learned, window: &[f64]) -> (f64, f64) {
+    let blocks = window.chunks(BLOCK_FRAMES);
+    let freedom = (window.len() - blocks.len()) as f64;
+    let squares = blocks.map(|block| moments(block.iter().copied()).1 * (block.len() - 1) as f64);
+    let variance = squares.sum::<f64>() / freedom;
     let floor = |v: f64| v.max(MIN_LN_STD * MIN_LN_STD);
-    let [low, high] = learned.ln_energy_std.map(|std| floor(std * std));
+    let middle = floor(learned.variance_within);
+    let noise = extreme_of_variances(learned.frames as f64 / BLOCK_FRAMES as f64);
+    let [low, high] = learned.ln_energy_std.map(|std| {
+        let off = (floor(std * std) / middle).ln();
+        let own = (off * off - noise * noise).max(0.0).sqrt();
+        middle * own.copysign(off).exp()
+    });
     let variance = floor(variance);
     let (ratio, beyond) = if variance > high {
         (variance / high, variance / high / VARIANCE_RATIO)
@@ -238,12 +252,19 @@ fn variance_change(learned: &Learned, variance: f64, n: usize) -> (f64, f64) {
     };
     let is_beyond = if ratio > 1.0 { beyond > 1.0 } else { beyond < 1.0 };
     match is_beyond {
-        true => (
-            ratio,
-            0.5 * INDEPENDENT * (n as f64 - 1.0) * (beyond - 1.0 - beyond.ln()),
-        ),
+        true => (ratio, 0.5 * INDEPENDENT * freedom * (beyond - 1.0 - beyond.ln())),
         false => (ratio, 0.0),
     }
+}
+
+/// How far the largest (or smallest) of so many blocks' ln variances is from the middle where the light is steady: the mean of
+/// Gumbel's distribution, the limit for normal deviates; 0.1 of their standard deviation too large from 4 blocks to 40.
+fn extreme_of_variances(blocks: f64) -> f64 {
+    const EULER: f64 = 0.577_215_664_901_532_9;
+    let std = (2.0 / (INDEPENDENT * BLOCK_FRAMES as f64 - 1.0)).sqrt();
+    let log = blocks.max(2.0).ln();
+    let scale = 1.0 / (2.0 * log).sqrt();
+    std * (1.0 / scale + scale * (EULER - 0.5 * (4.0 * std::f64::consts::PI * log).ln()))
 }
 
 #[cfg(test)]
