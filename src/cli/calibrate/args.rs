@@ -23,6 +23,6 @@ pub struct Args {
     /// Print one JSON object instead of sentences
     #[arg(long)]
     pub(super) json: bool,
-    /// FRAMES.npy; without --truth also a folder that [record] wrote
+    /// FRAMES.npy; without --truth also a folder that `[record]` wrote
     pub(super) frames: PathBuf,
 }
