@@ -16,6 +16,7 @@ use super::light_history::LightHistory;
 use super::maintenance::Maintenance;
 use super::pose::bias::PoseBias;
 use super::pose::consensus::PoseConsensus;
+use super::pose::wander::PoseWander;
 use super::pose::witness::residuals;
 use super::report::Look;
 use super::stats::error_budget::{ErrorBudget, TestFamily};
@@ -85,6 +86,8 @@ pub(super) struct FrameContext {
     pub pose: PoseConsensus,
     /// The pose error that lasts.
     pub bias: PoseBias,
+    /// How that and the rest of the displacement change.
+    pub wander: PoseWander,
     /// The error of this frame's pose that its beams share.
     pub pose_error: Option<Vector6<f64>>,
     /// Whether it is known where the camera is.
@@ -131,6 +134,7 @@ impl FrameContext {
             tracker: Tracker::new(max_score(&budget)),
             pose: PoseConsensus::default(),
             bias: PoseBias::default(),
+            wander: PoseWander::default(),
             pose_error: None,
             is_placed: true,
             pose_age_s: 0.0,
@@ -169,6 +173,7 @@ impl FrameContext {
         self.timing = ClaimTiming::default();
         self.pose = PoseConsensus::default();
         self.bias = PoseBias::default();
+        self.wander = PoseWander::default();
         self.track_frame_cov = None;
         self.users = UserTracks::default();
         self.lights.forget_tracks();
@@ -260,10 +265,19 @@ impl FrameContext {
 
     /// Covariance of what all residuals of a user at `p` share, m²: our own pose and what is systematic in positions.
     pub fn systematic_cov(&self, p: Vector2<f64>) -> Matrix2<f64> {
+        let known = self.displacement_cov(p);
+        match &self.view.sight {
+            None => known,
+            Some(_) => known + self.view.pose_cov(p) * UNMODELLED,
+        }
+    }
+
+    /// Covariance of [`FrameContext::displacement_at`], m².
+    pub fn displacement_cov(&self, p: Vector2<f64>) -> Matrix2<f64> {
         let systematic = Matrix2::identity() * (SYSTEMATIC_M.powi(2) + self.pose.variance(p));
         match &self.view.sight {
             None => systematic,
-            Some(_) => systematic + self.bias_cov(p) + self.view.pose_cov(p) * UNMODELLED,
+            Some(_) => systematic + self.bias_cov(p),
         }
     }
 
@@ -273,6 +287,13 @@ impl FrameContext {
             let residuals = residuals(&self.claims, &self.tracker, &self.view);
             self.bias.update(&residuals, sight.cov(), dt, period_s);
         }
+    }
+
+    /// Follows the displacement in the middle of the view, where the platform moves, enough users agree and the pose is not old.
+    pub fn update_wander(&mut self, dt: f64) {
+        let is_known = self.view.sight.is_some() && self.pose.support().0 > 0 && self.pose_age_s < FRESH_S;
+        let middle = self.view.middle_and_edges_m().first().copied().filter(|_| is_known);
+        self.wander.update(middle.map(|p| self.displacement_at(p)), dt);
     }
 
     /// How far the lasting pose error displaces a beam at `p`, m; nowhere for a fixed platform.

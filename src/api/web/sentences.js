@@ -81,6 +81,7 @@ const TELL = {
   pose_inconsistent(e) {
     return [
       isNumber(e.largest_in_view_m) && [`${e.users_agreeing} of ${e.users} users are shifted alike, by up to ${roughly(e.largest_in_view_m)} within the view; ${roughly(e.limit_m)} are tolerated.`],
+      e.changed_m > e.limit_m && [`The shift has changed by ${roughly(e.changed_m)} within ${seconds(e.changed_within_s)}: a position that is dragged away, or a pose source that fails.`],
       ["Our own position, attitude or calibration is off, and all positions with it."],
     ];
   },

@@ -4,4 +4,5 @@ pub(super) mod bias;
 pub(super) mod consensus;
 pub(super) mod displacement;
 pub(super) mod search;
+pub(super) mod wander;
 pub(super) mod witness;

@@ -1,4 +1,5 @@
-//! `pose_inconsistent`: all users are displaced alike, by more than is corrected in silence.
+//! `pose_inconsistent`: all users are displaced alike, by more than is corrected in silence, or by an error that changes faster than an
+//! honest one.
 
 use nalgebra::Vector2;
 use serde_json::json;
@@ -6,6 +7,7 @@ use serde_json::json;
 use crate::monitor::alert::{AlertKind, Severity};
 use crate::monitor::finding::{Cause, Content, Finding};
 use crate::monitor::frame_context::FrameContext;
+use crate::monitor::pose::wander::MEMORY_S;
 use crate::monitor::stats::error_budget::TestFamily;
 use crate::monitor::stats::gaussian::neg_log_p_outside;
 
@@ -33,7 +35,10 @@ pub fn evaluate(frame: &FrameContext) -> Vec<Finding> {
     let neg_log_p = neg_log_p_outside(worst, &cov, limit);
     let threshold = frame.budget.threshold(TestFamily::Pose, 1.0);
     let is_open = frame.alerts.is_open(&CAUSE);
-    let is_present = neg_log_p > threshold || (is_open && worst.norm() > ENDS_BELOW * limit);
+    // A dragged position is held against where it was, not against the error that the poses' source states.
+    let change = frame.wander.change();
+    let is_dragged = neg_log_p_outside(change, &frame.displacement_cov(place), limit) > threshold;
+    let is_present = neg_log_p > threshold || is_dragged || (is_open && worst.norm() > ENDS_BELOW * limit);
     if !is_present {
         return vec![Finding::Absent(CAUSE)];
     }
@@ -49,6 +54,8 @@ pub fn evaluate(frame: &FrameContext) -> Vec<Finding> {
         "turned_deg": pose.turn.to_degrees(),
         "scale": 1.0 + pose.scale,
         "largest_in_view_m": worst.norm(),
+        "changed_m": change.norm(),
+        "changed_within_s": MEMORY_S,
         "limit_m": limit,
         "users_agreeing": agreeing,
         "users": of,
@@ -92,6 +99,7 @@ mod tests {
     use super::*;
     use crate::monitor::fixture::{Scene, absent, present};
     use crate::monitor::pose::consensus::PoseConsensus;
+    use crate::monitor::pose::wander::PoseWander;
     use crate::monitor::pose::witness::Witness;
 
     const USERS: [[f64; 2]; 6] = [
@@ -136,6 +144,21 @@ mod tests {
         assert_eq!(absent(&findings(&mut scene, 2.2)), [&CAUSE]);
         findings(&mut scene, 11.0);
         assert_eq!(scene.alerts.open().next().unwrap().1.severity, Severity::Critical);
+    }
+
+    #[test]
+    fn a_displacement_that_grows_within_seconds_is_a_dragged_position() {
+        let mut scene = Scene::of_users(&USERS);
+        let mut drag = |scene: &mut Scene, speed: f64| {
+            for k in 0..600 {
+                let seconds = (f64::from(k) * 0.1 - 50.0).max(0.0);
+                scene.wander.update(Some(Vector2::new(speed * seconds, 0.0)), 0.1);
+            }
+            evaluate(scene.context())
+        };
+        assert_eq!(absent(&drag(&mut scene, 0.2)), [&CAUSE]);
+        scene.wander = PoseWander::default();
+        assert_eq!(present(&drag(&mut scene, 1.0)), [&CAUSE]);
     }
 
     #[test]
