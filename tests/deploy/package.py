@@ -14,7 +14,7 @@ import sys
 import tempfile
 import time
 
-LARGEST_MB = 60.0  # the installed program
+LARGEST_MB = 70.0  # the installed program, as CI builds it; link-time optimisation makes what is published smaller
 SLOWEST_S = 1.0  # the median start, until the first frame is through the pipeline
 STARTS = 5
 MOST_EXPOSED = 13  # tenths, as systemd-analyze counts

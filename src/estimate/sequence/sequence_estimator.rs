@@ -120,7 +120,7 @@ impl Estimator for SequenceEstimator {
         if let Some(alone) = self.take(time_s, elapsed, scale, is_over) {
             return Ok(alone);
         }
-        self.bury(elapsed);
+        self.bury(elapsed, is_over);
         self.tend(is_over);
         Ok(self.report(scale, is_over))
     }
@@ -152,6 +152,9 @@ impl SequenceEstimator {
                 return None;
             }
         }
+        if is_even && self.search_again(time_s, is_over) {
+            return None;
+        }
         // What is remembered is wrong where this frame alone is explained and its prediction is not.
         let found = self.single.estimate_loaded(scale, is_over);
         let mut alone = Window {
@@ -175,6 +178,38 @@ impl SequenceEstimator {
         }
         self.accept(alone);
         None
+    }
+
+    /// Searches the frames of the window together with the loaded one, as what is remembered may be wrong. Whether that explains it.
+    fn search_again(&mut self, time_s: f64, is_over: &dyn Fn() -> bool) -> bool {
+        let Some(first) = self.window.snapshots.first() else {
+            return false;
+        };
+        let born_s = first.time_s;
+        let mut next = self.window.clone();
+        next.snapshots
+            .append(&mut self.fresh(JointInformation::default(), time_s).snapshots);
+        let rules = self.rules;
+        let mut budget = WorkBudget::of_frames(SEARCH_WORK, is_over);
+        let (space, _, _) = self.single.loaded();
+        let mut engine = Engine {
+            bases: &space.bases,
+            rules,
+            budget: &mut budget,
+            workspace: &mut space.workspace,
+        };
+        next.fit(&mut engine, WINDOW_STEPS);
+        let mut search = WindowSearch {
+            engine: &mut engine,
+            matched_filter: &mut space.matched_filter,
+            penalty: space.source_penalty,
+        };
+        search.refine(&mut next, born_s);
+        let is_explained = is_last_explained(&next);
+        if is_explained {
+            self.window = next;
+        }
+        is_explained
     }
 
     /// Adds to `knowledge` that every emitter may have changed its velocity since the frame before.
@@ -248,28 +283,33 @@ impl SequenceEstimator {
             penalty: space.source_penalty,
         };
         search.grow(&mut fresh, time_s);
-        let last = &fresh.snapshots[0];
-        let freedom = (last.compressed.data_count - 3.0 * fresh.len() as f64).max(1.0);
-        (last.local.deviance < freedom + UNEXPLAINED * (2.0 * freedom).sqrt() + UNEXPLAINED).then_some(fresh)
+        is_last_explained(&fresh).then_some(fresh)
     }
 
-    /// Removes targets that have gone dark. What they told about others in the past stays.
-    fn bury(&mut self, elapsed: f64) {
+    /// Ends targets that have gone dark: frames before hold them still.
+    fn bury(&mut self, elapsed: f64, is_over: &dyn Fn() -> bool) {
         let window = &mut self.window;
         let Some(last) = window.snapshots.last() else { return };
-        let weight = (elapsed / COHERENCE_S).clamp(0.0, 1.0);
-        let mut dead = Vec::new();
-        for (i, e) in window.present(last.time_s).into_iter().enumerate() {
-            window.targets[e].weigh(last.local.energies[i], last.local.energy_variances[i], weight);
-            if window.targets[e].darkness > DARK {
-                dead.push(e);
+        let (time_s, weight) = (last.time_s, (elapsed / COHERENCE_S).clamp(0.0, 1.0));
+        let mut has_died = false;
+        for (i, e) in window.present(time_s).into_iter().enumerate() {
+            let target = &mut window.targets[e];
+            target.weigh(last.local.energies[i], last.local.energy_variances[i], weight);
+            if target.darkness > DARK {
+                target.died_s = time_s;
+                has_died = true;
             }
         }
-        if !dead.is_empty() {
-            window.fold(window.snapshots.len());
-        }
-        for e in dead.into_iter().rev() {
-            window.remove(e);
+        if has_died {
+            let mut budget = WorkBudget::of_frames(SEARCH_WORK, is_over);
+            let (space, _, _) = self.single.loaded();
+            let mut engine = Engine {
+                bases: &space.bases,
+                rules: self.rules,
+                budget: &mut budget,
+                workspace: &mut space.workspace,
+            };
+            self.window.fit(&mut engine, WINDOW_STEPS);
         }
     }
 
@@ -317,7 +357,8 @@ impl SequenceEstimator {
     fn report(&mut self, scale: f64, is_over: &dyn Fn() -> bool) -> Estimate {
         let sigma = self.camera.spot_sigma_m;
         let window = &self.window;
-        let n = window.len();
+        let present = window.present(window.time_s);
+        let n = present.len();
         let posterior = posterior(&window.total, 1.0 / (self.camera.ground_scale() * sigma));
         let mut known = DMatrix::zeros(2 * n, 2 * n);
         let mut positions = window.positions(&window.state, window.time_s);
@@ -325,7 +366,7 @@ impl SequenceEstimator {
         let (space, compressed, frame) = self.single.loaded();
         if let Some(Posterior { state, covariance }) = &posterior {
             positions = window.positions(state, window.time_s);
-            let place = |k: usize| STATE * (k / 2) + k % 2;
+            let place = |k: usize| STATE * present[k / 2] + k % 2;
             let own = DMatrix::from_fn(2 * n, 2 * n, |r, c| covariance[(place(r), place(c))]);
             let mut engine = Engine {
                 bases: &space.bases,
@@ -360,7 +401,7 @@ impl SequenceEstimator {
         for (e, emitter) in found.emitters.iter_mut().enumerate() {
             emitter.energy_j = emitter.energy_j.max(0.0);
             if let Some(Posterior { state, .. }) = &posterior {
-                let velocity = [2, 3].map(|k| state[STATE * e + k] * sigma);
+                let velocity = [2, 3].map(|k| state[STATE * present[e] + k] * sigma);
                 emitter.velocity = Some(velocity_on_ground(&self.camera, emitter.sensor_m, velocity));
             }
             if is_over() {
@@ -378,6 +419,15 @@ impl SequenceEstimator {
             steps: budget.steps,
         }
     }
+}
+
+/// Whether noise alone explains what the newest snapshot leaves.
+fn is_last_explained(window: &Window) -> bool {
+    window.snapshots.last().is_some_and(|last| {
+        let emitters = window.present(last.time_s).len() as f64;
+        let freedom = (last.compressed.data_count - 3.0 * emitters).max(1.0);
+        last.local.deviance < freedom + UNEXPLAINED * (2.0 * freedom).sqrt() + UNEXPLAINED
+    })
 }
 
 /// Whether positions have moved so far that snapshots need a new linearisation.
@@ -405,8 +455,9 @@ fn is_ambiguous(window: &Window) -> bool {
     let Some(covariance) = window.covariance() else {
         return true;
     };
-    (0..window.len()).any(|e| {
-        (0..e).any(|f| {
+    let present = window.present(window.time_s);
+    present.iter().any(|&e| {
+        present.iter().take_while(|f| **f < e).any(|&f| {
             let d = [0, 1].map(|k| window.state[STATE * e + k] - window.state[STATE * f + k]);
             let of = |a: usize, b: usize| covariance[(a, b)];
             let mut along = 0.0;

@@ -25,6 +25,8 @@ const MANY: f64 = 100.0;
 pub(crate) struct Target {
     /// Earlier frames do not hold it, s.
     pub born_s: f64,
+    /// This frame and later ones do not hold it, s; it is forgotten with the last frame that does.
+    pub died_s: f64,
     /// Mean energy of its frames, and their number up to the length of the memory.
     pub mean_energy: f64,
     pub frames: f64,
@@ -36,10 +38,16 @@ impl Target {
     pub fn born(born_s: f64) -> Self {
         Self {
             born_s,
+            died_s: f64::INFINITY,
             mean_energy: 0.0,
             frames: 0.0,
             darkness: 0.0,
         }
+    }
+
+    /// Whether a frame may hold it.
+    pub fn is_in(&self, time_s: f64) -> bool {
+        self.born_s <= time_s && time_s < self.died_s
     }
 
     /// Takes the energy that a frame measured, with its variance, at `weight` of an independent draw of the fading. The evidence is
@@ -90,7 +98,7 @@ impl Window {
 
     /// Indices of the targets that a frame at `time_s` may hold.
     pub fn present(&self, time_s: f64) -> Vec<usize> {
-        (0..self.len()).filter(|&e| self.targets[e].born_s <= time_s).collect()
+        (0..self.len()).filter(|&e| self.targets[e].is_in(time_s)).collect()
     }
 
     /// Positions of the targets that a frame at `time_s` may hold.
@@ -142,7 +150,7 @@ impl Window {
         self.total.marginalise(e);
     }
 
-    /// Moves the `count` oldest snapshots into the prior.
+    /// Moves the `count` oldest snapshots into the prior, and forgets who died before the first that is left.
     pub fn fold(&mut self, count: usize) {
         let mut prior = std::mem::take(&mut self.prior);
         prior.recentre(&self.state);
@@ -150,6 +158,14 @@ impl Window {
             self.absorb(&mut prior, &snapshot.local, snapshot.time_s);
         }
         self.prior = prior;
+        let first_s = self.snapshots.first().map_or(self.time_s, |s| s.time_s);
+        for e in (0..self.len())
+            .rev()
+            .filter(|&e| self.targets[e].died_s <= first_s)
+            .collect::<Vec<_>>()
+        {
+            self.remove(e);
+        }
     }
 
     /// Adds a snapshot's likelihood to `knowledge`.
@@ -261,7 +277,7 @@ impl Window {
     pub fn counts(&self) -> Vec<f64> {
         self.targets
             .iter()
-            .map(|t| self.dropped + self.snapshots.iter().filter(|s| t.born_s <= s.time_s).count() as f64)
+            .map(|t| self.dropped + self.snapshots.iter().filter(|s| t.is_in(s.time_s)).count() as f64)
             .collect()
     }
 }
