@@ -1,5 +1,6 @@
 //! Places on the earth, held to reference values of two independent programs (tests/reference/geo/make.py).
 
+mod crossing;
 mod terrain;
 mod tiff;
 
