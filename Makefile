@@ -141,7 +141,7 @@ test-aarch64: aarch64 build
 # Coverage-guided fuzzing, FUZZ_S seconds a target: libFuzzer with the address sanitizer, which a stable toolchain has too when told
 # that it is another one. Not in CI: it takes every dependency once more.
 FUZZ_S ?= 60
-FUZZ := npy config calibration scene claims mavlink ulg http v4l2 locate onnx
+FUZZ := npy config calibration scene claims mavlink ulg terrain http v4l2 locate onnx
 HOST = $(shell rustc -vV | sed -n 's/^host: //p')
 SANITIZED = RUSTC_BOOTSTRAP=1 RUSTFLAGS="-Zsanitizer=address" RUSTC_WRAPPER=$(CURDIR)/fuzz/rustc.sh
 fuzz: setup

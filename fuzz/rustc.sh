@@ -10,7 +10,7 @@ for argument in "$@"; do
     previous=$argument
 done
 case "$crate" in
-oapwatch* | toml* | winnow | serde_json | prost | tract_onnx | npyz)
+oapwatch* | toml* | winnow | serde_json | prost | tiff | tract_onnx | npyz)
     set -- "$@" -Ccodegen-units=1 -Cpasses=sancov-module -Cllvm-args=-sanitizer-coverage-level=4 \
         -Cllvm-args=-sanitizer-coverage-inline-8bit-counters -Cllvm-args=-sanitizer-coverage-pc-table \
         -Cllvm-args=-sanitizer-coverage-trace-compares

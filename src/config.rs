@@ -210,6 +210,7 @@ impl Config {
             &mut self.source.scene,
             &mut self.source.frames,
             &mut self.record.folder,
+            &mut self.world.terrain,
             &mut self.platform.poses,
             &mut self.platform.signing_key_file,
             &mut self.claims.log,

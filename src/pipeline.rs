@@ -114,6 +114,11 @@ impl Pipeline {
         })
     }
 
+    /// What of the platform's surroundings the operator should know.
+    pub fn warnings(&self) -> Vec<String> {
+        self.platform.warnings()
+    }
+
     /// The buffer that an autopilot's poses go into; none where they come from elsewhere.
     pub fn live_poses(&self) -> Option<platform::SharedPoses> {
         self.platform.live()

@@ -1,5 +1,9 @@
 //! `oapwatch locate` on files that are not as they should be: what it says, what it still gives, and its exit code.
 
+#[path = "geo/tiff.rs"]
+#[allow(dead_code, reason = "the terrain's own tests use more of it")]
+mod tiff;
+
 use std::path::Path;
 use std::process::{Command, Output};
 
@@ -146,4 +150,94 @@ fn stdin_is_read_and_frames_of_which_none_can_be_used_are_a_failure() {
         [f64::NAN, 0.0][k]
     });
     assert!(locate(folder.path(), &mixed, "").status.success());
+}
+
+#[test]
+fn over_terrain_positions_are_where_rays_meet_it() {
+    let folder = tempfile::tempdir().unwrap();
+    let run = |args: &[&str]| {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_oapwatch"));
+        command.current_dir(&folder).args(args).output().unwrap()
+    };
+    let scene = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/scenes/paper.toml");
+    let made = run(&[
+        "simulate",
+        "--scene",
+        scene.to_str().unwrap(),
+        "--frames",
+        "3",
+        "--out",
+        ".",
+    ]);
+    assert!(made.status.success(), "{made:?}");
+    // A plateau 100 m above the origin.
+    let plateau = |height_m: f64| {
+        let mut fields = tiff::place(11.55, 48.16, [0.0005, 0.0005]).to_vec();
+        fields.push(tiff::keys(&[(1024, 2), (1025, 1), (2048, 4326)]));
+        tiff::image([100, 100], tiff::Kind::I16, false, &fields, |_, _| height_m)
+    };
+    let scene = std::fs::read_to_string(scene).unwrap();
+    let table: toml::Table = scene.parse().unwrap();
+    let optics = toml::to_string(&toml::Table::from_iter([(
+        "optics".to_owned(),
+        table["optics"].clone(),
+    )]))
+    .unwrap();
+    let config = |datum: &str, terrain: &str| {
+        let origin = format!("latitude_deg = 48.137, longitude_deg = 11.575, height_m = 500.0, datum = \"{datum}\"");
+        let text = format!("{optics}\n[world]\norigin = {{ {origin} }}\n{terrain}\n");
+        std::fs::write(folder.path().join("oapwatch.toml"), text).unwrap();
+    };
+    let located = || run(&["locate", "--config", "oapwatch.toml", "frames.npy"]);
+
+    config("msl", "");
+    let plane = lines(&located());
+    std::fs::write(folder.path().join("dem.tif"), plateau(600.0)).unwrap();
+    config("msl", "terrain = \"dem.tif\"");
+    let raised = located();
+    assert!(
+        raised.status.success() && String::from_utf8_lossy(&raised.stderr).contains("z = 100.0 m"),
+        "{raised:?}"
+    );
+    let altitude_m = table["optics"]["altitude_m"].as_float().unwrap();
+    let nearer = (altitude_m - 100.0) / altitude_m;
+    let mut compared = 0;
+    for (a, b) in plane.iter().zip(lines(&raised)) {
+        let (a, b) = (a["emitters"].as_array().unwrap(), b["emitters"].as_array().unwrap());
+        assert_eq!(a.len(), b.len());
+        for (a, b) in a.iter().zip(b) {
+            let number = |value: &serde_json::Value| value.as_f64().unwrap();
+            for key in ["x_m", "y_m"] {
+                // The ground falls with the horizon, and is read to some millimetres.
+                assert!((number(&b[key]) - number(&a[key]) * nearer).abs() < 1e-2, "{a} {b}");
+            }
+            let ratio = number(&b["cov_m2"][0][0]) / number(&a["cov_m2"][0][0]);
+            assert!((ratio / nearer.powi(2) - 1.0).abs() < 1e-3, "{a} {b}");
+            compared += 1;
+        }
+    }
+    assert!(compared > 0);
+
+    let refused = |expected: &str| {
+        for args in [
+            &["locate", "--config", "oapwatch.toml", "frames.npy"][..],
+            &["check", "oapwatch.toml"],
+        ] {
+            let message = refusal(&run(args), 64);
+            assert!(message.contains("terrain") && message.contains(expected), "{message}");
+        }
+    };
+    config("ellipsoid", "terrain = \"dem.tif\"");
+    refused("datum = \"msl\"");
+    config("msl", "terrain = \"missing.tif\"");
+    refused("missing.tif: expected a readable file");
+    std::fs::write(folder.path().join("dem.tif"), plateau(900.0)).unwrap();
+    config("msl", "terrain = \"dem.tif\"");
+    refused("z = 400.0 m");
+    std::fs::write(
+        folder.path().join("oapwatch.toml"),
+        format!("{optics}\n[world]\nterrain = \"dem.tif\"\n"),
+    )
+    .unwrap();
+    refused("expected [world] origin");
 }

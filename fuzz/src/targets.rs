@@ -9,6 +9,7 @@ use oapwatch::config::Config;
 use oapwatch::estimate;
 use oapwatch::frames::npy::Reader;
 use oapwatch::frames::v4l2::{Bayer, DecodeError, Decoding, Granted, Layout, PixelFormat, Region, Response, Transfer};
+use oapwatch::geo::{Datum, Origin, Terrain};
 use oapwatch::optics;
 use oapwatch::platform::mavlink::{self, Event, Moment, Signing};
 use oapwatch::platform::px4_log;
@@ -281,5 +282,35 @@ pub fn ulg(bytes: &[u8]) {
         }
         Err(ulog::Fault::Malformed(_, message)) => assert!(!message.is_empty()),
         Err(ulog::Fault::Read(e)) => panic!("memory can be read: {e}"),
+    }
+}
+
+/// GeoTIFF: ground that is finite where it is known, and that a ray from above meets there, or a message.
+pub fn terrain(bytes: &[u8]) {
+    let origin = Origin {
+        latitude_deg: 48.137,
+        longitude_deg: 11.575,
+        height_m: 500.0,
+        datum: Datum::Msl,
+    };
+    match Terrain::read(std::io::Cursor::new(bytes), "dem.tif", &origin) {
+        Ok(terrain) => {
+            for place in [[0.0, 0.0], [333.0, -150.0], [-5000.0, 1.0]] {
+                let ground = terrain.at(place);
+                assert!(ground.is_none_or(|g| g.z_m.abs() < 2e4 && g.slope.iter().all(|s| s.is_finite())));
+                let lens = [place[0], place[1], 2e4].into();
+                let met = terrain.cross(&lens, &[0.0, 0.0, -1.0].into());
+                match (ground, met) {
+                    (Some(ground), Some(met)) => assert!((ground.z_m - met.ground.z_m).abs() < 1e-6),
+                    (None, None) => {}
+                    // Along the edge of a void or of the grid either may round.
+                    other => assert!(place != [0.0, 0.0] || terrain.voids().is_some(), "{other:?}"),
+                }
+                if let Some(met) = terrain.cross(&lens, &[0.7, -0.3, -1.0].into()) {
+                    assert!(met.reach.is_finite() && met.ground.z_m.is_finite());
+                }
+            }
+        }
+        Err(e) => assert!(!e.to_string().is_empty()),
     }
 }

@@ -160,7 +160,7 @@ fn config(file: &Path) -> Result<Checked, Failure> {
             pixels[0], pixels[1]
         ),
         facts: json!({ "kind": "config", "pixels": pixels, "source": source, "estimator": estimator }),
-        warnings: config.warnings(&camera),
+        warnings: [config.warnings(&camera), pipeline.warnings()].concat(),
         receivers,
     })
 }

@@ -48,7 +48,7 @@ struct Line<'a> {
 }
 
 /// Moves emitters from where a level camera would see them to where this one does, with its pose's uncertainty. One whose ray
-/// does not come down to the ground has no position and is left out.
+/// meets no known ground has no position and is left out.
 fn place(emitters: &mut Vec<Emitter>, platform: &mut Platform, view: &mut View, time: jiff::Timestamp) {
     view.sight = match platform.at(time) {
         Placement::Level => return,
@@ -92,6 +92,9 @@ pub fn run(args: Args) -> Outcome {
     let rate_hz = config.source.rate_hz.unwrap_or(frames::Config::DEFAULT_RATE_HZ);
     let platform = Platform::open(&config.platform, &config.world, camera.altitude_m);
     let mut platform = platform.map_err(Failure::config)?;
+    for warning in platform.warnings() {
+        eprintln!("oapwatch: {}: warning: {warning}", args.config.display());
+    }
     let mut view = View::level(&camera);
     let mut out = std::io::BufWriter::new(std::io::stdout().lock());
     let bar = progress::count("frames");

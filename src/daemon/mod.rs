@@ -77,7 +77,7 @@ impl Daemon {
         // A second daemon in one process (a test) counts into the first one's recorder.
         let _ = metrics::set_global_recorder(recorder);
         metric::describe();
-        for warning in config.warnings(&camera) {
+        for warning in config.warnings(&camera).into_iter().chain(pipeline.warnings()) {
             tracing::warn!("{warning}");
         }
         let server = api::Server::new(config.api.clone())?;

@@ -1,5 +1,7 @@
 //! `[world]`: where local (0, 0, 0) lies on the earth.
 
+use std::path::PathBuf;
+
 use serde::{Deserialize, Serialize};
 
 use super::wgs84::{Geodetic, LocalAxes};
@@ -10,6 +12,8 @@ use super::wgs84::{Geodetic, LocalAxes};
 pub struct Config {
     /// Where local (0, 0, 0) lies; without it everything is local.
     pub origin: Option<Origin>,
+    /// GeoTIFF or SRTM tile (`.hgt`) of the ground; without it the ground is the plane z = 0.
+    pub terrain: Option<PathBuf>,
 }
 
 /// A place on WGS-84.
@@ -35,22 +39,29 @@ pub enum Datum {
 
 /// Why a `[world]` table cannot be used.
 #[derive(Debug, thiserror::Error)]
-#[error("world.origin.{field}: expected {expected}, found {found}")]
-pub struct ConfigError {
-    field: &'static str,
-    expected: &'static str,
-    found: f64,
+pub enum ConfigError {
+    #[error("world.origin.{field}: expected {expected}, found {found}")]
+    Range {
+        field: &'static str,
+        expected: &'static str,
+        found: f64,
+    },
+    #[error("world.terrain: expected [world] origin, about which it is read, found none")]
+    NoOrigin,
 }
 
 impl Config {
     /// Checks every number.
     pub fn validate(&self) -> Result<(), ConfigError> {
         let Some(origin) = &self.origin else {
-            return Ok(());
+            return match self.terrain {
+                Some(_) => Err(ConfigError::NoOrigin),
+                None => Ok(()),
+            };
         };
         let check = |ok: bool, field, expected, found| match ok {
             true => Ok(()),
-            false => Err(ConfigError { field, expected, found }),
+            false => Err(ConfigError::Range { field, expected, found }),
         };
         let latitude = origin.latitude_deg;
         check(latitude.abs() <= 90.0, "latitude_deg", "-90 to 90", latitude)?;

@@ -1,11 +1,14 @@
-//! Places on the earth and on the ground: WGS-84 and local axes, and the camera's rays to the ground with their Jacobians.
+//! Places on the earth and on the ground: WGS-84 and local axes, and the camera's rays to the ground (a plane, or terrain) with their
+//! Jacobians.
 
 mod config;
 mod sight;
+mod terrain;
 mod view;
 mod wgs84;
 
 pub use config::{Config, ConfigError, Datum, Origin};
 pub use sight::{GroundPoint, Sight};
+pub use terrain::{Error as TerrainError, Fault as TerrainFault, Ground, Terrain};
 pub use view::{Placed, View};
 pub use wgs84::{Geodetic, LocalAxes};

@@ -1,15 +1,18 @@
 //! The camera's rays in the world, from its pose: sensor to ground and back, with Jacobians.
 
+use std::sync::Arc;
+
 use nalgebra::{Matrix2, Matrix2x3, Matrix2x6, Matrix3, Matrix6, Vector2, Vector3};
 
+use super::terrain::{Ground, Terrain};
 use crate::optics::Camera;
 use crate::pose::{Mount, Pose, swap_ned_enu};
 
-/// Least angle below the horizon, as the sine, of a ray that meets the ground: flatter ones end more than fifty heights away.
+/// Least angle to the ground, as the sine, of a ray that meets it: on a plane, flatter ones end more than fifty heights away.
 const MIN_DESCENT: f64 = 0.02;
 
 /// Where the camera is and looks in one frame.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug)]
 pub struct Sight {
     /// East, north, up, m.
     lens_m: Vector3<f64>,
@@ -17,6 +20,8 @@ pub struct Sight {
     to_world: Matrix3<f64>,
     /// Covariance of the pose, as [`Pose::cov`] has it.
     cov: Matrix6<f64>,
+    /// The ground; without it the plane z = 0.
+    terrain: Option<Arc<Terrain>>,
 }
 
 /// Where a ray meets the ground.
@@ -28,6 +33,8 @@ pub struct GroundPoint {
     pub by_sensor: Matrix2<f64>,
     /// ∂(east, north)/∂(rotation vector about north, east, down, rad; lens east, north, up, m).
     pub by_pose: Matrix2x6<f64>,
+    /// Upwards across the ground, with an upward part of 1.
+    normal: Vector3<f64>,
 }
 
 impl Sight {
@@ -38,11 +45,29 @@ impl Sight {
             lens_m: pose.position_m.into(),
             to_world: Matrix3::from_columns(&columns),
             cov: pose.cov,
+            terrain: None,
         }
+    }
+
+    /// The same over terrain, where there is one.
+    pub fn over(self, terrain: Option<Arc<Terrain>>) -> Self {
+        Self { terrain, ..self }
     }
 
     pub fn lens_m(&self) -> Vector3<f64> {
         self.lens_m
+    }
+
+    /// The lens above the ground below it, m; above z = 0 where the ground's height is not known.
+    pub fn height_m(&self) -> f64 {
+        match &self.terrain {
+            None => self.lens_m.z,
+            Some(terrain) => self.lens_m.z - terrain.at(self.lens_m.xy().into()).map_or(0.0, |ground| ground.z_m),
+        }
+    }
+
+    pub fn has_terrain(&self) -> bool {
+        self.terrain.is_some()
     }
 
     pub fn cov(&self) -> &Matrix6<f64> {
@@ -57,10 +82,11 @@ impl Sight {
             lens_m: self.lens_m + by.fixed_rows::<3>(3),
             to_world: nalgebra::Rotation3::from_scaled_axis(turn) * self.to_world,
             cov,
+            terrain: self.terrain.clone(),
         }
     }
 
-    /// The ground at a sensor position, m; `None` where the ray does not come down.
+    /// The ground at a sensor position, m; `None` where the ray meets no ground that is known.
     pub fn ground(&self, camera: &Camera, sensor: [f64; 2]) -> Option<GroundPoint> {
         let z = camera.plane_distance_m;
         let [tx, ty] = camera.distortion.unproject(z, sensor);
@@ -70,7 +96,7 @@ impl Sight {
         let mut point = self.meet(ray)?;
         let reach = (point.position_m - self.lens_m).norm() / ray.norm();
         // Along the ground, of the ray's components: tangents follow the sensor by the inverse of the projection's Jacobian.
-        let along = horizontal(&onto_ground(&ray)) * self.to_world * reach;
+        let along = horizontal(&onto_ground(&ray, &point.normal)) * self.to_world * reach;
         let by_tangents = Matrix2::from_columns(&[along.column(1).into_owned(), along.column(0).into_owned()]);
         point.by_sensor = by_tangents * Matrix2::new(d, -b, -c, a) / det;
         Some(point)
@@ -91,32 +117,79 @@ impl Sight {
         Some(camera.distortion.project(camera.plane_distance_m, tangents))
     }
 
+    /// The ground below or above a place, east and north; `None` where it is not known.
+    pub fn ground_below(&self, place_m: [f64; 2]) -> Option<Ground> {
+        match &self.terrain {
+            Some(terrain) => terrain.at(place_m),
+            None => Some(Ground {
+                z_m: 0.0,
+                slope: [0.0; 2],
+            }),
+        }
+    }
+
+    /// The ground at a place, east and north, as a ray to there would meet it. Where it cannot be seen, behind a hill, it is taken
+    /// to be level.
+    pub fn ground_at(&self, place_m: [f64; 2]) -> Option<GroundPoint> {
+        let [x, y] = place_m;
+        if self.terrain.is_none() {
+            return self.apparent([x, y, 0.0]);
+        }
+        let ground = self.ground_below(place_m)?;
+        let ray = Vector3::new(x, y, ground.z_m) - self.lens_m;
+        let is_met = |normal: &Vector3<f64>| is_steep(&ray, normal);
+        let normal = Some(normal(&ground))
+            .filter(is_met)
+            .or(Some(Vector3::z()).filter(is_met))?;
+        Some(self.point(&ray, 1.0, normal))
+    }
+
     fn meet(&self, ray: Vector3<f64>) -> Option<GroundPoint> {
+        if let Some(terrain) = &self.terrain {
+            let crossing = terrain.cross(&self.lens_m, &ray)?;
+            let normal = normal(&crossing.ground);
+            return is_steep(&ray, &normal).then(|| self.point(&ray, crossing.reach, normal));
+        }
         if !(-ray.z > MIN_DESCENT * ray.norm()) || !(self.lens_m.z > 0.0) {
             return None;
         }
-        let reach = -self.lens_m.z / ray.z;
+        let mut point = self.point(&ray, -self.lens_m.z / ray.z, Vector3::z());
+        point.position_m.z = 0.0;
+        Some(point)
+    }
+
+    /// Where a ray ends on ground with a normal.
+    fn point(&self, ray: &Vector3<f64>, reach: f64, normal: Vector3<f64>) -> GroundPoint {
         let way = ray * reach;
-        let onto = onto_ground(&ray);
+        let onto = onto_ground(ray, &normal);
         // A turn δ (north, east, down) moves the ray by (Sδ) × ray, S being the change of axes.
         let swap = Matrix3::from_columns(&[Vector3::x(), Vector3::y(), Vector3::z()].map(swap_ned_enu));
         let by_turn = horizontal(&onto) * (-way.cross_matrix() * swap);
         let mut by_pose = Matrix2x6::zeros();
         by_pose.fixed_view_mut::<2, 3>(0, 0).copy_from(&by_turn);
         by_pose.fixed_view_mut::<2, 3>(0, 3).copy_from(&horizontal(&onto));
-        let mut position_m = self.lens_m + way;
-        position_m.z = 0.0;
-        Some(GroundPoint {
-            position_m,
+        GroundPoint {
+            position_m: self.lens_m + way,
             by_sensor: Matrix2::zeros(),
             by_pose,
-        })
+            normal,
+        }
     }
 }
 
-/// Slides a displacement of a ray's end along the ray onto the plane: 1 − ray·ẑᵀ/ray_z.
-fn onto_ground(ray: &Vector3<f64>) -> Matrix3<f64> {
-    Matrix3::identity() - ray * Vector3::z().transpose() / ray.z
+fn normal(ground: &Ground) -> Vector3<f64> {
+    let [by_x, by_y] = ground.slope;
+    Vector3::new(-by_x, -by_y, 1.0)
+}
+
+/// Whether a ray comes down onto the ground steeply enough to say where.
+fn is_steep(ray: &Vector3<f64>, normal: &Vector3<f64>) -> bool {
+    -ray.dot(normal) > MIN_DESCENT * ray.norm() * normal.norm()
+}
+
+/// Slides a displacement of a ray's end along the ray onto the ground: 1 − ray·nᵀ/(n·ray).
+fn onto_ground(ray: &Vector3<f64>, normal: &Vector3<f64>) -> Matrix3<f64> {
+    Matrix3::identity() - ray * normal.transpose() / ray.dot(normal)
 }
 
 fn horizontal(m: &Matrix3<f64>) -> Matrix2x3<f64> {

@@ -17,6 +17,8 @@ pub struct View {
 pub struct Placed {
     /// East, north, m.
     pub position_m: Vector2<f64>,
+    /// Up, m; zero on the plane.
+    pub z_m: f64,
     /// Without the pose's error, m².
     pub cov_m2: [[f64; 2]; 2],
     /// ∂position/∂pose, as [`GroundPoint::by_pose`](super::GroundPoint); zero for a fixed platform.
@@ -25,11 +27,12 @@ pub struct Placed {
 
 impl View {
     /// Places a spot that a level camera at its own altitude would see at `level_m`, m, with the covariance `level_cov`, m²;
-    /// `None` where its ray does not come down to the ground.
+    /// `None` where its ray meets no ground that is known.
     pub fn place(&self, sensor_m: [f64; 2], level_m: [f64; 2], level_cov: [[f64; 2]; 2]) -> Option<Placed> {
         let Some(sight) = &self.sight else {
             return Some(Placed {
                 position_m: level_m.into(),
+                z_m: 0.0,
                 cov_m2: level_cov,
                 by_pose: Matrix2x6::zeros(),
             });
@@ -39,6 +42,7 @@ impl View {
         let cov = point.by_sensor * Matrix2::new(a, b, b, c) * point.by_sensor.transpose();
         Some(Placed {
             position_m: point.horizontal_m(),
+            z_m: point.position_m.z,
             cov_m2: [[cov[(0, 0)], cov[(0, 1)]], [cov[(0, 1)], cov[(1, 1)]]],
             by_pose: point.by_pose,
         })
@@ -52,18 +56,26 @@ impl View {
         }
     }
 
-    /// The sensor position, m, of a place on the ground, m; infinite behind the camera.
+    /// The sensor position, m, of a place on the ground, m; infinite behind the camera and where the ground's height is not known.
     pub fn to_sensor(&self, [x, y]: [f64; 2]) -> [f64; 2] {
-        match &self.sight {
-            None => self.camera.to_sensor([x, y]),
-            Some(sight) => sight.sensor(&self.camera, [x, y, 0.0]).unwrap_or([f64::INFINITY; 2]),
-        }
+        let Some(sight) = &self.sight else {
+            return self.camera.to_sensor([x, y]);
+        };
+        let seen = sight.ground_below([x, y]);
+        let seen = seen.and_then(|ground| sight.sensor(&self.camera, [x, y, ground.z_m]));
+        seen.unwrap_or([f64::INFINITY; 2])
     }
 
-    /// Where on the ground a beam from a place appears to come from, m; the place itself where it is on the ground or no ray from
-    /// it comes down.
+    /// Where on the ground a beam from a place appears to come from, m; the place itself where it is on the ground (without `z_m`)
+    /// or no ray from it comes down.
     pub fn apparent(&self, x_m: f64, y_m: f64, z_m: Option<f64>) -> Vector2<f64> {
         let place = Vector2::new(x_m, y_m);
+        if let (Some(sight), Some(z_m)) = (&self.sight, z_m)
+            && sight.has_terrain()
+        {
+            let seen = sight.apparent([x_m, y_m, z_m]);
+            return seen.map_or(place, |point| point.horizontal_m());
+        }
         let Some(z_m) = z_m.filter(|z| *z != 0.0) else {
             return place;
         };
@@ -75,9 +87,17 @@ impl View {
         nadir + (place - nadir) * (height_m / (height_m - z_m))
     }
 
-    /// The lens above the ground, m.
+    /// The lens above the ground below it, m; above z = 0 where the ground's height is not known.
     pub fn height_m(&self) -> f64 {
-        self.sight.as_ref().map_or(self.camera.altitude_m, |s| s.lens_m().z)
+        self.sight.as_ref().map_or(self.camera.altitude_m, Sight::height_m)
+    }
+
+    /// The height of the ground at a place, m; `None` where it is not known.
+    pub fn ground_z_m(&self, p: Vector2<f64>) -> Option<f64> {
+        match &self.sight {
+            None => Some(0.0),
+            Some(sight) => sight.ground_below(p.into()).map(|ground| ground.z_m),
+        }
     }
 
     /// The place below the lens, m.
@@ -89,7 +109,7 @@ impl View {
     pub fn ground_scale(&self) -> f64 {
         match &self.sight {
             None => self.camera.ground_scale(),
-            Some(sight) => sight.lens_m().z / (self.camera.plane_distance_m * self.camera.distortion.focal_scale),
+            Some(sight) => sight.height_m() / (self.camera.plane_distance_m * self.camera.distortion.focal_scale),
         }
     }
 
@@ -112,7 +132,7 @@ impl View {
 
     /// ∂place/∂pose of a place on the ground, as [`GroundPoint::by_pose`](super::GroundPoint) has it; zero for a fixed platform.
     pub fn by_pose(&self, p: Vector2<f64>) -> Matrix2x6<f64> {
-        let point = self.sight.as_ref().and_then(|s| s.apparent([p.x, p.y, 0.0]));
+        let point = self.sight.as_ref().and_then(|s| s.ground_at(p.into()));
         point.map_or(Matrix2x6::zeros(), |point| point.by_pose)
     }
 

@@ -215,7 +215,7 @@ impl FrameContext {
         let drifted = self.track_frame_cov.map(|cov| cov + found.cov);
         let of = |cov: &Matrix6<f64>| {
             let seen = sight.corrected(&Vector6::zeros(), *cov);
-            let point = seen.apparent([self.view.nadir_m().x, self.view.nadir_m().y, 0.0]);
+            let point = seen.ground_at(self.view.nadir_m().into());
             point.map_or(0.0, |p| p.pose_cov(cov).trace())
         };
         let cov = match drifted {

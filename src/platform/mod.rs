@@ -27,7 +27,7 @@ pub use replay::{Error as ReplayError, LineError};
 pub use telemetry::{Error as TelemetryError, Telemetry, open as open_telemetry};
 
 use crate::claim::seconds;
-use crate::geo::{self, Sight};
+use crate::geo::{self, Sight, Terrain};
 use crate::pose::{Mount, Pose};
 use delay::DelayEstimate;
 use replay::Replay;
@@ -42,6 +42,12 @@ pub enum Error {
     Config(#[from] ConfigError),
     #[error("platform.poses: {0}")]
     Replay(#[from] ReplayError),
+    #[error("world.terrain: {0}")]
+    Terrain(#[from] geo::TerrainError),
+    #[error(
+        "[optics] altitude_m: expected a lens above the ground, which [world] terrain has at z = {ground_m:.1} m there, found {altitude_m} m above world.origin.height_m"
+    )]
+    Buried { altitude_m: f64, ground_m: f64 },
 }
 
 /// Rates are taken over this time to either side of a frame, s: much longer than from pose to pose, so that the poses' own noise
@@ -54,6 +60,8 @@ const MOST_WAITING: usize = 64;
 pub struct Platform {
     source: Source,
     mount: Mount,
+    /// The ground; without it the plane z = 0.
+    terrain: Option<Arc<Terrain>>,
     delay_s: Option<f64>,
     lost_s: f64,
     /// What is learned of the delay where none is configured.
@@ -112,18 +120,26 @@ impl Platform {
     /// Opens what a config names; `altitude_m` is a fixed platform's. An autopilot's poses come in through [`Platform::live`].
     pub fn open(config: &Config, world: &geo::Config, altitude_m: f64) -> Result<Self, Error> {
         config.validate()?;
+        let terrain = Terrain::of_config(world)?;
         let source = match (config.kind, &config.poses) {
             (Kind::Replay, Some(path)) => {
                 let replay = Replay::open(path, world, config.poses_start)?;
                 Source::Replay(Box::new(replay), PoseBuffer::default())
             }
-            (Kind::Fixed, _) if config.mount.is_none() => Source::Level,
+            (Kind::Fixed, _) if config.mount.is_none() && terrain.is_none() => Source::Level,
             (Kind::Fixed, _) => Source::Fixed(Pose::level(Timestamp::UNIX_EPOCH, [0.0, 0.0, altitude_m])),
             _ => Source::Live(SharedPoses::default()),
         };
+        if let (Source::Fixed(_), Some(ground)) = (&source, terrain.as_ref().and_then(|t| t.at([0.0, 0.0])))
+            && !(altitude_m > ground.z_m)
+        {
+            let ground_m = ground.z_m;
+            return Err(Error::Buried { altitude_m, ground_m });
+        }
         Ok(Self {
             source,
             mount: config.mount,
+            terrain: terrain.map(Arc::new),
             delay_s: config.delay_s,
             lost_s: config.pose_lost_s,
             learned: DelayEstimate::default(),
@@ -138,6 +154,7 @@ impl Platform {
         Self {
             source: Source::Level,
             mount: Mount::default(),
+            terrain: None,
             delay_s: None,
             lost_s: Config::default().pose_lost_s,
             learned: DelayEstimate::default(),
@@ -145,6 +162,14 @@ impl Platform {
             learned_at: None,
             unlearned: VecDeque::new(),
         }
+    }
+
+    /// What of the ground the operator should know.
+    pub fn warnings(&self) -> Vec<String> {
+        self.terrain
+            .as_ref()
+            .map(|terrain| terrain.warnings())
+            .unwrap_or_default()
     }
 
     /// The buffer that a receiver of poses fills; none but for an autopilot's.
@@ -215,7 +240,7 @@ impl Platform {
         }
         let is_lost = pose.age_s > self.lost_s;
         Placement::At {
-            sight: Sight::new(&pose.pose, &self.mount),
+            sight: Sight::new(&pose.pose, &self.mount).over(self.terrain.clone()),
             pose: Box::new(pose),
             is_lost,
         }

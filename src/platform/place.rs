@@ -91,6 +91,7 @@ mod tests {
                 height_m: 500.0,
                 datum,
             }),
+            terrain: None,
         }
     }
 

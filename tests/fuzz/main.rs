@@ -121,6 +121,11 @@ fn ulg() {
 }
 
 #[test]
+fn terrain() {
+    try_seeds("fuzz/seeds/terrain", 300, targets::terrain);
+}
+
+#[test]
 fn v4l2() {
     try_seeds("fuzz/seeds/v4l2", 1000, targets::v4l2);
 }

@@ -58,7 +58,7 @@ impl Detection {
         detections
     }
 
-    /// `None` where the emitter's ray does not come down to the ground.
+    /// `None` where the emitter's ray meets no ground that is known.
     fn of_emitter(e: &Emitter, inflation: f64, view: &View) -> Option<Self> {
         let camera = &view.camera;
         let placed = view.place(e.sensor_m, [e.x_m, e.y_m], e.cov_m2)?;

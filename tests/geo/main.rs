@@ -1,5 +1,9 @@
 //! Places on the earth, held to reference values of two independent programs (tests/reference/geo/make.py).
 
+mod crossing;
+mod terrain;
+mod tiff;
+
 use oapwatch::geo::{Geodetic, LocalAxes};
 
 #[test]
@@ -12,7 +16,7 @@ fn local_metres_and_places_agree_with_geographiclib_and_pymap3d() {
             height_m,
         }
     };
-    let reference = include_str!("reference/geo/local.ndjson");
+    let reference = include_str!("../reference/geo/local.ndjson");
     for line in reference.lines() {
         let line: serde_json::Value = serde_json::from_str(line).unwrap();
         let axes = LocalAxes::at(place(&line["origin"]));
