@@ -17,6 +17,8 @@ pub struct View {
 pub struct Placed {
     /// East, north, m.
     pub position_m: Vector2<f64>,
+    /// Height of the ground there above the world's origin, m.
+    pub z_m: f64,
     /// Without the pose's error, m².
     pub cov_m2: [[f64; 2]; 2],
     /// ∂position/∂pose, as [`GroundPoint::by_pose`](super::GroundPoint); zero for a fixed platform.
@@ -30,6 +32,7 @@ impl View {
         let Some(sight) = &self.sight else {
             return Some(Placed {
                 position_m: level_m.into(),
+                z_m: 0.0,
                 cov_m2: level_cov,
                 by_pose: Matrix2x6::zeros(),
             });
@@ -39,6 +42,7 @@ impl View {
         let cov = point.by_sensor * Matrix2::new(a, b, b, c) * point.by_sensor.transpose();
         Some(Placed {
             position_m: point.horizontal_m(),
+            z_m: point.position_m.z,
             cov_m2: [[cov[(0, 0)], cov[(0, 1)]], [cov[(0, 1)], cov[(1, 1)]]],
             by_pose: point.by_pose,
         })
