@@ -61,14 +61,13 @@ impl Fake {
     pub async fn on_socket(config: Config, socket: &Path) -> Self {
         let journal = Journal::open(&journal::Config::default(), Vec::new()).unwrap();
         let listener = Listener::bind(&Listen::Unix(socket.to_owned())).unwrap();
-        let nowhere = SocketAddr::from(([127, 0, 0, 1], 0));
-        Self::serve(config, journal, 1, (listener, nowhere), |state| state).await
+        let at = (listener, SocketAddr::from(([127, 0, 0, 1], 0)));
+        Self::serve(config, journal, 1, at, |state| state).await
     }
 
     /// Starts with the folder of a recorder.
     pub async fn with_recordings(config: Config, folder: &Path) -> Self {
-        let estimator = oapwatch::estimate::Config::default();
-        Self::with(config, |state| state.with_evidence(folder, &estimator)).await
+        Self::with(config, |state| state.with_evidence(folder, &Default::default())).await
     }
 
     async fn on_port(config: Config, journal: Journal, now_us: u64, complete: impl FnOnce(State) -> State) -> Self {
