@@ -2,6 +2,8 @@
 
 #[path = "claims/formats.rs"]
 mod formats;
+#[path = "claims/heights.rs"]
+mod heights;
 
 use std::fs::{self, OpenOptions};
 use std::io::Write;

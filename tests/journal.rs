@@ -22,6 +22,8 @@ fn alert(id: &str, kind: AlertKind, raised_s: i64) -> Alert {
         user: Some("u-17".to_owned()),
         x_m: Some(12.5),
         y_m: Some(-80.0),
+        z_m: Some(0.0),
+        geodetic: None,
         cov_m2: Some([[0.1, 0.0], [0.0, 0.1]]),
         claimed: None,
         evidence: serde_json::json!({"distance_m": 7.5}),

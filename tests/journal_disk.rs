@@ -20,6 +20,8 @@ fn raised(k: u64) -> AlertEvent {
         user: None,
         x_m: None,
         y_m: None,
+        z_m: None,
+        geodetic: None,
         cov_m2: None,
         claimed: None,
         evidence: serde_json::json!({"text": "x".repeat(1000)}),

@@ -43,6 +43,8 @@ fn event(kind: AlertEventKind, id: &str) -> AlertEvent {
         user: None,
         x_m: Some(1.0),
         y_m: Some(2.0),
+        z_m: Some(0.0),
+        geodetic: None,
         cov_m2: None,
         claimed: None,
         evidence: serde_json::json!({"text": "x".repeat(300)}),

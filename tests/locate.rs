@@ -241,3 +241,66 @@ fn over_terrain_positions_are_where_rays_meet_it() {
     .unwrap();
     refused("expected [world] origin");
 }
+
+#[test]
+fn an_origin_places_emitters_on_the_earth_and_changes_nothing_else() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path();
+    let scene = format!(
+        "[optics]\npixels = [{SIDE}, {SIDE}]\n[link]\nintegration_time_s = 0.1\ncoherence_time_s = 0.01\n\
+         [[user]]\nname = \"a\"\nmotion.still = [80, -60]\n[[user]]\nname = \"b\"\nmotion.still = [-70, 90]\n"
+    );
+    std::fs::write(path.join("scene.toml"), scene).unwrap();
+    let simulate = [
+        "simulate",
+        "--scene",
+        "scene.toml",
+        "--frames",
+        "2",
+        "--seed",
+        "1",
+        "--out",
+        ".",
+    ];
+    let simulated = Command::new(env!("CARGO_BIN_EXE_oapwatch"))
+        .args(simulate)
+        .current_dir(path)
+        .output();
+    assert!(simulated.unwrap().status.success());
+    let frames = path.join("frames.npy");
+    let flat = lines(&locate(path, &frames, ""));
+    let (lat, lon, height) = (48.137_f64, 11.575, 520.0);
+    let world = format!(
+        "[world]\norigin = {{ latitude_deg = {lat}, longitude_deg = {lon}, height_m = {height}, datum = \"msl\" }}\n"
+    );
+    let placed = lines(&locate(path, &frames, &world));
+    // The ellipsoid's radii of curvature (Torge and Müller 2012, 4.1), to second order in metres over radius.
+    let (sin, cos) = lat.to_radians().sin_cos();
+    let e2 = (2.0 - 1.0 / 298.257_223_563) / 298.257_223_563;
+    let n = 6_378_137.0 / (1.0 - e2 * sin * sin).sqrt() + height;
+    let m = 6_378_137.0 * (1.0 - e2) / (1.0 - e2 * sin * sin).powf(1.5) + height;
+    let mut emitters = 0;
+    for (flat, placed) in flat.iter().zip(&placed) {
+        let [before, after] = [flat, placed].map(|line| line["emitters"].as_array().unwrap());
+        assert_eq!(before.len(), 2);
+        for (before, after) in before.iter().zip(after) {
+            let number = |key: &str| after[key].as_f64().unwrap();
+            let (x, y) = (number("x_m"), number("y_m"));
+            let latitude = lat + (y / m - x * x * sin / cos / (2.0 * m * n)).to_degrees();
+            let longitude = lon + (x / (n * cos) * (1.0 + y * sin / cos / n)).to_degrees();
+            let rise = (x * x + y * y) / (2.0 * n);
+            // A millimetre.
+            assert!((number("latitude_deg") - latitude).abs() < 1e-8, "{after}");
+            assert!((number("longitude_deg") - longitude).abs() < 1e-8, "{after}");
+            assert!((number("height_m") - height - rise).abs() < 1e-3, "{after}");
+            assert_eq!(before["z_m"], 0.0);
+            let mut stripped = after.clone();
+            for key in ["latitude_deg", "longitude_deg", "height_m"] {
+                stripped.as_object_mut().unwrap().remove(key);
+            }
+            assert_eq!(&stripped, before);
+            emitters += 1;
+        }
+    }
+    assert_eq!(emitters, 4);
+}

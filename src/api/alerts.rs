@@ -40,9 +40,9 @@ pub struct ListQuery {
 #[derive(Debug, Serialize, utoipa::ToSchema)]
 pub struct Page {
     /// Newest first.
-    alerts: Vec<Alert>,
+    pub(super) alerts: Vec<Alert>,
     /// What to give as `cursor` for the next page; null on the last.
-    next_cursor: Option<String>,
+    pub(super) next_cursor: Option<String>,
 }
 
 fn cursor(text: &str) -> Result<Cursor, Problem> {
@@ -80,6 +80,17 @@ pub async fn list(
     Query(query): Query<ListQuery>,
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
+    page(&state, &query, "/v1/alerts", &headers, |page| respond::json(&page)).await
+}
+
+/// The page that `query` asks for at `path`, written by `answer`, with a link to the next.
+pub(super) async fn page(
+    state: &State,
+    query: &ListQuery,
+    path: &str,
+    headers: &HeaderMap,
+    answer: impl FnOnce(Page) -> Response,
+) -> Result<Response, Problem> {
     let version = state.feed.last_event();
     let limit = within("limit", query.limit.unwrap_or(DEFAULT_LIMIT), 1, MAX_LIMIT)?;
     let filter = Filter {
@@ -88,19 +99,21 @@ pub async fn list(
         since: query.since,
         after: query.cursor.as_deref().map(cursor).transpose()?,
     };
-    let found = read(&state, move |journal| journal.alerts(&filter, limit)).await?;
+    let found = read(state, move |journal| journal.alerts(&filter, limit)).await?;
     let page = Page {
         next_cursor: found.next.map(|c| c.to_string()),
         alerts: found.alerts,
     };
-    let mut response = conditional::answer(&headers, version, || respond::json(&page));
-    if let Some(link) = page.next_cursor.as_deref().and_then(|c| next_link(&query, limit, c)) {
+    let next = page.next_cursor.as_deref();
+    let link = next.and_then(|cursor| next_link(path, query, limit, cursor));
+    let mut response = conditional::answer(headers, version, || answer(page));
+    if let Some(link) = link {
         response.headers_mut().insert(header::LINK, link);
     }
     Ok(response)
 }
 
-fn next_link(query: &ListQuery, limit: usize, cursor: &str) -> Option<HeaderValue> {
+fn next_link(path: &str, query: &ListQuery, limit: usize, cursor: &str) -> Option<HeaderValue> {
     let mut pairs = url::form_urlencoded::Serializer::new(String::new());
     let name = |value: serde_json::Value| value.as_str().unwrap_or_default().to_owned();
     if let Some(state) = query.state {
@@ -115,7 +128,7 @@ fn next_link(query: &ListQuery, limit: usize, cursor: &str) -> Option<HeaderValu
     pairs
         .append_pair("limit", &limit.to_string())
         .append_pair("cursor", cursor);
-    HeaderValue::from_str(&format!("</v1/alerts?{}>; rel=\"next\"", pairs.finish())).ok()
+    HeaderValue::from_str(&format!("<{path}?{}>; rel=\"next\"", pairs.finish())).ok()
 }
 
 #[derive(Debug, Deserialize, utoipa::IntoParams)]
@@ -151,6 +164,10 @@ const COLUMNS: &Columns = &[
     ("acknowledged_by", "/acknowledgement/by"),
     ("note", "/acknowledgement/note"),
     ("evidence", "/evidence"),
+    ("z_m", "/z_m"),
+    ("latitude_deg", "/latitude_deg"),
+    ("longitude_deg", "/longitude_deg"),
+    ("height_m", "/height_m"),
 ];
 
 /// Alerts as a table (CSV), newest first

@@ -19,6 +19,7 @@ mod evidence_fit;
 mod extract;
 mod feed;
 mod frame;
+mod geojson;
 mod guard;
 mod history;
 mod intake;

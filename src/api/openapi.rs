@@ -10,8 +10,8 @@ use utoipa_axum::routes;
 
 use super::state::State;
 use super::{
-    acknowledge, alerts, audit_log, claims, evidence, frame, known_lights, maintenance, pose, positions, probes, sse,
-    webhooks, websocket, zones,
+    acknowledge, alerts, audit_log, claims, evidence, frame, geojson, known_lights, maintenance, pose, positions,
+    probes, sse, webhooks, websocket, zones,
 };
 
 #[derive(OpenApi)]
@@ -41,6 +41,7 @@ impl Modify for Bearer {
 pub fn router() -> (Router<State>, utoipa::openapi::OpenApi) {
     OpenApiRouter::with_openapi(Described::openapi())
         .routes(routes!(positions::positions))
+        .routes(routes!(geojson::positions))
         .routes(routes!(positions::user_position))
         .routes(routes!(positions::history))
         .routes(routes!(positions::history_csv))
@@ -49,6 +50,7 @@ pub fn router() -> (Router<State>, utoipa::openapi::OpenApi) {
         .routes(routes!(positions::stations))
         .routes(routes!(alerts::list))
         .routes(routes!(alerts::csv))
+        .routes(routes!(geojson::alerts))
         .routes(routes!(alerts::get))
         .routes(routes!(acknowledge::acknowledge, acknowledge::unacknowledge))
         .routes(routes!(evidence::npy))

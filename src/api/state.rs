@@ -41,6 +41,8 @@ pub struct State {
     pub(super) fitter: Arc<Fitter>,
     /// The local axes on the earth, for posted claims in latitude and longitude.
     pub(super) axes: Option<LocalAxes>,
+    /// Whether places may be known on the earth: there is an origin, or this is a hub, whose stations have their own.
+    pub(super) has_latitudes: bool,
     /// Turns true when the server stops: streams then close.
     pub(super) stopping: watch::Sender<bool>,
 }
@@ -63,6 +65,7 @@ impl State {
             metrics,
             ready,
             axes: None,
+            has_latitudes: false,
             notifier: None,
             pictures: Arc::default(),
             stopping: watch::Sender::new(false),
@@ -90,6 +93,13 @@ impl State {
 
     pub fn with_axes(mut self, axes: Option<LocalAxes>) -> Self {
         self.axes = axes;
+        self.has_latitudes = axes.is_some();
+        self
+    }
+
+    /// The API of a hub: places are those of its stations.
+    pub fn of_hub(mut self) -> Self {
+        self.has_latitudes = true;
         self
     }
 

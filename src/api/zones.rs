@@ -8,13 +8,13 @@ use axum::response::{IntoResponse, Response};
 use serde_json::Value;
 
 use super::client::Caller;
+use super::geojson::MEDIA_TYPE;
 use super::known_lights::{body_of, written};
 use super::problem::Problem;
 use super::state::{Command, State, ZonesRefused};
 use crate::journal::AuditAction;
 use crate::monitor::zones::{Zone, ZoneError, ZoneMap, collection, parse};
 
-const MEDIA_TYPE: &str = "application/geo+json";
 const LARGEST_BODY: usize = 4 << 20;
 
 impl From<ZoneError> for Problem {

@@ -9,10 +9,10 @@ use serde::Serialize;
 
 use super::{Failure, Outcome, progress};
 use crate::config::Config;
-use crate::estimate::{self, Emitter};
+use crate::estimate::{self, Emitter, Flags, Velocity};
 use crate::frame::Frame;
 use crate::frames::{self, npy};
-use crate::geo::View;
+use crate::geo::{Geodetic, LocalAxes, View};
 use crate::platform::{Placement, Platform};
 
 #[derive(Debug, clap::Args)]
@@ -32,10 +32,10 @@ pub struct Args {
 
 /// One line of the output.
 #[derive(Serialize)]
-struct Line<'a> {
+struct Line {
     frame: u64,
     #[serde(skip_serializing_if = "Option::is_none")]
-    emitters: Option<&'a [Emitter]>,
+    emitters: Option<Vec<Located>>,
     #[serde(skip_serializing_if = "Option::is_none")]
     error: Option<String>,
     latency_us: u64,
@@ -47,25 +47,62 @@ struct Line<'a> {
     spot_error: Option<f64>,
 }
 
-/// Moves emitters from where a level camera would see them to where this one does, with its pose's uncertainty. One whose ray
-/// meets no known ground has no position and is left out.
-fn place(emitters: &mut Vec<Emitter>, platform: &mut Platform, view: &mut View, time: jiff::Timestamp) {
-    view.sight = match platform.at(time) {
-        Placement::Level => return,
-        Placement::At { sight, .. } => Some(sight),
-        Placement::Unknown { .. } => return emitters.clear(),
-    };
-    emitters.retain_mut(|e| {
-        let Some(placed) = view.place(e.sensor_m, [e.x_m, e.y_m], e.cov_m2) else {
-            return false;
+/// An emitter in the world.
+#[derive(Serialize)]
+struct Located {
+    x_m: f64,
+    y_m: f64,
+    /// Height of the ground there.
+    z_m: f64,
+    /// The same on the earth, where the world has an origin.
+    #[serde(flatten)]
+    geodetic: Option<Geodetic>,
+    cov_m2: [[f64; 2]; 2],
+    energy_j: f64,
+    #[serde(flatten)]
+    velocity: Option<Velocity>,
+    flags: Flags,
+}
+
+/// Where the emitters of a frame are.
+struct Locator {
+    platform: Platform,
+    view: View,
+    axes: Option<LocalAxes>,
+}
+
+impl Locator {
+    /// Moves emitters from where a level camera would see them to where this one does, with its pose's uncertainty. One whose ray
+    /// does not come down to the ground has no position and is left out.
+    fn locate(&mut self, emitters: &[Emitter], time: jiff::Timestamp) -> Vec<Located> {
+        self.view.sight = match self.platform.at(time) {
+            Placement::Level => None,
+            Placement::At { sight, .. } => Some(sight),
+            Placement::Unknown { .. } => return Vec::new(),
         };
-        [e.x_m, e.y_m] = placed.position_m.into();
-        let pose = view.pose_cov(placed.position_m);
-        let [[a, b], [_, c]] = placed.cov_m2;
-        let off = b + pose[(0, 1)];
-        e.cov_m2 = [[a + pose[(0, 0)], off], [off, c + pose[(1, 1)]]];
-        true
-    });
+        emitters.iter().filter_map(|e| self.place(e)).collect()
+    }
+
+    fn place(&self, e: &Emitter) -> Option<Located> {
+        let placed = self.view.place(e.sensor_m, [e.x_m, e.y_m], e.cov_m2)?;
+        let [x_m, y_m] = placed.position_m.into();
+        let mut cov_m2 = placed.cov_m2;
+        if self.view.sight.is_some() {
+            let pose = self.view.pose_cov(placed.position_m);
+            let off = cov_m2[0][1] + pose[(0, 1)];
+            cov_m2 = [[cov_m2[0][0] + pose[(0, 0)], off], [off, cov_m2[1][1] + pose[(1, 1)]]];
+        }
+        Some(Located {
+            x_m,
+            y_m,
+            z_m: placed.z_m,
+            geodetic: self.axes.map(|axes| axes.to_geodetic([x_m, y_m, placed.z_m])),
+            cov_m2,
+            energy_j: e.energy_j,
+            velocity: e.velocity,
+            flags: e.flags,
+        })
+    }
 }
 
 pub fn run(args: Args) -> Outcome {
@@ -91,11 +128,15 @@ pub fn run(args: Args) -> Outcome {
     let start = config.source.start.unwrap_or(jiff::Timestamp::UNIX_EPOCH);
     let rate_hz = config.source.rate_hz.unwrap_or(frames::Config::DEFAULT_RATE_HZ);
     let platform = Platform::open(&config.platform, &config.world, camera.altitude_m);
-    let mut platform = platform.map_err(Failure::config)?;
+    let platform = platform.map_err(Failure::config)?;
     for warning in platform.warnings() {
         eprintln!("oapwatch: {}: warning: {warning}", args.config.display());
     }
-    let mut view = View::level(&camera);
+    let mut locator = Locator {
+        platform,
+        view: View::level(&camera),
+        axes: config.world.axes(),
+    };
     let mut out = std::io::BufWriter::new(std::io::stdout().lock());
     let bar = progress::count("frames");
     let (mut usable, mut misshapen, mut first_error) = (0_u64, 0_u64, None);
@@ -115,15 +156,13 @@ pub fn run(args: Args) -> Outcome {
         };
         let clock = Instant::now();
         let is_over = || budget.is_some_and(|budget| clock.elapsed() >= budget);
-        let mut estimate = estimator.estimate_until(&frame, &is_over);
-        if let Ok(estimate) = &mut estimate {
-            place(&mut estimate.emitters, &mut platform, &mut view, frame.time);
-        }
+        let estimate = estimator.estimate_until(&frame, &is_over);
+        let located = estimate.as_ref().map(|e| locator.locate(&e.emitters, frame.time));
         let latency_us = clock.elapsed().as_micros() as u64;
-        let (emitters, error) = match &estimate {
-            Ok(estimate) => {
+        let (emitters, error) = match located {
+            Ok(emitters) => {
                 usable += 1;
-                (Some(estimate.emitters.as_slice()), None)
+                (Some(emitters), None)
             }
             Err(e) => {
                 first_error.get_or_insert_with(|| e.to_string());

@@ -74,16 +74,21 @@ impl Reload {
         let changed = new.tables_that_differ(&self.current);
         endpoints.extend(self.exports.replace(exports));
         self.webhooks.replace(endpoints).await?;
+        let claims = claims::Config {
+            // The origin changes with a restart only, as all of [world].
+            axes: self.current.claims.axes,
+            ..new.claims.clone()
+        };
         let settings = Settings {
             monitor: new.monitor.clone(),
-            claims: new.claims.clone(),
+            claims: claims.clone(),
             places,
         };
         // An error would mean that the compute thread has ended, and with it the daemon.
         let _ = self.settings.send(settings).await;
         self.current.log = new.log.clone();
         self.current.monitor = new.monitor.clone();
-        self.current.claims = new.claims.clone();
+        self.current.claims = claims;
         self.current.webhook = new.webhook.clone();
         self.current.zone = new.zone.clone();
         self.current.known_light = new.known_light.clone();

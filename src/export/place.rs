@@ -57,7 +57,7 @@ impl World {
         Place {
             horizontal_sigma_m: sigma_m(&emitter.cov_m2),
             axes_sigma_m: axes_sigma_m(&emitter.cov_m2),
-            ..self.at([emitter.x_m, emitter.y_m, 0.0])
+            ..self.at([emitter.x_m, emitter.y_m, emitter.z_m])
         }
     }
 
@@ -70,7 +70,7 @@ impl World {
         Place {
             horizontal_sigma_m: cov.and_then(sigma_m),
             axes_sigma_m: cov.and_then(axes_sigma_m),
-            ..self.at([x, y, 0.0])
+            ..self.at([x, y, alert.z_m.unwrap_or(0.0)])
         }
     }
 }

@@ -17,7 +17,7 @@ pub struct View {
 pub struct Placed {
     /// East, north, m.
     pub position_m: Vector2<f64>,
-    /// Up, m; zero on the plane.
+    /// Height of the ground there above the world's origin, m.
     pub z_m: f64,
     /// Without the pose's error, m².
     pub cov_m2: [[f64; 2]; 2],

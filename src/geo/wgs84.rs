@@ -1,6 +1,7 @@
 //! WGS-84: geodetic, earth-centred and local east-north-up coordinates.
 
 use nalgebra::{Matrix3, Vector3};
+use serde::{Deserialize, Serialize};
 
 /// Semi-major axis, m, and flattening of WGS-84 (NIMA TR8350.2, table 3.1).
 const A: f64 = 6_378_137.0;
@@ -9,7 +10,7 @@ const E2: f64 = F * (2.0 - F);
 const B: f64 = A * (1.0 - F);
 
 /// A place by latitude, longitude (degrees) and height above the ellipsoid, m.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Geodetic {
     pub latitude_deg: f64,
     pub longitude_deg: f64,

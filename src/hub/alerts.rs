@@ -5,6 +5,7 @@ use std::collections::{BTreeMap, HashMap, HashSet};
 use jiff::Timestamp;
 use serde_json::{Value, json};
 
+use crate::geo::Geodetic;
 use crate::monitor::{
     Acknowledgement, Alert, AlertEvent, AlertEventKind, AlertKind, AlertSource, AlertState, Severity, StationName,
     Withdrawal,
@@ -26,7 +27,8 @@ pub enum OwnCause {
 /// Place and evidence of one of the hub's own alerts.
 #[derive(Clone, Debug, Default)]
 pub struct Finding {
-    pub place_m: Option<[f64; 2]>,
+    pub place_m: Option<[f64; 3]>,
+    pub geodetic: Option<Geodetic>,
     pub evidence: Value,
 }
 
@@ -184,6 +186,8 @@ impl HubAlerts {
             user,
             x_m: finding.place_m.map(|p| p[0]),
             y_m: finding.place_m.map(|p| p[1]),
+            z_m: finding.place_m.map(|p| p[2]),
+            geodetic: finding.geodetic,
             cov_m2: None,
             claimed: None,
             evidence: finding.evidence,

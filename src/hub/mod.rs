@@ -94,7 +94,7 @@ impl Hub {
             self.metrics.clone(),
             ready.clone(),
         );
-        let state = state.with_webhooks(notifier.clone());
+        let state = state.with_webhooks(notifier.clone()).of_hub();
         tracing::info!(
             site = self.config.fleet.site.as_deref().unwrap_or("all"),
             url = self.config.fleet.url.as_deref().unwrap_or_default(),

@@ -223,8 +223,11 @@ impl Run {
             // Just started, the hub has not had the time to hear of anybody.
             if is_lost && uptime > self.lost_after_s {
                 let evidence = json!({ "last_seen_at": last_seen, "lost_after_s": self.lost_after_s });
-                let place_m = None;
-                events.push(self.alerts.raise(cause, Finding { place_m, evidence }, now));
+                let finding = Finding {
+                    evidence,
+                    ..Finding::default()
+                };
+                events.push(self.alerts.raise(cause, finding, now));
             } else if !is_lost {
                 events.push(self.alerts.clear(&cause, now));
             }
@@ -238,7 +241,8 @@ impl Run {
             };
             let seen = if a.is_seen { &a } else { &b };
             let finding = Finding {
-                place_m: Some([seen.x_m, seen.y_m]),
+                place_m: Some([seen.x_m, seen.y_m, seen.z_m]),
+                geodetic: seen.geodetic,
                 evidence: json!({ "places": [place(&a), place(&b)], "distance_m": (a.x_m - b.x_m).hypot(a.y_m - b.y_m) }),
             };
             events.push(self.alerts.raise(OwnCause::UserInTwoPlaces(user), finding, now));

@@ -9,6 +9,7 @@ use serde_json::Value;
 use crate::api::{StationState, StationStatus};
 use crate::claim::{Claim, ClaimState};
 use crate::fleet::message::{HealthMessage, PositionsMessage};
+use crate::geo::{Geodetic, LocalAxes};
 use crate::monitor::{PositionStatus, StationName, TrackedPosition};
 
 /// Stations known at once. Each costs some 50 kB with its positions and status.
@@ -60,6 +61,9 @@ pub struct Sighting {
     pub name: StationName,
     pub x_m: f64,
     pub y_m: f64,
+    pub z_m: f64,
+    /// Of a beam, where its station has an origin.
+    pub geodetic: Option<Geodetic>,
     /// Seen, not only claimed.
     pub is_seen: bool,
 }
@@ -240,6 +244,8 @@ struct Place {
     name: StationName,
     time: Timestamp,
     at: Vector2<f64>,
+    z_m: f64,
+    geodetic: Option<Geodetic>,
     cov: Matrix2<f64>,
     is_seen: bool,
 }
@@ -250,6 +256,8 @@ impl Place {
             name: message.name.clone(),
             time: message.time,
             at: Vector2::new(emitter.x_m, emitter.y_m),
+            z_m: emitter.z_m,
+            geodetic: emitter.geodetic,
             cov: cov(emitter),
             is_seen: true,
         }
@@ -260,6 +268,8 @@ impl Place {
             name: message.name.clone(),
             time: claim.time,
             at: Vector2::new(claim.x_m, claim.y_m),
+            z_m: claim.z_m.unwrap_or(0.0),
+            geodetic: None,
             cov: Matrix2::identity() * claim.sigma_m.unwrap_or(0.0).powi(2),
             is_seen: false,
         }
@@ -270,6 +280,8 @@ impl Place {
             name: self.name.clone(),
             x_m: self.at.x,
             y_m: self.at.y,
+            z_m: self.z_m,
+            geodetic: self.geodetic,
             is_seen: self.is_seen,
         }
     }
@@ -307,6 +319,8 @@ fn fuse(into: &mut TrackedPosition, other: &TrackedPosition, name: &StationName)
         into.status = other.status;
     }
     into.track = into.track.min(other.track);
+    let shift = [at.x - into.x_m, at.y - into.y_m, 0.0];
+    into.geodetic = into.geodetic.map(|here| LocalAxes::at(here).to_geodetic(shift));
     (into.x_m, into.y_m) = (at.x, at.y);
     into.cov_m2 = [[fused[(0, 0)], fused[(0, 1)]], [fused[(1, 0)], fused[(1, 1)]]];
 }

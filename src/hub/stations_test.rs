@@ -57,6 +57,26 @@ fn two_sightings_far_apart_conflict_and_near_ones_are_one_beam() {
 }
 
 #[test]
+fn a_fused_beam_is_between_both_on_the_earth_too() {
+    let axes = LocalAxes::at(Geodetic {
+        latitude_deg: 48.137,
+        longitude_deg: 11.575,
+        height_m: 520.0,
+    });
+    let seen = |station: &str, x_m: f64| {
+        let mut message = positions(station, 0, &[(1, Some("u"), x_m)], &[]);
+        message.emitters[0].geodetic = Some(axes.to_geodetic([x_m, 0.0, 0.0]));
+        message
+    };
+    let picture = stations(vec![seen("a", 80.0), seen("b", 80.2)]).picture(at(0), 5.0);
+    let found = axes.to_local(picture.emitters[0].geodetic.expect("stations with an origin"));
+    assert!((found[0] - 80.1).abs() < 1e-4 && found[1].abs() < 1e-4, "{found:?}");
+    // A station without an origin adds no place on the earth.
+    let picture = stations(vec![positions("a", 0, &[(1, None, 0.0)], &[])]).picture(at(0), 5.0);
+    assert!(picture.emitters[0].geodetic.is_none());
+}
+
+#[test]
 fn a_beam_here_and_a_claim_there_conflict_but_two_claims_do_not() {
     let here = positions("a", 0, &[(1, Some("u"), 0.0)], &[("u", 0.0)]);
     let there = positions("b", 0, &[], &[("u", 80.0)]);

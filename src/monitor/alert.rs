@@ -3,6 +3,8 @@
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 
+use crate::geo::Geodetic;
+
 /// Distance within which beams without a claim, one after the other, are one cause, m. Wider joins two strangers into one
 /// alert; narrower raises an alert for each reappearance of one who walks on while off. Not tuned; `a_beam_that_blinks` in
 /// `tests/monitor` checks it.
@@ -114,6 +116,13 @@ pub struct Alert {
     pub user: Option<String>,
     pub x_m: Option<f64>,
     pub y_m: Option<f64>,
+    /// Height of the ground there above the world's origin.
+    #[serde(default)]
+    pub z_m: Option<f64>,
+    /// The same on the earth, where `[world] origin` places it.
+    #[serde(default, flatten)]
+    #[schema(value_type = GeodeticFields)]
+    pub geodetic: Option<Geodetic>,
     pub cov_m2: Option<[[f64; 2]; 2]>,
     /// The claim that the position was compared with, where there is one.
     pub claimed: Option<serde_json::Value>,
@@ -143,6 +152,16 @@ pub struct Alert {
 pub struct StationFields {
     site: Option<String>,
     station: Option<String>,
+}
+
+/// How an optional [`Geodetic`] beside other fields is described: all of these or none.
+#[derive(utoipa::ToSchema)]
+#[allow(dead_code, reason = "a description only")]
+pub struct GeodeticFields {
+    latitude_deg: Option<f64>,
+    longitude_deg: Option<f64>,
+    /// Above the datum of `[world] origin`.
+    height_m: Option<f64>,
 }
 
 /// An access point among all sites.
@@ -273,6 +292,8 @@ mod tests {
             user: user.map(str::to_owned),
             x_m: Some(x),
             y_m: Some(0.0),
+            z_m: Some(0.0),
+            geodetic: None,
             cov_m2: None,
             claimed: None,
             evidence: serde_json::json!({}),

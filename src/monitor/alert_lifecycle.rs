@@ -214,6 +214,8 @@ impl AlertLifecycle {
             user: cause.user().map(str::to_owned),
             x_m: None,
             y_m: None,
+            z_m: None,
+            geodetic: None,
             cov_m2: None,
             claimed: None,
             evidence: Value::Null,
@@ -298,7 +300,7 @@ mod tests {
 
     fn at_place(track: u64, x: f64) -> Finding {
         let content = Content::new(Severity::Warning, json!({}));
-        let place = nalgebra::Vector2::new(x, 0.0);
+        let place = nalgebra::Vector3::new(x, 0.0, 0.0);
         Finding::present(Cause::Track(track), content.at(place, Default::default()))
     }
 

@@ -1,9 +1,10 @@
 //! What a rule says of a frame: a cause is present, absent, or continues under another name.
 
-use nalgebra::{Matrix2, Vector2};
+use nalgebra::{Matrix2, Vector3};
 use serde_json::Value;
 
 use super::alert::{Alert, AlertKind, KNOWN_LIGHT, SHARED_SPOT, Severity};
+use crate::geo::Geodetic;
 
 /// What an alert is about. While an alert is open for a cause, the cause raises no other.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -74,6 +75,8 @@ pub(super) struct Content {
     pub severity: Severity,
     pub x_m: Option<f64>,
     pub y_m: Option<f64>,
+    pub z_m: Option<f64>,
+    pub geodetic: Option<Geodetic>,
     pub cov_m2: Option<[[f64; 2]; 2]>,
     pub claimed: Option<Value>,
     pub evidence: Value,
@@ -116,6 +119,8 @@ impl Content {
             severity,
             x_m: None,
             y_m: None,
+            z_m: None,
+            geodetic: None,
             cov_m2: None,
             claimed: None,
             evidence,
@@ -126,9 +131,10 @@ impl Content {
     }
 
     /// Places the alert on the ground, m and m².
-    pub fn at(mut self, position: Vector2<f64>, cov: Matrix2<f64>) -> Self {
-        self.x_m = Some(position.x);
-        self.y_m = Some(position.y);
+    pub fn at(mut self, place: Vector3<f64>, cov: Matrix2<f64>) -> Self {
+        self.x_m = Some(place.x);
+        self.y_m = Some(place.y);
+        self.z_m = Some(place.z);
         self.cov_m2 = Some([[cov[(0, 0)], cov[(0, 1)]], [cov[(1, 0)], cov[(1, 1)]]]);
         self
     }
@@ -143,6 +149,8 @@ impl Content {
         alert.severity = self.severity;
         alert.x_m = self.x_m;
         alert.y_m = self.y_m;
+        alert.z_m = self.z_m;
+        alert.geodetic = self.geodetic;
         alert.cov_m2 = self.cov_m2;
         alert.claimed = self.claimed;
         alert.evidence = self.evidence;

@@ -6,7 +6,6 @@ use nalgebra::{Matrix2, Matrix6, Vector2, Vector6};
 use super::alert_lifecycle::AlertLifecycle;
 use super::ambiguity;
 use super::config::{Config, Source};
-use super::finding::Content;
 use super::input::claim_state::ActiveClaim;
 use super::input::claim_timing::ClaimTiming;
 use super::input::crowding::Crowding;
@@ -27,9 +26,9 @@ use super::track::detection::{Detection, OVERLAP, spot_m};
 use super::track::registration::register;
 use super::track::tracker::Tracker;
 use super::track::user_tracks::UserTracks;
-use super::zones::{Zone, ZoneKind, ZoneMap};
+use super::zones::ZoneMap;
 use crate::claims::{Squeeze, seconds};
-use crate::geo::View;
+use crate::geo::{LocalAxes, View};
 use crate::optics::Camera;
 
 /// Standard deviation of what is systematic in positions and does not average out, m. Larger delays the alert of a drift, smaller
@@ -51,10 +50,6 @@ const MAX_SCORE: f64 = 1.5;
 /// Time since a user was last seen, beside any blindness, within which they count as visible, s. Longer takes users who have left
 /// for a lost sensor, shorter forgets those whom a few frames missed. Not measured.
 const VISIBLE_S: f64 = 2.0;
-/// Standard deviations of a position within which it may be inside of an ignored zone: who stands at the edge must not flicker. More
-/// widen the ground on which a stranger is ignored by as much.
-const EDGE: f64 = 3.0;
-
 /// Claims that found no room or time, lately, and the room there is.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Overload {
@@ -75,6 +70,8 @@ pub(super) struct FrameContext {
     pub config: Config,
     /// What the camera sees in this frame.
     pub view: View,
+    /// Where the world's axes lie on the earth, where that is known.
+    pub axes: Option<LocalAxes>,
     pub budget: ErrorBudget,
     /// Standard deviation of claims that state none, m.
     pub default_sigma_m: f64,
@@ -126,6 +123,7 @@ impl FrameContext {
         Self {
             config: config.clone(),
             view: View::level(camera),
+            axes: claims.axes,
             budget,
             default_sigma_m: claims.default_sigma_m,
             time: None,
@@ -377,61 +375,6 @@ impl FrameContext {
     pub fn position_error_m(&self, track: &Track) -> f64 {
         let here = track.filter.position();
         largest_eigenvalue(&(track.filter.position_cov() + self.systematic_cov(here))).sqrt()
-    }
-
-    /// The restricted zone that a track is in.
-    pub fn restricted_zone(&self, track: &Track) -> Option<&Zone> {
-        if self.zones.is_empty() {
-            return None;
-        }
-        self.zones.within(self.world(track), ZoneKind::Restricted, 0.0)
-    }
-
-    /// The zone in which a beam that nobody claims raises nothing: by its errors it may be inside. A restricted zone goes before.
-    pub fn ignore_zone(&self, track: &Track) -> Option<&Zone> {
-        if self.zones.is_empty() {
-            return None;
-        }
-        let (here, error_m) = (self.world(track), self.position_error_m(track));
-        let ignored = self.zones.within(here, ZoneKind::Ignore, -EDGE * error_m)?;
-        self.zones
-            .within(here, ZoneKind::Restricted, 0.0)
-            .is_none()
-            .then_some(ignored)
-    }
-
-    /// Distance within which the user of a claim at `p` is where they say, m.
-    pub fn tolerated_distance_m(&self, p: Vector2<f64>) -> f64 {
-        if self.zones.is_empty() {
-            return self.config.tolerated_distance_m;
-        }
-        let near = self.zones.near(self.unmoved(p));
-        let watched = near.filter(|i| i.zone.kind == ZoneKind::Watch && i.depth_m >= 0.0);
-        let own = watched.filter_map(|i| i.zone.tolerated_distance_m);
-        own.reduce(f64::min).unwrap_or(self.config.tolerated_distance_m)
-    }
-
-    /// Adds to an alert what its zone and the maintenance in force say.
-    pub fn mark(&self, content: &mut Content) {
-        content.maintenance = self.maintenance.in_force(self.now).map(|window| window.id.clone());
-        if content.maintenance.is_some() {
-            content.webhooks = Some(Vec::new());
-        }
-        let Some((x, y)) = content.x_m.zip(content.y_m).filter(|_| !self.zones.is_empty()) else {
-            return;
-        };
-        // What lasts of a moving platform's pose error is out of the alert's place already.
-        let place = Vector2::new(x, y);
-        let here = (place - self.pose.displacement().at(place)).into();
-        let of = |kind| self.zones.within(here, kind, 0.0);
-        let Some(zone) = of(ZoneKind::Restricted).or_else(|| of(ZoneKind::Watch)) else {
-            return;
-        };
-        content.zone = Some(zone.name.clone());
-        content.severity = zone.severity.unwrap_or(content.severity);
-        if content.webhooks.is_none() {
-            content.webhooks = zone.webhooks.clone();
-        }
     }
 
     /// σ of a spot on the ground, m.

@@ -20,6 +20,7 @@ mod maintenance;
 #[expect(clippy::module_inception, reason = "the list of files names the stages")]
 mod monitor;
 mod operator;
+mod places;
 mod pose;
 mod report;
 mod rules;

@@ -5,8 +5,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::claims::Claim;
 use crate::estimate::{Error, Estimate};
-use crate::geo::Sight;
-use crate::monitor::alert::{AlertEvent, StationFields, StationName};
+use crate::geo::{Geodetic, Sight};
+use crate::monitor::alert::{AlertEvent, GeodeticFields, StationFields, StationName};
 
 /// One frame's estimate, or why there is none.
 #[derive(Clone, Copy, Debug)]
@@ -54,6 +54,13 @@ pub struct TrackedPosition {
     pub track: u64,
     pub x_m: f64,
     pub y_m: f64,
+    /// Height of the ground there above the world's origin.
+    #[serde(default)]
+    pub z_m: f64,
+    /// The same on the earth, where `[world] origin` places it.
+    #[serde(default, flatten)]
+    #[schema(value_type = GeodeticFields)]
+    pub geodetic: Option<Geodetic>,
     pub cov_m2: [[f64; 2]; 2],
     pub energy_j: f64,
     /// The user whose claim it is associated with, if any. Never an input to the position.

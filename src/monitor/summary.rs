@@ -50,12 +50,14 @@ fn position(frame: &FrameContext, track: &Track, user: Option<&str>, mismatched:
         None if track.confirmed && frame.ignore_zone(track).is_some() => PositionStatus::Ignored,
         _ => PositionStatus::Pending,
     };
-    let (p, c) = (frame.position(track), frame.position_cov(track));
+    let (place, c) = (frame.place(track), frame.position_cov(track));
     let flags = track.detection.flags;
     TrackedPosition {
         track: track.id,
-        x_m: p.x,
-        y_m: p.y,
+        x_m: place.x,
+        y_m: place.y,
+        z_m: place.z,
+        geodetic: frame.geodetic(place),
         cov_m2: [[c[(0, 0)], c[(0, 1)]], [c[(1, 0)], c[(1, 1)]]],
         energy_j: track.detection.energy_j,
         user: user.map(str::to_owned),

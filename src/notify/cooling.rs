@@ -240,6 +240,8 @@ mod tests {
                 user: None,
                 x_m: Some(place[0]),
                 y_m: Some(place[1]),
+                z_m: Some(0.0),
+                geodetic: None,
                 cov_m2: None,
                 claimed: None,
                 evidence: json!({}),

@@ -40,6 +40,8 @@ pub fn test_event(now: Timestamp) -> Recorded {
         user: None,
         x_m: Some(0.0),
         y_m: Some(0.0),
+        z_m: Some(0.0),
+        geodetic: None,
         cov_m2: Some([[1.0, 0.0], [0.0, 1.0]]),
         claimed: None,
         evidence: serde_json::json!({ "test": true }),

@@ -43,47 +43,45 @@ pub fn at(second: i64) -> Timestamp {
 
 impl Fake {
     pub async fn start(config: Config) -> Self {
+        Self::with(config, |state| state).await
+    }
+
+    /// Starts with what `complete` adds to its state.
+    pub async fn with(config: Config, complete: impl FnOnce(State) -> State) -> Self {
         let journal = Journal::open(&journal::Config::default(), Vec::new()).unwrap();
-        Self::resume(config, journal, 1).await
+        Self::on_port(config, journal, 1, complete).await
     }
 
     /// Starts on the journal of an earlier run; `now_us` stands for the clock.
     pub async fn resume(config: Config, journal: Journal, now_us: u64) -> Self {
-        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
-        let address = listener.local_addr().unwrap();
-        Self::serve(config, journal, now_us, listener.into(), address, None).await
+        Self::on_port(config, journal, now_us, |state| state).await
     }
 
     /// Starts on a Unix socket; `address` is then of no use.
     pub async fn on_socket(config: Config, socket: &Path) -> Self {
         let journal = Journal::open(&journal::Config::default(), Vec::new()).unwrap();
         let listener = Listener::bind(&Listen::Unix(socket.to_owned())).unwrap();
-        Self::serve(
-            config,
-            journal,
-            1,
-            listener,
-            SocketAddr::from(([127, 0, 0, 1], 0)),
-            None,
-        )
-        .await
+        let at = (listener, SocketAddr::from(([127, 0, 0, 1], 0)));
+        Self::serve(config, journal, 1, at, |state| state).await
     }
 
     /// Starts with the folder of a recorder.
     pub async fn with_recordings(config: Config, folder: &Path) -> Self {
-        let journal = Journal::open(&journal::Config::default(), Vec::new()).unwrap();
+        Self::with(config, |state| state.with_evidence(folder, &Default::default())).await
+    }
+
+    async fn on_port(config: Config, journal: Journal, now_us: u64, complete: impl FnOnce(State) -> State) -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
         let address = listener.local_addr().unwrap();
-        Self::serve(config, journal, 1, listener.into(), address, Some(folder)).await
+        Self::serve(config, journal, now_us, (listener.into(), address), complete).await
     }
 
     async fn serve(
         config: Config,
         journal: Journal,
         now_us: u64,
-        listener: Listener,
-        address: SocketAddr,
-        recordings: Option<&Path>,
+        (listener, address): (Listener, SocketAddr),
+        complete: impl FnOnce(State) -> State,
     ) -> Self {
         // reqwest is built without a default; a second installation finds the first in place.
         let _ = rustls::crypto::ring::default_provider().install_default();
@@ -91,10 +89,8 @@ impl Fake {
         let ready = Arc::new(AtomicBool::new(true));
         let (commands, received) = mpsc::channel(64);
         let metrics = oapwatch::metric::recorder().unwrap().handle();
-        let mut state = State::new(feed.clone(), commands, journal.clone(), metrics, ready.clone());
-        if let Some(folder) = recordings {
-            state = state.with_evidence(folder, &oapwatch::estimate::Config::default());
-        }
+        let state = State::new(feed.clone(), commands, journal.clone(), metrics, ready.clone());
+        let state = complete(state);
         tokio::spawn(answer(received, feed.clone(), journal.clone()));
         let (stop, stopped) = oneshot::channel::<()>();
         let server = Server::new(config).unwrap();
@@ -177,7 +173,7 @@ pub async fn until_closed(mut stream: TcpStream) -> String {
     String::from_utf8_lossy(&said).into_owned()
 }
 
-async fn publish(feed: &Feed, journal: &Journal, event: AlertEventKind, alert: Alert) {
+pub async fn publish(feed: &Feed, journal: &Journal, event: AlertEventKind, alert: Alert) {
     let events = feed.number(vec![AlertEvent { event, alert }], at(0));
     journal.record_numbered(&events, at(0)).unwrap();
     journal.settled().await;
@@ -301,6 +297,8 @@ pub fn alert(id: &str, second: i64) -> Alert {
         user: None,
         x_m: Some(-40.0),
         y_m: Some(60.0),
+        z_m: Some(0.0),
+        geodetic: None,
         cov_m2: Some([[0.01, 0.0], [0.0, 0.01]]),
         claimed: None,
         evidence: serde_json::json!({"seconds_seen": 1.0, "log_likelihood_ratio": 38.2}),
@@ -322,6 +320,8 @@ fn beam(track: u64, x_m: f64, y_m: f64, user: Option<&str>, status: PositionStat
         track,
         x_m,
         y_m,
+        z_m: 0.0,
+        geodetic: None,
         cov_m2: [[0.04, 0.01], [0.01, 0.03]],
         energy_j: 0.008,
         user: user.map(str::to_owned),

@@ -4,6 +4,7 @@ mod bodies;
 mod connections;
 mod evidence;
 mod fake;
+mod geojson;
 mod guards;
 mod rest;
 mod stream;

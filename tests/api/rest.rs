@@ -262,6 +262,8 @@ async fn the_description_is_openapi_3_1_and_lists_every_path() {
     assert!(api["openapi"].as_str().unwrap().starts_with("3.1"));
     for path in [
         "/v1/positions",
+        "/v1/positions.geojson",
+        "/v1/alerts.geojson",
         "/v1/users/{user}/position",
         "/v1/alerts",
         "/v1/alerts.csv",

@@ -33,6 +33,8 @@ pub fn event(event: AlertEventKind, id: &str, kind: AlertKind) -> AlertEvent {
         user: None,
         x_m: Some(1.5),
         y_m: Some(-2.5),
+        z_m: Some(0.0),
+        geodetic: None,
         cov_m2: None,
         claimed: None,
         evidence: serde_json::json!({"log_likelihood_ratio": 12.5}),

@@ -340,7 +340,7 @@ fn content(
         "threshold": threshold,
         "flags": detection.flags,
     });
-    Content::new(severity, evidence).at(frame.position(track), frame.position_cov(track))
+    Content::new(severity, evidence).at(frame.place(track), frame.position_cov(track))
 }
 
 #[cfg(test)]
@@ -448,7 +448,8 @@ mod tests {
         beams.push(detection(5.0, 0.0));
         watch.scene.detect(&beams);
         let stranger = watch.scene.tracker.tracks.last().unwrap().id;
-        let content = Content::new(Severity::Warning, json!({})).at(Vector2::new(5.0, 0.0), Default::default());
+        let content =
+            Content::new(Severity::Warning, json!({})).at(nalgebra::Vector3::new(5.0, 0.0, 0.0), Default::default());
         watch
             .scene
             .apply(vec![Finding::present(Cause::Track(stranger), content)]);

@@ -199,7 +199,7 @@ fn content(
         "threshold": threshold,
         "flags": track.detection.flags,
     });
-    Content::new(severity, evidence).at(frame.position(track), frame.position_cov(track))
+    Content::new(severity, evidence).at(frame.place(track), frame.position_cov(track))
 }
 
 /// Adds the frame to what is known of the lights.

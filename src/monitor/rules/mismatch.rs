@@ -158,7 +158,7 @@ impl User {
             "answered_from_elsewhere": self.is_displaced,
             "power_against_reported": power_against_reported(frame, i),
         });
-        let content = Content::new(severity, evidence).at(frame.position(track), frame.position_cov(track));
+        let content = Content::new(severity, evidence).at(frame.place(track), frame.position_cov(track));
         Some(content.with_claim(claimed(claim)))
     }
 }

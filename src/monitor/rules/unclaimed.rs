@@ -218,7 +218,7 @@ fn content(frame: &FrameContext, track: &Track, since: Timestamp) -> Content {
         Some(_) => Severity::Critical,
         None => Severity::of_duration(lasted_s),
     };
-    Content::new(severity, evidence).at(frame.position(track), frame.position_cov(track))
+    Content::new(severity, evidence).at(frame.place(track), frame.position_cov(track))
 }
 
 /// The beam that this one is a reflection of, if it fades with one and stays beside it.

@@ -53,7 +53,7 @@ pub fn evaluate(frame: &FrameContext) -> Vec<Finding> {
                 "depth_m": breach.depth_m,
             });
             Content::new(severity, evidence)
-                .at(frame.position(track), frame.position_cov(track))
+                .at(frame.place(track), frame.position_cov(track))
                 .with_claim(claimed(claim))
         });
         findings.push(Finding::of(cause, content));

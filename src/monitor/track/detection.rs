@@ -19,6 +19,8 @@ pub const OVERLAP: f64 = 3.0;
 #[derive(Clone, Debug)]
 pub struct Detection {
     pub position: Vector2<f64>,
+    /// Height of the ground there above the world's origin, m.
+    pub z_m: f64,
     pub cov: Matrix2<f64>,
     /// ∂position/∂pose; zero for a fixed platform.
     pub by_pose: Matrix2x6<f64>,
@@ -70,6 +72,7 @@ impl Detection {
         let cov = Matrix2::new(a, b, b, c) * inflation + Matrix2::identity() * POSITION_FLOOR_M.powi(2);
         Some(Self {
             position: placed.position_m,
+            z_m: placed.z_m,
             cov,
             by_pose: placed.by_pose,
             velocity: e.velocity.map(|v| Vector2::new(v.vx_m_s, v.vy_m_s)),
@@ -179,6 +182,7 @@ pub mod fixture {
     pub fn detection(x: f64, y: f64) -> Detection {
         Detection {
             position: Vector2::new(x, y),
+            z_m: 0.0,
             cov: Matrix2::identity() * 0.01,
             by_pose: Matrix2x6::zeros(),
             velocity: None,
