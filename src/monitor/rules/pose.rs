@@ -149,7 +149,7 @@ mod tests {
     #[test]
     fn a_displacement_that_grows_within_seconds_is_a_dragged_position() {
         let mut scene = Scene::of_users(&USERS);
-        let mut drag = |scene: &mut Scene, speed: f64| {
+        let drag = |scene: &mut Scene, speed: f64| {
             for k in 0..600 {
                 let seconds = (f64::from(k) * 0.1 - 50.0).max(0.0);
                 scene.wander.update(Some(Vector2::new(speed * seconds, 0.0)), 0.1);
