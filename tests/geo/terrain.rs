@@ -54,12 +54,7 @@ fn on_ground(x: f64, y: f64, z: impl Fn(f64, f64) -> f64) -> f64 {
 
 #[test]
 fn a_geotiff_by_latitude_and_longitude_is_read_whatever_its_layout() {
-    for (kind, rounding_m) in [
-        (Kind::F32, 0.01),
-        (Kind::F64, 0.01),
-        (Kind::I16, 1.1),
-        (Kind::U16, 1.1),
-    ] {
+    for (kind, rounding_m) in [(Kind::F32, 0.01), (Kind::F64, 0.01), (Kind::I16, 1.1), (Kind::U16, 1.1)] {
         for is_tiled in [false, true] {
             let file = degrees(kind, is_tiled, GEOGRAPHIC, &[], slope);
             let terrain = read(file, "dem.tif", &ORIGIN).unwrap();
