@@ -21,8 +21,8 @@ const FINEST_M: f64 = 0.05;
 const COARSEST_M: f64 = 1000.0;
 /// Most pixels that are read.
 const MOST_PIXELS: usize = 1 << 26;
-/// Map coordinates are exact at nodes this far apart and linear between: off by d²/8R, 0.2 mm.
-const ANCHORS_M: f64 = 100.0;
+/// Map coordinates are exact at nodes this far apart and linear between: off by d²/8R along each axis, 5 mm.
+const ANCHORS_M: f64 = 500.0;
 /// A height at which map coordinates are taken too, m: verticals 20 km apart differ by 3 mrad.
 const UP_M: f64 = 1000.0;
 /// Ground at the origin that is farther from z = 0 is warned of, m: models are off by 5 to 10 m.
@@ -65,7 +65,7 @@ impl Terrain {
         if let Some((share, nearest_m)) = self.voids() {
             let (percent, half_m) = (100.0 * share, self.half_m());
             warnings.push(format!(
-                "world.terrain: no height is known at some places, the nearest {nearest_m:.0} m from the origin (voids, or beyond the file: {percent:.2} % of the square within {half_m:.0} m); a beam there has no position"
+                "world.terrain: {percent:.2} % of the square within {half_m:.0} m of the origin have no height (voids, or beyond the file), the nearest {nearest_m:.0} m from it: a beam there has no position"
             ));
         }
         if let Some(ground) = self.at([0.0, 0.0])
