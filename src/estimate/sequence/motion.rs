@@ -2,8 +2,10 @@
 
 use nalgebra::{DMatrix, DVector};
 
+use crate::estimate::emitter::Velocity;
 use crate::estimate::sequence::joint_information::{JointInformation, STATE};
 use crate::estimate::sequence::window::SPEED_STD_M_S;
+use crate::optics::Camera;
 
 /// Standard deviations of a speed along an axis, m/s, that emitters of a scene may have: all stand still, walk, cycle, drive.
 const SPEEDS_M_S: [f64; 4] = [0.01, 0.7, 2.5, SPEED_STD_M_S];
@@ -71,4 +73,16 @@ fn held(total: &JointInformation, speed: f64) -> Option<Posterior> {
     let covariance = held.factor(1e-13)?.inverse();
     let state = &held.at + &covariance * &held.gradient;
     Some(Posterior { state, covariance })
+}
+
+/// Velocity on the ground of one on the sensor, m/s, at `sensor_m`.
+pub(crate) fn velocity_on_ground(camera: &Camera, sensor_m: [f64; 2], velocity: [f64; 2]) -> Velocity {
+    /// Time over which the difference quotient is taken, s: a walker's place on the sensor moves by 10⁻⁷ m.
+    const DT: f64 = 1e-3;
+    let ahead = camera.to_ground([0, 1].map(|k| sensor_m[k] + 0.5 * DT * velocity[k]));
+    let behind = camera.to_ground([0, 1].map(|k| sensor_m[k] - 0.5 * DT * velocity[k]));
+    Velocity {
+        vx_m_s: (ahead[0] - behind[0]) / DT,
+        vy_m_s: (ahead[1] - behind[1]) / DT,
+    }
 }

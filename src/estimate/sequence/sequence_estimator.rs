@@ -5,7 +5,7 @@ use std::sync::Arc;
 use jiff::Timestamp;
 use nalgebra::{DMatrix, DVector};
 
-use crate::estimate::emitter::{Estimate, Flags, Velocity};
+use crate::estimate::emitter::{Estimate, Flags};
 use crate::estimate::error::Error;
 use crate::estimate::estimator::Estimator;
 use crate::estimate::estimators::analytic::AnalyticEstimator;
@@ -15,7 +15,7 @@ use crate::estimate::fit::work_budget::WorkBudget;
 use crate::estimate::model::hypothesis::Nuisances;
 use crate::estimate::rules::Rules;
 use crate::estimate::sequence::joint_information::{JointInformation, STATE};
-use crate::estimate::sequence::motion::{Posterior, posterior};
+use crate::estimate::sequence::motion::{Posterior, posterior, velocity_on_ground};
 use crate::estimate::sequence::search::WindowSearch;
 use crate::estimate::sequence::snapshot::{Engine, LocalQuadratic, Snapshot, hypothesis};
 use crate::estimate::sequence::window::{SPEED_STD_M_S, Target, Window};
@@ -23,9 +23,6 @@ use crate::estimate::uncertainty::localise::localise;
 use crate::frame::Frame;
 use crate::optics::Camera;
 
-/// Standard deviations of χ² from which a frame contradicts what is remembered, as the flag `poor_fit` of one frame: nearer, noise alone would end the
-/// memory within hours.
-const UNEXPLAINED: f64 = 5.0;
 /// Evidence, ln, that a target has gone dark before it is dropped: false once in a million.
 const DARK: f64 = 14.0;
 /// Frames nearer in time than this count as one draw of the fading, s: the coherence time of a turbulent atmosphere.
@@ -38,11 +35,6 @@ const MAX_NUMBERS: usize = 1 << 20;
 /// Steps of a fit to a new frame, and of the whole window.
 const FRAME_STEPS: usize = 12;
 const WINDOW_STEPS: usize = 30;
-/// The window is fitted anew when a position has moved this far since it was linearised, as a share of the distance to the nearest emitter,
-/// at most of a σ: the information of overlapping spots changes over that distance.
-const MOVED: f64 = 0.02;
-/// Pairs nearer than this many standard deviations of their difference are ambiguous: the window is searched again.
-const AMBIGUOUS: f64 = 4.0;
 /// The window is searched when it has grown by this factor since, and at the latest after this many frames.
 const SEARCH_GROWTH: f64 = 1.4;
 const SEARCH_AFTER: usize = 32;
@@ -205,7 +197,7 @@ impl SequenceEstimator {
             penalty: space.source_penalty,
         };
         search.refine(&mut next, born_s);
-        let is_explained = is_last_explained(&next);
+        let is_explained = next.is_last_explained();
         if is_explained {
             self.window = next;
         }
@@ -283,7 +275,7 @@ impl SequenceEstimator {
             penalty: space.source_penalty,
         };
         search.grow(&mut fresh, time_s);
-        is_last_explained(&fresh).then_some(fresh)
+        fresh.is_last_explained().then_some(fresh)
     }
 
     /// Ends targets that have gone dark: frames before hold them still.
@@ -330,7 +322,8 @@ impl SequenceEstimator {
         if window.snapshots.len() > most {
             window.fold(window.snapshots.len() - most);
         }
-        if has_moved(window) {
+        window.forget_dead();
+        if window.has_moved() {
             window.fit(&mut engine, WINDOW_STEPS);
         }
         self.since_search += 1;
@@ -344,7 +337,7 @@ impl SequenceEstimator {
             matched_filter: &mut space.matched_filter,
             penalty: space.source_penalty,
         };
-        let is_ambiguous = is_ambiguous(window);
+        let is_ambiguous = window.is_ambiguous();
         let born_s = window.snapshots[0].time_s;
         let has_grown = search.grow(window, born_s);
         if is_ambiguous || has_grown {
@@ -418,70 +411,5 @@ impl SequenceEstimator {
             condition: found.condition,
             steps: budget.steps,
         }
-    }
-}
-
-/// Whether noise alone explains what the newest snapshot leaves.
-fn is_last_explained(window: &Window) -> bool {
-    window.snapshots.last().is_some_and(|last| {
-        let emitters = window.present(last.time_s).len() as f64;
-        let freedom = (last.compressed.data_count - 3.0 * emitters).max(1.0);
-        last.local.deviance < freedom + UNEXPLAINED * (2.0 * freedom).sqrt() + UNEXPLAINED
-    })
-}
-
-/// Whether positions have moved so far that snapshots need a new linearisation.
-fn has_moved(window: &Window) -> bool {
-    let n = window.len();
-    let at = |e: usize| [window.state[STATE * e], window.state[STATE * e + 1]];
-    let reach: Vec<f64> = (0..n)
-        .map(|e| {
-            let apart = |f: usize| (at(e)[0] - at(f)[0]).hypot(at(e)[1] - at(f)[1]);
-            MOVED * (0..n).filter(|f| *f != e).map(apart).fold(1.0, f64::min)
-        })
-        .collect();
-    window.snapshots.iter().any(|s| {
-        let moved = window.positions(&window.state, s.time_s) - &s.local.positions;
-        let present = window.present(s.time_s);
-        present
-            .iter()
-            .enumerate()
-            .any(|(i, &e)| moved[2 * i].hypot(moved[2 * i + 1]) > reach[e])
-    })
-}
-
-/// Whether a pair of emitters is not told apart for certain.
-fn is_ambiguous(window: &Window) -> bool {
-    let Some(covariance) = window.covariance() else {
-        return true;
-    };
-    let present = window.present(window.time_s);
-    present.iter().any(|&e| {
-        present.iter().take_while(|f| **f < e).any(|&f| {
-            let d = [0, 1].map(|k| window.state[STATE * e + k] - window.state[STATE * f + k]);
-            let of = |a: usize, b: usize| covariance[(a, b)];
-            let mut along = 0.0;
-            for r in 0..2 {
-                for c in 0..2 {
-                    let (a, b) = (STATE * e, STATE * f);
-                    let s = of(a + r, a + c) + of(b + r, b + c) - of(a + r, b + c) - of(b + r, a + c);
-                    along += d[r] * s * d[c];
-                }
-            }
-            let square = d[0] * d[0] + d[1] * d[1];
-            square * square < AMBIGUOUS * AMBIGUOUS * along
-        })
-    })
-}
-
-/// Velocity on the ground of one on the sensor, m/s, at `sensor_m`.
-fn velocity_on_ground(camera: &Camera, sensor_m: [f64; 2], velocity: [f64; 2]) -> Velocity {
-    /// Time over which the difference quotient is taken, s: a walker's place on the sensor moves by 10⁻⁷ m.
-    const DT: f64 = 1e-3;
-    let ahead = camera.to_ground([0, 1].map(|k| sensor_m[k] + 0.5 * DT * velocity[k]));
-    let behind = camera.to_ground([0, 1].map(|k| sensor_m[k] - 0.5 * DT * velocity[k]));
-    Velocity {
-        vx_m_s: (ahead[0] - behind[0]) / DT,
-        vy_m_s: (ahead[1] - behind[1]) / DT,
     }
 }

@@ -16,6 +16,15 @@ const LONGEST_STEP: f64 = 0.5;
 /// Standard deviation of a speed that is not known, m/s: cars in town. It only keeps the first frames' normal equations regular.
 pub(crate) const SPEED_STD_M_S: f64 = 8.0;
 
+/// Standard deviations of χ² from which a frame contradicts what is remembered, as the flag `poor_fit` of one frame: nearer, noise alone would end the
+/// memory within hours.
+const UNEXPLAINED: f64 = 5.0;
+/// The window is fitted anew when a position has moved this far since it was linearised, as a share of the distance to the nearest emitter,
+/// at most of a σ: the information of overlapping spots changes over that distance.
+const MOVED: f64 = 0.02;
+/// Pairs nearer than this many standard deviations of their difference are ambiguous: the window is searched again.
+const AMBIGUOUS: f64 = 4.0;
+
 /// Frames from which a target's mean energy is known well enough to miss it, and over how many it is averaged.
 const FEW: f64 = 3.0;
 const MANY: f64 = 100.0;
@@ -150,7 +159,7 @@ impl Window {
         self.total.marginalise(e);
     }
 
-    /// Moves the `count` oldest snapshots into the prior, and forgets who died before the first that is left.
+    /// Moves the `count` oldest snapshots into the prior.
     pub fn fold(&mut self, count: usize) {
         let mut prior = std::mem::take(&mut self.prior);
         prior.recentre(&self.state);
@@ -158,6 +167,10 @@ impl Window {
             self.absorb(&mut prior, &snapshot.local, snapshot.time_s);
         }
         self.prior = prior;
+    }
+
+    /// Forgets who died before the first snapshot that is left.
+    pub fn forget_dead(&mut self) {
         let first_s = self.snapshots.first().map_or(self.time_s, |s| s.time_s);
         for e in (0..self.len())
             .rev()
@@ -279,6 +292,59 @@ impl Window {
             .iter()
             .map(|t| self.dropped + self.snapshots.iter().filter(|s| t.is_in(s.time_s)).count() as f64)
             .collect()
+    }
+
+    /// Whether noise alone explains what the newest snapshot leaves.
+    pub fn is_last_explained(&self) -> bool {
+        self.snapshots.last().is_some_and(|last| {
+            let emitters = self.present(last.time_s).len() as f64;
+            let freedom = (last.compressed.data_count - 3.0 * emitters).max(1.0);
+            last.local.deviance < freedom + UNEXPLAINED * (2.0 * freedom).sqrt() + UNEXPLAINED
+        })
+    }
+
+    /// Whether positions have moved so far that snapshots need a new linearisation.
+    pub fn has_moved(&self) -> bool {
+        let n = self.len();
+        let at = |e: usize| [self.state[STATE * e], self.state[STATE * e + 1]];
+        let reach: Vec<f64> = (0..n)
+            .map(|e| {
+                let apart = |f: usize| (at(e)[0] - at(f)[0]).hypot(at(e)[1] - at(f)[1]);
+                MOVED * (0..n).filter(|f| *f != e).map(apart).fold(1.0, f64::min)
+            })
+            .collect();
+        self.snapshots.iter().any(|s| {
+            let moved = self.positions(&self.state, s.time_s) - &s.local.positions;
+            let present = self.present(s.time_s);
+            present
+                .iter()
+                .enumerate()
+                .any(|(i, &e)| moved[2 * i].hypot(moved[2 * i + 1]) > reach[e])
+        })
+    }
+
+    /// Whether a pair of emitters is not told apart for certain.
+    pub fn is_ambiguous(&self) -> bool {
+        let Some(covariance) = self.covariance() else {
+            return true;
+        };
+        let present = self.present(self.time_s);
+        present.iter().any(|&e| {
+            present.iter().take_while(|f| **f < e).any(|&f| {
+                let d = [0, 1].map(|k| self.state[STATE * e + k] - self.state[STATE * f + k]);
+                let of = |a: usize, b: usize| covariance[(a, b)];
+                let mut along = 0.0;
+                for r in 0..2 {
+                    for c in 0..2 {
+                        let (a, b) = (STATE * e, STATE * f);
+                        let s = of(a + r, a + c) + of(b + r, b + c) - of(a + r, b + c) - of(b + r, a + c);
+                        along += d[r] * s * d[c];
+                    }
+                }
+                let square = d[0] * d[0] + d[1] * d[1];
+                square * square < AMBIGUOUS * AMBIGUOUS * along
+            })
+        })
     }
 }
 
