@@ -3,9 +3,9 @@
 use jiff::{SignedDuration, Timestamp};
 use serde_json::Value;
 
-use super::format::checked_cov;
-use super::{Claim, ClaimState, Config};
-use crate::claim::{escape_undisplayable, is_displayable_name};
+use super::config::Config;
+use super::ellipse::checked_cov;
+use crate::claim::{Claim, ClaimState, escape_undisplayable, is_displayable_name};
 use crate::geo::{Geodetic, LocalAxes};
 
 /// Longest user name accepted, in bytes.

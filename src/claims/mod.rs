@@ -4,6 +4,7 @@
 mod ahead;
 mod candidates;
 mod config;
+mod ellipse;
 mod follower;
 mod format;
 mod history;

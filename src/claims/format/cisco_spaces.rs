@@ -2,9 +2,10 @@
 
 use serde_json::Value;
 
-use super::ellipse;
+use crate::claim::Claim;
+use crate::claims::config::Config;
+use crate::claims::ellipse;
 use crate::claims::line::{self, LineError, number, optional, required, wrong};
-use crate::claims::{Claim, Config};
 
 /// Of `confidenceFactor`: the radius within which a device is at 95 %, in feet.
 const CONFIDENCE: f64 = 0.95;

@@ -4,8 +4,9 @@ use quick_xml::events::{BytesStart, Event};
 use quick_xml::{Reader, XmlVersion};
 use serde_json::{Map, Value};
 
+use crate::claim::Claim;
+use crate::claims::config::Config;
 use crate::claims::line::{self, LineError, number, optional, required, wrong};
-use crate::claims::{Claim, Config};
 
 /// From here on an error is unknown: the schema writes 9999999.
 const UNKNOWN_M: f64 = 9_999_999.0;

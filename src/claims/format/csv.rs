@@ -2,8 +2,9 @@
 
 use serde_json::{Map, Number, Value};
 
+use crate::claim::Claim;
+use crate::claims::config::Config;
 use crate::claims::line::{self, LineError};
-use crate::claims::{Claim, Config};
 
 /// The columns of a file.
 #[derive(Clone, Debug)]

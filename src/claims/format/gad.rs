@@ -2,9 +2,10 @@
 
 use serde_json::Value;
 
-use super::ellipse;
+use crate::claim::Claim;
+use crate::claims::config::Config;
+use crate::claims::ellipse;
 use crate::claims::line::{self, LineError, number, optional, required, wrong};
-use crate::claims::{Claim, Config};
 
 const SHAPE: &str = "POINT, POINT_UNCERTAINTY_CIRCLE, POINT_UNCERTAINTY_ELLIPSE or LOCAL_2D_POINT_UNCERTAINTY_ELLIPSE";
 const UNCERTAINTY: &str = "metres, zero or more";

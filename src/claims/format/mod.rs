@@ -3,14 +3,11 @@
 mod cisco_spaces;
 mod cot;
 mod csv;
-mod ellipse;
 mod gad;
 
-use super::config::Format;
+use super::config::{Config, Format};
 use super::line::{self, LineError};
-use super::{Claim, Config};
-
-pub(super) use ellipse::checked_cov;
+use crate::claim::Claim;
 
 /// Reads the lines of one file or body in their order.
 #[derive(Clone, Debug, Default)]

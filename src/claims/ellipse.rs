@@ -17,7 +17,7 @@ pub(super) fn covariance(half_axes_m: [f64; 2], bearing_deg: f64, confidence: f6
 }
 
 /// A covariance that was stated: symmetric, finite and not negative.
-pub(in crate::claims) fn checked_cov(cov: [[f64; 2]; 2]) -> Option<[[f64; 2]; 2]> {
+pub(super) fn checked_cov(cov: [[f64; 2]; 2]) -> Option<[[f64; 2]; 2]> {
     let [[a, b], [c, d]] = cov;
     let is_finite = [a, b, c, d].iter().all(|v| v.is_finite());
     let is_symmetric = (b - c).abs() <= 1e-6 * (a.abs() + d.abs());
