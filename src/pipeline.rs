@@ -14,6 +14,7 @@ use crate::monitor::{self, KnownLight, Look, Monitor, Observation, Report, Windo
 use crate::notify;
 use crate::optics::Camera;
 use crate::platform::{self, Placement, Platform};
+use crate::pose::Pose;
 
 /// Why a config describes no pipeline.
 #[derive(Debug, thiserror::Error)]
@@ -119,9 +120,14 @@ impl Pipeline {
         self.platform.warnings()
     }
 
-    /// The buffer that an autopilot's poses go into; none where they come from elsewhere.
-    pub fn live_poses(&self) -> Option<platform::SharedPoses> {
-        self.platform.live()
+    /// Where an autopilot's poses go; none where they come from elsewhere.
+    pub fn pose_inbox(&self) -> Option<platform::PoseInbox> {
+        self.platform.inbox()
+    }
+
+    /// Takes the poses for a frame at `time`, after those `with_frame`. Returns all, for a recording.
+    pub fn receive_poses(&mut self, with_frame: Vec<Pose>, time: Timestamp) -> Vec<Pose> {
+        self.platform.receive(with_frame, time)
     }
 
     pub fn estimator(&self) -> &'static str {
@@ -141,7 +147,7 @@ impl Pipeline {
         }
     }
 
-    /// One frame through calibration, estimation and cross-check.
+    /// One frame through calibration, estimation and cross-check, with the claims and poses that came before.
     pub fn step(&mut self, frame: &Frame) -> Step {
         let began = Instant::now();
         let digest = frame.digest();

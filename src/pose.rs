@@ -7,7 +7,8 @@ use nalgebra::{Matrix6, Quaternion, UnitQuaternion, Vector3};
 use serde::{Deserialize, Serialize};
 
 /// Where the platform was and how it was turned.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(into = "PoseRecord", try_from = "PoseRecord")]
 pub struct Pose {
     pub time: Timestamp,
     /// The lens: east, north, up of the world's origin, m.
@@ -17,6 +18,90 @@ pub struct Pose {
     /// Covariance of the rotation vector that turns `attitude` into the true one, about north, east, down (rad), then of the
     /// position, east, north, up (m).
     pub cov: Matrix6<f64>,
+}
+
+/// A pose as recordings hold it: a line of a poses file with its whole covariance.
+#[derive(Clone, Debug, Serialize, Deserialize, utoipa::ToSchema)]
+#[schema(as = RecordedPose)]
+#[serde(deny_unknown_fields)]
+pub struct PoseRecord {
+    #[schema(value_type = String, format = DateTime)]
+    time: Timestamp,
+    x_m: f64,
+    y_m: f64,
+    z_m: f64,
+    /// Body (forward, right, down) to north, east, down: w, x, y, z.
+    q: [f64; 4],
+    /// Upper triangle, row by row, of the covariance of attitude (about north, east, down, rad) and position (east, north, up, m).
+    cov: Vec<f64>,
+}
+
+/// Why a record is no pose.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum RecordError {
+    #[error("field `q`: {0}")]
+    Attitude(#[from] AttitudeError),
+    #[error("expected finite coordinates")]
+    Place,
+    #[error("field `cov`: expected the {COV_LEN} numbers of a covariance's upper triangle")]
+    Cov,
+}
+
+/// Numbers of the upper triangle of a 6 × 6 matrix.
+const COV_LEN: usize = 21;
+
+fn upper_triangle() -> impl Iterator<Item = (usize, usize)> {
+    (0..6).flat_map(|row| (row..6).map(move |column| (row, column)))
+}
+
+impl From<Pose> for PoseRecord {
+    fn from(pose: Pose) -> Self {
+        let [x_m, y_m, z_m] = pose.position_m;
+        let q = pose.attitude.quaternion();
+        Self {
+            time: pose.time,
+            x_m,
+            y_m,
+            z_m,
+            q: [q.w, q.i, q.j, q.k],
+            cov: upper_triangle().map(|at| pose.cov[at]).collect(),
+        }
+    }
+}
+
+impl TryFrom<PoseRecord> for Pose {
+    type Error = RecordError;
+
+    fn try_from(record: PoseRecord) -> Result<Self, RecordError> {
+        /// Departure of a unit quaternion's squared norm from one by rounding.
+        const ROUNDING: f64 = 1e-14;
+        let position_m = [record.x_m, record.y_m, record.z_m];
+        if position_m.iter().any(|v| !v.is_finite()) {
+            return Err(RecordError::Place);
+        }
+        let [w, i, j, k] = record.q;
+        let quaternion = Quaternion::new(w, i, j, k);
+        // To be normalised again would change the last bits, and with them what a review of the recording says.
+        let attitude = match (quaternion.norm_squared() - 1.0).abs() <= ROUNDING {
+            true => UnitQuaternion::new_unchecked(quaternion),
+            false => attitude_of(record.q)?,
+        };
+        let mut cov = Matrix6::zeros();
+        for ((row, column), value) in upper_triangle().zip(&record.cov) {
+            cov[(row, column)] = *value;
+            cov[(column, row)] = *value;
+        }
+        let is_cov = cov.iter().all(|v| v.is_finite()) && cov.diagonal().iter().all(|v| *v >= 0.0);
+        if record.cov.len() != COV_LEN || !is_cov {
+            return Err(RecordError::Cov);
+        }
+        Ok(Self {
+            time: record.time,
+            position_m,
+            attitude,
+            cov,
+        })
+    }
 }
 
 /// Standard deviations of a pose whose errors are alike along all axes.
@@ -175,6 +260,29 @@ mod tests {
         let beyond = a.towards(&b, 2.0, Timestamp::UNIX_EPOCH);
         assert!((beyond.heading_rad() + 150f64.to_radians()).abs() < 1e-12);
         assert_eq!(beyond.cov, b.cov);
+    }
+
+    #[test]
+    fn a_recorded_pose_is_the_same_to_the_bit_and_a_wrong_one_is_refused() {
+        for k in 0..100 {
+            let angle = 0.1 * f64::from(k);
+            let mut pose = Pose::level("2026-11-21T08:00:00.1234567Z".parse().unwrap(), [0.1, -2.0 / 3.0, 300.0]);
+            pose.attitude = UnitQuaternion::from_euler_angles(angle, 0.3 * angle, 1.0 / 3.0);
+            pose.cov = PoseSigmas::default().cov();
+            pose.cov[(0, 4)] = 1e-3 * angle;
+            pose.cov[(4, 0)] = 1e-3 * angle;
+            let line = serde_json::to_string(&pose).unwrap();
+            assert_eq!(serde_json::from_str::<Pose>(&line).unwrap(), pose, "{line}");
+        }
+        let line = serde_json::to_string(&Pose::level(Timestamp::UNIX_EPOCH, [0.0; 3])).unwrap();
+        for (from, to) in [
+            ("\"q\":[1.0", "\"q\":[0.0"),
+            ("\"cov\":[0.0", "\"cov\":[-1.0"),
+            ("\"cov\":[0.0,", "\"cov\":["),
+        ] {
+            assert!(line.contains(from), "{line}");
+            assert!(serde_json::from_str::<Pose>(&line.replacen(from, to, 1)).is_err(), "{to}");
+        }
     }
 
     #[test]

@@ -9,7 +9,8 @@ use ndarray::Array2;
 use oapwatch::claim::{Claim, ClaimState};
 use oapwatch::frame::Frame;
 use oapwatch::frames::record::{Config, Recorder};
-use oapwatch::frames::{self, Error, FrameSource, Next, SourceKind, npy};
+use oapwatch::frames::{self, Arrivals, Error, FrameSource, Next, SourceKind, npy};
+use oapwatch::pose::{Pose, PoseSigmas, attitude_of};
 
 fn time(tenths: i64) -> Timestamp {
     let start: Timestamp = "2026-11-21T08:00:00Z".parse().unwrap();
@@ -40,6 +41,21 @@ fn claim(k: u64) -> Claim {
         power_w: None,
         state: ClaimState::Active,
     }
+}
+
+/// A pose of a tenth of a second, all of its numbers with 17 digits.
+fn pose(tenth: u64) -> Pose {
+    let at = tenth as f64 + 0.1;
+    Pose {
+        time: time(tenth as i64),
+        position_m: [at / 3.0, -at / 7.0, 300.0],
+        attitude: attitude_of([1.0, 0.1 * at.sin(), 0.1 * at.cos(), at / 9.0]).unwrap(),
+        cov: PoseSigmas::default().cov() / 3.0,
+    }
+}
+
+fn claims(claims: &[Claim]) -> Arrivals {
+    claims.to_vec().into()
 }
 
 fn config(folder: &Path) -> Config {
@@ -80,9 +96,9 @@ fn all(mut source: Box<dyn FrameSource>) -> Vec<(String, Option<String>)> {
 }
 
 /// Waits for the disk where a test would outrun it.
-fn record(recorder: &mut Recorder, frame: &Frame, claims: &[Claim]) -> Arc<Path> {
+fn record(recorder: &mut Recorder, frame: &Frame, arrivals: &Arrivals) -> Arc<Path> {
     loop {
-        if let Some(taken) = recorder.frame(frame, claims) {
+        if let Some(taken) = recorder.frame(frame, arrivals) {
             return taken.file.expect("a disk that works");
         }
         std::thread::sleep(Duration::from_millis(1));
@@ -98,7 +114,7 @@ fn a_replay_gives_what_was_recorded_bit_for_bit_over_all_files() {
         let name = |path: Arc<Path>| Some(path.file_name().unwrap().to_str().unwrap().to_owned());
         if k == 12 {
             let path = recorder
-                .unusable(36, time(12), "short", &[claim(12)])
+                .unusable(36, time(12), "short", &claims(&[claim(12)]))
                 .unwrap()
                 .file
                 .unwrap();
@@ -106,14 +122,17 @@ fn a_replay_gives_what_was_recorded_bit_for_bit_over_all_files() {
                 index: 36,
                 time: time(12),
                 reason: "short".into(),
-                claims: vec![claim(12)],
+                arrivals: claims(&[claim(12)]),
             };
             expected.push((format!("{next:?}"), name(path)));
             continue;
         }
-        let claims = vec![claim(k); (k % 2) as usize];
-        let path = record(&mut recorder, &frame(k), &claims);
-        expected.push((format!("{:?}", Next::Frame(frame(k), claims)), name(path)));
+        let arrivals = Arrivals {
+            claims: vec![claim(k); (k % 2) as usize],
+            poses: (0..k % 4).map(|i| pose(4 * k + i)).collect(),
+        };
+        let path = record(&mut recorder, &frame(k), &arrivals);
+        expected.push((format!("{:?}", Next::Frame(frame(k), arrivals)), name(path)));
     }
     drop(recorder);
     let seen = all(replay(folder.path()).unwrap());
@@ -129,9 +148,9 @@ fn a_replay_gives_what_was_recorded_bit_for_bit_over_all_files() {
 fn the_files_are_valid_while_they_grow_and_after_a_kill() {
     let folder = tempfile::tempdir().unwrap();
     let mut recorder = Recorder::start(&config(folder.path())).unwrap().unwrap();
-    let path = record(&mut recorder, &frame(0), &[]);
+    let path = record(&mut recorder, &frame(0), &Arrivals::default());
     for k in 1..4 {
-        record(&mut recorder, &frame(k), &[]);
+        record(&mut recorder, &frame(k), &Arrivals::default());
     }
     drop(recorder);
     // A process killed between a frame's pixels and its line, and within a line.
@@ -147,8 +166,8 @@ fn the_files_are_valid_while_they_grow_and_after_a_kill() {
 fn a_damaged_index_is_named_with_its_line() {
     let folder = tempfile::tempdir().unwrap();
     let mut recorder = Recorder::start(&config(folder.path())).unwrap().unwrap();
-    let path = record(&mut recorder, &frame(0), &[]);
-    record(&mut recorder, &frame(1), &[]);
+    let path = record(&mut recorder, &frame(0), &Arrivals::default());
+    record(&mut recorder, &frame(1), &Arrivals::default());
     drop(recorder);
     let index = path.with_extension("frames.ndjson");
     let text = std::fs::read_to_string(&index).unwrap();
@@ -165,7 +184,7 @@ fn the_ring_stays_within_its_limit_and_loses_the_oldest() {
     config.limit_mb = 0.02;
     let mut recorder = Recorder::start(&config).unwrap().unwrap();
     for k in 0..400 {
-        record(&mut recorder, &frame(k), &[claim(k)]);
+        record(&mut recorder, &frame(k), &claims(&[claim(k)]));
     }
     drop(recorder);
     let files = std::fs::read_dir(folder.path())
@@ -185,18 +204,22 @@ fn a_recording_goes_on_where_an_earlier_run_ended() {
     for run in 0..2 {
         let mut recorder = Recorder::start(&config(folder.path())).unwrap().unwrap();
         for k in 0..3 {
-            record(&mut recorder, &frame(10 * run + k), &[]);
+            record(&mut recorder, &frame(10 * run + k), &Arrivals::default());
         }
     }
     assert_eq!(all(replay(folder.path()).unwrap()).len(), 6);
 }
 
 #[test]
-fn evidence_holds_what_lies_around_the_alert_and_the_claims_that_stood() {
+fn evidence_holds_what_lies_around_the_alert_and_what_stood() {
     let folder = tempfile::tempdir().unwrap();
     let mut recorder = Recorder::start(&config(folder.path())).unwrap().unwrap();
     for k in 0..60 {
-        record(&mut recorder, &frame(k), &[claim(k)]);
+        let arrivals = Arrivals {
+            claims: vec![claim(k)],
+            poses: vec![pose(k)],
+        };
+        record(&mut recorder, &frame(k), &arrivals);
         if k == 40 {
             recorder.evidence("alert-7/../x", time(40));
         }
@@ -204,13 +227,16 @@ fn evidence_holds_what_lies_around_the_alert_and_the_claims_that_stood() {
     drop(recorder);
     let path = folder.path().join("evidence/alert-7____x.npy");
     let mut source = replay(&path).unwrap();
-    let Next::Frame(first, claims) = source.next(Duration::ZERO) else {
+    let Next::Frame(first, arrivals) = source.next(Duration::ZERO) else {
         panic!("a frame")
     };
     assert_eq!(first.time, time(25));
     // Each of three users' last two claims stood; the frame's own follows.
     let expected: Vec<Claim> = (19..=25).map(claim).collect();
-    assert_eq!(claims, expected);
+    assert_eq!(arrivals.claims, expected);
+    // The poses of the second before, and the frame's own.
+    let expected: Vec<Pose> = (14..=25).map(pose).collect();
+    assert_eq!(arrivals.poses, expected);
     let rest = all(source);
     assert!(
         rest.last().unwrap().0.contains(&format!("index: {}", 3 * 45)),
@@ -225,13 +251,13 @@ fn a_recorder_whose_disk_fails_names_no_file_and_goes_on_when_it_can() {
     let folder = tempfile::tempdir().unwrap();
     let ring = folder.path().join("ring");
     let mut recorder = Recorder::start(&config(&ring)).unwrap().unwrap();
-    record(&mut recorder, &frame(0), &[claim(0)]);
+    record(&mut recorder, &frame(0), &claims(&[claim(0)]));
     std::fs::rename(&ring, folder.path().join("unplugged")).unwrap();
     let mut k = 1;
     let mut until = |is_named: bool| {
         for _ in 0..10_000 {
             k += 1;
-            let taken = recorder.frame(&frame(k), &[]);
+            let taken = recorder.frame(&frame(k), &Arrivals::default());
             if taken.is_some_and(|taken| taken.file.is_some() == is_named) {
                 return k;
             }
@@ -282,7 +308,7 @@ fn recordings_and_evidence_are_their_owner_s_whatever_the_umask() {
     let mut evidence = None;
     for k in 0..5 {
         let frame = frame(k);
-        recorder.frame(&frame, &[]).expect("taken");
+        recorder.frame(&frame, &Arrivals::default()).expect("taken");
         if k == 2 {
             evidence = recorder.evidence("alert-1", frame.time);
         }

@@ -39,8 +39,8 @@ fn watch(config: &Config, most: usize) -> Vec<(u64, Timestamp, f64)> {
     let mut seen = Vec::new();
     while seen.len() < most {
         match source.next(LONG) {
-            Next::Frame(frame, claims) => {
-                assert!(claims.is_empty());
+            Next::Frame(frame, arrivals) => {
+                assert!(arrivals.claims.is_empty() && arrivals.poses.is_empty());
                 seen.push((frame.index, frame.time, frame.pixels[[1, 1]]));
             }
             Next::End => break,

@@ -1,4 +1,4 @@
-//! `/v1/alerts/{id}/evidence.*`: what was recorded around an alert, as frames, as a picture and as claims.
+//! `/v1/alerts/{id}/evidence.*`: what was recorded around an alert, as frames, as a picture, as claims and poses.
 
 use std::io::SeekFrom;
 use std::path::{Path as FilePath, PathBuf};
@@ -25,6 +25,7 @@ use crate::frame::Frame;
 use crate::frames::npy::{self, Header};
 use crate::frames::record::{self, EvidenceFrame};
 use crate::monitor::Alert;
+use crate::pose::{Pose, PoseRecord};
 
 /// Read from the disk at a time.
 const CHUNK: usize = 64 << 10;
@@ -45,7 +46,10 @@ pub struct AlertEvidence {
     emitters: Option<Vec<Emitter>>,
     /// Claims that stood when the recording begins, oldest first.
     claims: Vec<Claim>,
-    /// What the monitor was given, in order, with the claims that came with it.
+    /// The platform's poses until then, of about a second; none where it is fixed.
+    #[schema(value_type = Vec<PoseRecord>)]
+    poses: Vec<Pose>,
+    /// What the monitor was given, in order, with the claims and poses that came with it.
     frames: Vec<EvidenceFrame>,
 }
 
@@ -124,11 +128,11 @@ async fn read<T: Send + 'static>(
     })
 }
 
-/// What was recorded around an alert: frames by number and time, claims
+/// What was recorded around an alert: frames by number and time, claims, poses
 #[utoipa::path(get, path = "/v1/alerts/{id}/evidence.json", tag = "alerts",
     params(("id" = String, Path, description = "The alert's id")),
     responses(
-        (status = 200, description = "Frames and claims around the alert", body = AlertEvidence),
+        (status = 200, description = "Frames, claims and poses around the alert", body = AlertEvidence),
         (status = 400, description = "The path cannot be read", body = Problem, content_type = "application/problem+json"),
         (status = 404, description = "There is no such alert, or nothing was recorded around it", body = Problem, content_type = "application/problem+json"),
         (status = 503, description = "The journal or the recording cannot be read", body = Problem, content_type = "application/problem+json"),
@@ -151,6 +155,7 @@ pub async fn json(Shared(state): Shared<State>, Path(id): Path<String>) -> Resul
         raised_at: alert.raised_at,
         alert: alert.id,
         claims: evidence.claims,
+        poses: evidence.poses,
         frames: evidence.frames,
     }))
 }

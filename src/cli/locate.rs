@@ -75,6 +75,7 @@ impl Locator {
     /// Moves emitters from where a level camera would see them to where this one does, with its pose's uncertainty. One whose ray
     /// does not come down to the ground has no position and is left out.
     fn locate(&mut self, emitters: &[Emitter], time: jiff::Timestamp) -> Vec<Located> {
+        self.platform.receive(Vec::new(), time);
         self.view.sight = match self.platform.at(time) {
             Placement::Level => None,
             Placement::At { sight, .. } => Some(sight),

@@ -49,19 +49,21 @@ pub fn run(args: Args) -> Outcome {
         let next = source.next(Duration::from_secs(1));
         pipeline.monitor.recorded_in(source.file());
         let report = match next {
-            Next::Frame(frame, with_frame) => {
+            Next::Frame(frame, arrivals) => {
                 pipeline.claim(from_fn(|| upcoming.next_if(|c| c.time <= frame.time)), frame.time);
-                pipeline.claim(with_frame, frame.time);
+                pipeline.claim(arrivals.claims, frame.time);
+                pipeline.receive_poses(arrivals.poses, frame.time);
                 pipeline.step(&frame).report
             }
             Next::Unusable {
                 index,
                 time,
                 reason,
-                claims,
+                arrivals,
             } => {
                 pipeline.claim(from_fn(|| upcoming.next_if(|c| c.time <= time)), time);
-                pipeline.claim(claims, time);
+                pipeline.claim(arrivals.claims, time);
+                pipeline.receive_poses(arrivals.poses, time);
                 pipeline.unusable(index, time, &reason)
             }
             Next::Nothing => continue,

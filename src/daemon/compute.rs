@@ -19,7 +19,7 @@ use crate::api::{ClaimsStatus, Command, FrameCounts, JournalStatus, Snapshot, So
 use crate::claims::{Claim, ClaimState, Inbox};
 use crate::frame::Frame;
 use crate::frames::record::{Recorder, Taken};
-use crate::frames::{Capture, Next};
+use crate::frames::{Arrivals, Capture, Next};
 use crate::journal::Journal;
 use crate::metric;
 use crate::monitor::{AlertEventKind, Report};
@@ -31,7 +31,7 @@ use crate::pipeline::{Pipeline, Step};
 const PATIENCE: Duration = Duration::from_millis(50);
 /// The same while posted claims wait to be placed.
 const POSTING: Duration = Duration::from_millis(1);
-/// Most claims kept for a recorder that accepts nothing.
+/// Most claims and poses kept for a recorder that accepts nothing.
 const MOST_UNRECORDED: usize = 100_000;
 /// A source that gives neither a frame nor a failure for this long is reported as failed.
 const SILENCE: Duration = Duration::from_secs(2);
@@ -44,8 +44,8 @@ pub struct Compute {
     /// Claims of the log that take effect with the next frame, so that a recording reproduces them.
     pub inbox: Inbox,
     pub posts: Posts,
-    /// Claims that the recorder does not have yet.
-    pub unrecorded: Vec<Claim>,
+    /// What the recorder does not have yet.
+    pub unrecorded: Arrivals,
     pub commands: mpsc::Receiver<Command>,
     /// Loaded again while running.
     pub settings: mpsc::Receiver<Settings>,
@@ -77,11 +77,11 @@ impl Compute {
             let captured = self.capture.next(patience);
             let arrived = Instant::now();
             match captured.next {
-                Next::Frame(frame, claims) => {
+                Next::Frame(frame, arrivals) => {
                     last_event = arrived;
                     // The latency of a live frame counts from its capture; a recording's frame has waited for this thread.
                     let since = if self.is_replay { arrived } else { captured.at };
-                    self.take_claims(claims, frame.time);
+                    self.take_arrivals(arrivals, frame.time);
                     self.handle_commands();
                     let recorded = self.recorder.as_mut().map(|r| r.frame(&frame, &self.unrecorded));
                     self.recorded(recorded.flatten(), captured.file);
@@ -91,10 +91,10 @@ impl Compute {
                     index,
                     time,
                     reason,
-                    claims,
+                    arrivals,
                 } => {
                     last_event = arrived;
-                    self.take_claims(claims, time);
+                    self.take_arrivals(arrivals, time);
                     self.unusable(index, time, reason, captured.file);
                 }
                 Next::Nothing if !self.is_replay && last_event.elapsed() > SILENCE => {
@@ -109,8 +109,9 @@ impl Compute {
         self.outlet.close();
     }
 
-    /// Takes the claims that came with a frame and those of the log that it has time for.
-    fn take_claims(&mut self, claims: Vec<Claim>, now: Timestamp) {
+    /// Takes what came with a frame, the claims of the log that it has time for, and the poses until now.
+    fn take_arrivals(&mut self, Arrivals { claims, poses }: Arrivals, now: Timestamp) {
+        let poses = self.pipeline.receive_poses(poses, now);
         let batch = self.inbox.take();
         metrics::counter!(metric::CLAIMS, "outcome" => "shed").increment(batch.shed.shed_new + batch.shed.shed_known);
         self.pipeline.claims.note_shed(batch.shed, now);
@@ -119,15 +120,17 @@ impl Compute {
             return self.pipeline.claim(claims, now);
         }
         let claims: Vec<Claim> = claims.collect();
-        self.unrecorded.extend_from_slice(&claims);
-        self.pipeline.claim(claims, now);
+        let arrivals = Arrivals { claims, poses };
+        self.unrecorded.append(arrivals.clone());
+        self.pipeline.claim(arrivals.claims, now);
     }
 
     /// Sets the file that alerts name as holding their frame: the recorder's, or the one being replayed.
     fn recorded(&mut self, recorded: Option<Taken>, replayed: Option<Arc<Path>>) {
-        // Claims that the recorder could not accept go with the next frame, unless the disk never recovers.
-        if recorded.is_some() || self.unrecorded.len() > MOST_UNRECORDED {
-            self.unrecorded.clear();
+        // What the recorder could not accept goes with the next frame, unless the disk never recovers.
+        let waiting = self.unrecorded.claims.len() + self.unrecorded.poses.len();
+        if recorded.is_some() || waiting > MOST_UNRECORDED {
+            self.unrecorded = Arrivals::default();
         }
         let file = recorded.and_then(|taken| taken.file).or(replayed);
         self.pipeline.monitor.recorded_in(file.as_deref());
@@ -208,7 +211,7 @@ impl Compute {
     fn silence(&mut self) {
         let index = self.state.counts.captured;
         let now = Timestamp::now();
-        self.take_claims(Vec::new(), now);
+        self.take_arrivals(Arrivals::default(), now);
         self.unusable(
             index,
             now,

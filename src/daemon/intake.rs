@@ -51,7 +51,7 @@ impl Compute {
         } = self;
         posts.place(|claim| {
             if recorder.is_some() {
-                unrecorded.push(claim.clone());
+                unrecorded.claims.push(claim.clone());
             }
             pipeline.claims.insert(claim, now).refusal()
         });

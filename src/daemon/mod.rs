@@ -25,7 +25,7 @@ use tokio::sync::{mpsc, watch};
 use crate::claims::{Follower, Inbox};
 use crate::config::Config;
 use crate::frames::record::Recorder;
-use crate::frames::{self, Capture, FrameSource, SourceKind};
+use crate::frames::{self, Arrivals, Capture, FrameSource, SourceKind};
 use crate::journal::Journal;
 use crate::optics::Camera;
 use crate::pipeline::Pipeline;
@@ -177,8 +177,8 @@ impl Daemon {
             listener.url(self.server.scheme())?,
         );
         let is_replay = source.kind == SourceKind::Replay;
-        let telemetry = self.telemetry.zip(self.pipeline.live_poses());
-        let telemetry = telemetry.map(|(link, poses)| Telemetry::start(link, poses, self.config.world.clone()));
+        let telemetry = self.telemetry.zip(self.pipeline.pose_inbox());
+        let telemetry = telemetry.map(|(link, inbox)| Telemetry::start(link, inbox, self.config.world.clone()));
         let _telemetry = telemetry.transpose()?;
         let halt = Arc::new(AtomicBool::new(false));
         if !is_replay {
@@ -191,7 +191,7 @@ impl Daemon {
             recorder: self.recorder,
             inbox: inbox.clone(),
             posts: posts::Posts::default(),
-            unrecorded: Vec::new(),
+            unrecorded: Arrivals::default(),
             commands: orders,
             settings,
             follower: log

@@ -27,7 +27,7 @@ pub use error::Error;
 pub use replay::frame_time;
 pub use simulator::Simulator;
 pub use slot::Captured;
-pub use source::{FrameSource, Next};
+pub use source::{Arrivals, FrameSource, Next};
 
 use crate::optics::Camera;
 

@@ -7,7 +7,7 @@ use jiff::{SignedDuration, Timestamp};
 
 use super::npy::Reader;
 use super::record::{self, Player};
-use super::{Config, Error, FrameSource, Next};
+use super::{Arrivals, Config, Error, FrameSource, Next};
 use crate::frame::Frame;
 use crate::toml_file::Key;
 
@@ -74,7 +74,7 @@ impl FrameSource for Playback {
                         index: index + 1,
                         time,
                         reason,
-                        claims: Vec::new(),
+                        arrivals: Arrivals::default(),
                     };
                 }
             },
@@ -161,7 +161,7 @@ impl FrameSource for Replay {
                     pixels,
                     masked: None,
                 };
-                Next::Frame(frame, Vec::new())
+                Next::Frame(frame, Arrivals::default())
             }
             Some(Err(error)) => {
                 tracing::error!(%error, "the recording ends early");
@@ -170,7 +170,7 @@ impl FrameSource for Replay {
                     index,
                     time,
                     reason: error.to_string(),
-                    claims: Vec::new(),
+                    arrivals: Arrivals::default(),
                 }
             }
             None => Next::End,

@@ -69,7 +69,7 @@ impl Simulator {
             index,
             time: self.plan.time(index),
             reason: format!("no frame for {:.0} s", silent.as_secs_f64()),
-            claims: std::mem::take(&mut self.waiting),
+            arrivals: std::mem::take(&mut self.waiting).into(),
         }
     }
 }
@@ -94,7 +94,7 @@ impl FrameSource for Simulator {
             return self.lost(index);
         }
         self.unreported = self.next;
-        Next::Frame(made.frame, std::mem::take(&mut self.waiting))
+        Next::Frame(made.frame, std::mem::take(&mut self.waiting).into())
     }
 }
 
@@ -114,7 +114,7 @@ mod tests {
 
     fn frame(next: Next) -> (crate::frame::Frame, Vec<Claim>) {
         match next {
-            Next::Frame(frame, claims) => (frame, claims),
+            Next::Frame(frame, arrivals) => (frame, arrivals.claims),
             other => panic!("{other:?}"),
         }
     }
@@ -182,10 +182,10 @@ mod tests {
         let mut until = 0;
         for next in came {
             let (frame, claims) = match next {
-                Next::Frame(frame, claims) => (frame, claims),
-                Next::Unusable { index, claims, .. } => {
+                Next::Frame(frame, arrivals) => (frame, arrivals.claims),
+                Next::Unusable { index, arrivals, .. } => {
                     assert_eq!(fate(index), Fate::Dropped);
-                    received.extend(claims);
+                    received.extend(arrivals.claims);
                     until = index;
                     continue;
                 }

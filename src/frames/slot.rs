@@ -62,7 +62,7 @@ impl Slot {
     /// Puts an event; a newer frame replaces an older one. `false` when the slot is closed.
     pub fn put(&self, mut captured: Captured) -> bool {
         let mut state = self.lock();
-        if let Next::Frame(_, claims) = &mut captured.next {
+        if let Next::Frame(_, arrivals) = &mut captured.next {
             let older = state
                 .waiting
                 .iter()
@@ -73,8 +73,8 @@ impl Slot {
                 ..
             }) = older
             {
-                inherited.append(claims);
-                *claims = inherited;
+                inherited.append(std::mem::take(arrivals));
+                *arrivals = inherited;
                 state.dropped += 1;
             }
         }
@@ -143,6 +143,7 @@ mod tests {
     use super::*;
     use crate::claim::{Claim, ClaimState};
     use crate::frame::Frame;
+    use crate::frames::Arrivals;
 
     const LONG: Duration = Duration::from_secs(20);
 
@@ -164,19 +165,19 @@ mod tests {
             pixels: Array2::zeros((1, 1)),
             masked: None,
         };
-        Captured::new(Next::Frame(frame, vec![claim]), None)
+        Captured::new(Next::Frame(frame, vec![claim].into()), None)
     }
 
     fn unusable(index: u64) -> Captured {
         let reason = "short".to_owned();
         let time = Timestamp::UNIX_EPOCH;
-        let claims = Vec::new();
+        let arrivals = Arrivals::default();
         Captured::new(
             Next::Unusable {
                 index,
                 time,
                 reason,
-                claims,
+                arrivals,
             },
             None,
         )
@@ -196,7 +197,7 @@ mod tests {
             assert!(slot.put(frame(k)));
         }
         let (next, dropped) = take(&slot);
-        let Next::Frame(frame, claims) = next else {
+        let Next::Frame(frame, Arrivals { claims, .. }) = next else {
             panic!("{next:?}")
         };
         assert_eq!((frame.index, dropped), (2, 2));

@@ -4,6 +4,7 @@
 mod buffer;
 mod config;
 mod delay;
+mod inbox;
 #[allow(
     clippy::disallowed_methods,
     reason = "telemetry is dated when it arrives, and waits have an end"
@@ -15,13 +16,14 @@ mod replay;
 mod telemetry;
 
 use std::collections::VecDeque;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
 
 use jiff::{SignedDuration, Timestamp};
 use nalgebra::Vector6;
 
 pub use buffer::{Counts, Outcome, PoseAt, PoseBuffer};
 pub use config::{Config, ConfigError, Kind};
+pub use inbox::PoseInbox;
 pub use place::{Geodetic, Origin, Place, Unplaced};
 pub use replay::{Error as ReplayError, LineError};
 pub use telemetry::{Error as TelemetryError, Telemetry, open as open_telemetry};
@@ -74,16 +76,16 @@ pub struct Platform {
     unlearned: VecDeque<(Timestamp, Vector6<f64>)>,
 }
 
-/// Poses as they come in, shared with the thread that receives them.
-pub type SharedPoses = Arc<Mutex<PoseBuffer>>;
 
 #[allow(clippy::large_enum_variant, reason = "a platform has one")]
 enum Source {
     /// Level over (0, 0) at the camera's own altitude.
     Level,
     Fixed(Pose),
+    /// From a file.
     Replay(Box<Replay>, PoseBuffer),
-    Live(SharedPoses),
+    /// From an autopilot, or with the frames of a recording.
+    Live(PoseInbox, PoseBuffer),
 }
 
 impl Source {
@@ -91,8 +93,7 @@ impl Source {
     fn read<T>(&self, reader: impl FnOnce(&PoseBuffer) -> T) -> Option<T> {
         match self {
             Self::Level | Self::Fixed(_) => None,
-            Self::Replay(_, poses) => Some(reader(poses)),
-            Self::Live(poses) => Some(reader(&poses.lock().unwrap_or_else(PoisonError::into_inner))),
+            Self::Replay(_, poses) | Self::Live(_, poses) => Some(reader(poses)),
         }
     }
 }
@@ -128,7 +129,7 @@ impl Platform {
             }
             (Kind::Fixed, _) if config.mount.is_none() && terrain.is_none() => Source::Level,
             (Kind::Fixed, _) => Source::Fixed(Pose::level(Timestamp::UNIX_EPOCH, [0.0, 0.0, altitude_m])),
-            _ => Source::Live(SharedPoses::default()),
+            _ => Source::Live(PoseInbox::default(), PoseBuffer::default()),
         };
         if let (Source::Fixed(_), Some(ground)) = (&source, terrain.as_ref().and_then(|t| t.at([0.0, 0.0])))
             && !(altitude_m > ground.z_m)
@@ -172,12 +173,37 @@ impl Platform {
             .unwrap_or_default()
     }
 
-    /// The buffer that a receiver of poses fills; none but for an autopilot's.
-    pub fn live(&self) -> Option<SharedPoses> {
+    /// Where a receiver of poses puts them; none but for an autopilot's.
+    pub fn inbox(&self) -> Option<PoseInbox> {
         match &self.source {
-            Source::Live(poses) => Some(poses.clone()),
+            Source::Live(inbox, _) => Some(inbox.clone()),
             _ => None,
         }
+    }
+
+    /// Takes the poses that are there for a frame at `time`, after those that a recording has `with_frame`. Returns them, so that a
+    /// recording of them has [`Platform::at`] say the same again. A file of poses is preferred to those of a recording.
+    pub fn receive(&mut self, with_frame: Vec<Pose>, time: Timestamp) -> Vec<Pose> {
+        let stamp = self.stamp(time);
+        let (received, buffer) = match &mut self.source {
+            Source::Level | Source::Fixed(_) => return Vec::new(),
+            Source::Replay(replay, buffer) => (replay.until(stamp), buffer),
+            Source::Live(inbox, buffer) => {
+                let mut received = with_frame;
+                received.extend(inbox.take());
+                (received, buffer)
+            }
+        };
+        for pose in &received {
+            telemetry::count(buffer.insert(pose.clone()));
+        }
+        received
+    }
+
+    /// A frame's time on the clock of the poses.
+    fn stamp(&self, time: Timestamp) -> Timestamp {
+        let delay = SignedDuration::from_secs_f64(self.delay_s());
+        time.saturating_add(delay).unwrap_or(time)
     }
 
     /// Pose stamps minus frame stamps, s: as configured, or as learned so far.
@@ -211,22 +237,17 @@ impl Platform {
         }
     }
 
-    /// Where the camera is at a frame's `time`.
+    /// Where the camera is at a frame's `time`, by the poses received.
     pub fn at(&mut self, time: Timestamp) -> Placement {
-        let stamp = time.saturating_add(SignedDuration::from_secs_f64(self.delay_s()));
-        let stamp = stamp.unwrap_or(time);
-        let found = match &mut self.source {
+        let stamp = self.stamp(time);
+        let found = match &self.source {
             Source::Level => return Placement::Level,
             Source::Fixed(pose) => Some(PoseAt {
                 pose: pose.clone(),
                 age_s: 0.0,
                 rates: Vector6::zeros(),
             }),
-            Source::Replay(replay, buffer) => {
-                replay.advance(stamp, buffer);
-                buffer.at(stamp)
-            }
-            Source::Live(poses) => poses.lock().unwrap_or_else(PoisonError::into_inner).at(stamp),
+            Source::Replay(_, poses) | Source::Live(_, poses) => poses.at(stamp),
         };
         let Some(mut pose) = found else {
             let waited_s = seconds(*self.waiting_since.get_or_insert(time), time).max(0.0);
@@ -265,9 +286,8 @@ mod tests {
         };
         let at = |s: f64| Timestamp::UNIX_EPOCH + SignedDuration::from_nanos(((100.0 + s) * 1e9).round() as i64);
         let tilt = |s: f64| [0.05 * (0.785 * s).sin(), 0.05 * (0.63 * s + 1.0).sin()];
-        let poses = SharedPoses::default();
         let mut platform = Platform {
-            source: Source::Live(poses.clone()),
+            source: Source::Live(PoseInbox::default(), PoseBuffer::default()),
             ..Platform::level()
         };
         // Stamps at 50 Hz that coincide with those of the frames at 10 Hz.
@@ -279,7 +299,7 @@ mod tests {
                 attitude,
                 ..Pose::level(at(s), [0.0, 0.0, 300.0])
             };
-            poses.lock().expect("one thread").insert(pose);
+            platform.receive(vec![pose], at(s));
             // A frame that is seen when the next poses are there.
             let frame_s = s - 0.04;
             if k % 5 == 2 && frame_s > 0.0 {

@@ -6,7 +6,6 @@ use std::path::{Path, PathBuf};
 use jiff::Timestamp;
 use serde_json::Value;
 
-use super::buffer::PoseBuffer;
 use super::place::Unplaced;
 use super::px4_log;
 use crate::claim::seconds;
@@ -89,15 +88,17 @@ impl Replay {
         })
     }
 
-    /// Hands the buffer the poses up to a moment after `time`.
-    pub fn advance(&mut self, time: Timestamp, buffer: &mut PoseBuffer) {
+    /// The next poses up to a moment after `time`.
+    pub fn until(&mut self, time: Timestamp) -> Vec<Pose> {
+        let mut due = Vec::new();
         while let Some(pose) = self.upcoming.take().or_else(|| Some(self.poses.next()?.pose())) {
             if seconds(time, pose.time) > AHEAD_S {
                 self.upcoming = Some(pose);
-                return;
+                break;
             }
-            buffer.insert(pose);
+            due.push(pose);
         }
+        due
     }
 }
 

@@ -1,13 +1,14 @@
-//! An autopilot's poses on their way into the buffer from which frames take theirs.
+//! An autopilot's poses on their way to the frames.
 
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
 
 use jiff::Timestamp;
 use metrics::{counter, gauge};
 
-use super::buffer::{Outcome, PoseBuffer};
+use super::buffer::Outcome;
 use super::config::{Config, ConfigError};
+use super::inbox::PoseInbox;
 use super::mavlink::{Event, Link, Moment, Reader, Relation, Sample};
 use super::place::Unplaced;
 use crate::geo;
@@ -44,11 +45,11 @@ pub struct Telemetry {
 }
 
 impl Telemetry {
-    /// Starts reading a link into `poses`. `world` says where local axes lie.
+    /// Starts reading a link into `inbox`. `world` says where local axes lie.
     ///
     /// # Errors
     /// No thread can be started.
-    pub fn start(link: Link, poses: Arc<Mutex<PoseBuffer>>, world: geo::Config) -> std::io::Result<Self> {
+    pub fn start(link: Link, inbox: PoseInbox, world: geo::Config) -> std::io::Result<Self> {
         let stop = Arc::new(AtomicBool::new(false));
         let mut unplaced: Option<Unplaced> = None;
         link.start(stop.clone(), move |event, moment, reader| match event {
@@ -59,7 +60,7 @@ impl Telemetry {
                 match pose(&sample, moment, &world) {
                     Ok(pose) => {
                         unplaced = None;
-                        count(poses.lock().unwrap_or_else(PoisonError::into_inner).insert(pose));
+                        inbox.put(pose);
                     }
                     Err(why) => {
                         refused("unplaced");
@@ -81,7 +82,8 @@ impl Drop for Telemetry {
     }
 }
 
-fn count(outcome: Outcome) {
+/// Counts what became of a pose.
+pub(super) fn count(outcome: Outcome) {
     match outcome {
         Outcome::Accepted | Outcome::OutOfOrder | Outcome::Restarted => counter!(metric::POSES).increment(1),
         Outcome::Duplicate => refused("duplicate"),

@@ -4,7 +4,9 @@ use ndarray::Array2;
 use oapwatch::api::Config;
 use oapwatch::claim::Claim;
 use oapwatch::frame::Frame;
+use oapwatch::frames::Arrivals;
 use oapwatch::frames::record::{self, Recorder};
+use oapwatch::pose::Pose;
 use reqwest::{StatusCode, header};
 use serde_json::json;
 
@@ -37,7 +39,11 @@ async fn evidence_is_served_as_frames_as_a_picture_and_with_claims() {
             pixels: Array2::from_elem((64, 64), k as f64),
             masked: None,
         };
-        recorder.frame(&frame, std::slice::from_ref(&claim)).expect("taken");
+        let arrivals = Arrivals {
+            claims: vec![claim.clone()],
+            poses: vec![Pose::level(at(k as i64), [0.0, 0.0, 300.0])],
+        };
+        recorder.frame(&frame, &arrivals).expect("taken");
         if k == 10 {
             file = recorder.evidence("a-1", frame.time);
         }
@@ -61,6 +67,7 @@ async fn evidence_is_served_as_frames_as_a_picture_and_with_claims() {
     let position = told["position"].as_u64().unwrap() as usize;
     assert_eq!(told["frames"][position]["index"], 10, "the alert's own frame");
     assert_eq!(told["frames"][position]["claims"][0]["user"], "u-1");
+    assert_eq!(told["frames"][position]["poses"][0]["z_m"], 300.0);
     let png = get(&fake, "/v1/alerts/a-1/evidence.png?scale=2").await;
     assert_eq!(png.headers()[header::CONTENT_TYPE], "image/png");
     assert_eq!(

@@ -1,4 +1,4 @@
-//! Reads the evidence of one alert: which frames and claims its recording holds, and single frames of it.
+//! Reads the evidence of one alert: which frames, claims and poses its recording holds, and single frames of it.
 
 use std::path::Path;
 
@@ -9,12 +9,16 @@ use super::tape::{Seen, TapeReader};
 use crate::claim::Claim;
 use crate::frame::Frame;
 use crate::frames::{Error, Next, npy};
+use crate::pose::{Pose, PoseRecord};
 
 /// What the monitor was given around an alert.
 #[derive(Clone, Debug, Serialize, utoipa::ToSchema)]
 pub struct Evidence {
     /// Claims that stood when the recording begins, oldest first.
     pub claims: Vec<Claim>,
+    /// The platform's poses until then, of about a second; none where it is fixed.
+    #[schema(value_type = Vec<PoseRecord>)]
+    pub poses: Vec<Pose>,
     /// What followed, in order.
     pub frames: Vec<EvidenceFrame>,
 }
@@ -33,6 +37,10 @@ pub struct EvidenceFrame {
     pub unusable: Option<String>,
     /// Claims that came with the frame, or since the one before.
     pub claims: Vec<Claim>,
+    /// The platform's poses that came since the frame before.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    #[schema(value_type = Vec<PoseRecord>)]
+    pub poses: Vec<Pose>,
 }
 
 /// The file name that an alert's evidence has.
@@ -45,7 +53,7 @@ pub fn file_name(alert: &str) -> String {
 impl Evidence {
     /// Reads the index beside a recording; it may still be growing.
     pub fn read(path: &Path) -> Result<Self, Error> {
-        let (mut tape, claims) = TapeReader::open(path)?;
+        let (mut tape, standing) = TapeReader::open(path)?;
         let mut frames = Vec::new();
         let mut position = 0;
         while let Some(entry) = tape.entry()? {
@@ -55,11 +63,16 @@ impl Evidence {
                 index: entry.index,
                 time: entry.time,
                 unusable: entry.unusable,
-                claims: entry.claims,
+                claims: entry.arrivals.claims,
+                poses: entry.arrivals.poses,
             });
             position += u64::from(has_pixels);
         }
-        Ok(Self { claims, frames })
+        Ok(Self {
+            claims: standing.claims,
+            poses: standing.poses,
+            frames,
+        })
     }
 
     /// Position of the frame with this number or, where it is not there, of the one nearest in time.

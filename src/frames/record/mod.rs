@@ -25,8 +25,7 @@ use std::thread::JoinHandle;
 
 use jiff::{SignedDuration, Timestamp};
 
-use super::{Error, npy};
-use crate::claim::Claim;
+use super::{Arrivals, Error, npy};
 use crate::frame::Frame;
 use crate::metric;
 use standing::Standing;
@@ -63,7 +62,7 @@ pub struct Recorder {
 /// A frame that the recorder thread has taken.
 #[derive(Clone, Debug)]
 pub struct Taken {
-    /// The file that holds it; `None` while writing fails. Its claims are still written to the head of the next file.
+    /// The file that holds it; `None` while writing fails. Its claims and poses are still written to the head of the next file.
     pub file: Option<Arc<Path>>,
 }
 
@@ -139,21 +138,21 @@ impl Recorder {
         }))
     }
 
-    /// Records a frame as it came, before any correction, with the claims taken in since the one before. `None`
+    /// Records a frame as it came, before any correction, with what came since the one before. `None`
     /// when the disk cannot keep up and the frame was dropped.
-    pub fn frame(&mut self, frame: &Frame, claims: &[Claim]) -> Option<Taken> {
+    pub fn frame(&mut self, frame: &Frame, arrivals: &Arrivals) -> Option<Taken> {
         let bytes = 8 * frame.pixels.len() as u64;
-        self.write(Some(frame.pixels.dim()), bytes, Seen::frame(frame, claims))
+        self.write(Some(frame.pixels.dim()), bytes, Seen::frame(frame, arrivals))
     }
 
     /// Records that there was no usable frame.
-    pub fn unusable(&mut self, index: u64, time: Timestamp, reason: &str, claims: &[Claim]) -> Option<Taken> {
+    pub fn unusable(&mut self, index: u64, time: Timestamp, reason: &str, arrivals: &Arrivals) -> Option<Taken> {
         let entry = Entry {
             index,
             time,
             unusable: Some(reason.to_owned()),
             masked: None,
-            claims: claims.to_vec(),
+            arrivals: arrivals.clone(),
         };
         self.write(None, 0, Seen { entry, pixels: None })
     }
@@ -290,7 +289,7 @@ impl RecorderThread {
             return Ok(());
         }
         let written = self.append(&path, shape, seen);
-        self.standing.take(&seen.entry.claims);
+        self.standing.take(&seen.entry.arrivals);
         self.clips.retain(|clip| seen.entry.time <= clip.until);
         let mut appended = Ok(());
         self.clips.retain_mut(|clip| match clip.tape.push(seen) {
@@ -314,7 +313,7 @@ impl RecorderThread {
         let tape = match self.tape.take().filter(|tape| tape.path() == path) {
             Some(tape) => self.tape.insert(tape),
             None => {
-                let tape = TapeWriter::create(path, shape, self.standing.claims())?;
+                let tape = TapeWriter::create(path, shape, self.standing.arrivals())?;
                 self.trim(&self.folder, self.config.limit_mb, path);
                 self.tape.insert(tape)
             }
@@ -347,20 +346,20 @@ impl RecorderThread {
         let mut standing = Standing::default();
         let mut clip: Option<TapeWriter> = None;
         for file in files {
-            let (mut tape, claims) = TapeReader::open(&file)?;
+            let (mut tape, stood) = TapeReader::open(&file)?;
             if clip.is_none() {
                 standing = Standing::default();
-                standing.take(&claims);
+                standing.take(&stood);
             }
             while let Some(seen) = tape.next()? {
                 if clip.is_none() && (seen.entry.time < from || seen.pixels.is_none()) {
-                    standing.take(&seen.entry.claims);
+                    standing.take(&seen.entry.arrivals);
                     continue;
                 }
                 let shape = seen.pixels.as_ref().map_or((1, 1), ndarray::Array2::dim);
                 let writer = match &mut clip {
                     Some(writer) => writer,
-                    None => clip.insert(TapeWriter::create(path, shape, standing.claims())?),
+                    None => clip.insert(TapeWriter::create(path, shape, standing.arrivals())?),
                 };
                 match writer.push(&seen) {
                     // The camera changed its shape: the evidence ends there.

@@ -4,16 +4,15 @@ use std::collections::VecDeque;
 use std::path::{Path, PathBuf};
 
 use super::tape::{Seen, TapeReader};
-use crate::claim::Claim;
-use crate::frames::Error;
+use crate::frames::{Arrivals, Error};
 
 /// Reads the events of several files in order.
 #[derive(Debug)]
 pub(in crate::frames) struct Player {
     files: VecDeque<PathBuf>,
     tape: TapeReader,
-    /// The claims that stood when the first file begins; they come with the first frame.
-    standing: Vec<Claim>,
+    /// What stood when the first file begins; it comes with the first frame. None once it has.
+    standing: Option<Arrivals>,
 }
 
 impl Player {
@@ -23,7 +22,11 @@ impl Player {
             return Ok(None);
         };
         let (tape, standing) = TapeReader::open(&first)?;
-        Ok(Some(Self { files, tape, standing }))
+        Ok(Some(Self {
+            files,
+            tape,
+            standing: Some(standing),
+        }))
     }
 
     pub fn path(&self) -> &Path {
@@ -33,8 +36,9 @@ impl Player {
     pub fn next(&mut self) -> Result<Option<Seen>, Error> {
         loop {
             if let Some(mut seen) = self.tape.next()? {
-                if !self.standing.is_empty() {
-                    seen.entry.claims.splice(0..0, self.standing.drain(..));
+                if let Some(mut arrivals) = self.standing.take() {
+                    arrivals.append(seen.entry.arrivals);
+                    seen.entry.arrivals = arrivals;
                 }
                 return Ok(Some(seen));
             }

@@ -1,5 +1,5 @@
 //! One file of a recording: frames in NAME.npy, and in NAME.frames.ndjson one line for each event that the monitor received, in
-//! order: times, claims, masks, and why a frame was unusable.
+//! order: times, claims, poses, masks, and why a frame was unusable.
 
 use std::fs::File;
 use std::io::{BufRead, BufReader, Write};
@@ -10,17 +10,17 @@ use jiff::Timestamp;
 use ndarray::Array2;
 use serde::{Deserialize, Serialize};
 
-use crate::claim::Claim;
 use crate::frame::Frame;
-use crate::frames::{Error, Next, npy};
+use crate::frames::{Arrivals, Error, Next, npy};
 
 /// First line of the index.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub(super) struct Head {
     /// Version of the format.
     pub oapwatch_recording: u32,
-    /// Claims in force when the file begins, for a replay that begins with it.
-    pub claims: Vec<Claim>,
+    /// Claims in force and poses known when the file begins, for a replay that begins with it.
+    #[serde(flatten)]
+    pub standing: Arrivals,
 }
 
 /// A line of the index after the first.
@@ -34,9 +34,8 @@ pub(in crate::frames) struct Entry {
     /// Masked pixels, row and column.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub masked: Option<Vec<[usize; 2]>>,
-    /// Claims that came with the frame, or since the one before.
-    #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    pub claims: Vec<Claim>,
+    #[serde(flatten)]
+    pub arrivals: Arrivals,
 }
 
 /// One event: an entry with its pixels.
@@ -47,7 +46,7 @@ pub(in crate::frames) struct Seen {
 }
 
 impl Seen {
-    pub fn frame(frame: &Frame, claims: &[Claim]) -> Self {
+    pub fn frame(frame: &Frame, arrivals: &Arrivals) -> Self {
         let masked = frame.masked.as_ref().map(|masked| {
             let marked = masked.indexed_iter().filter(|(_, m)| **m);
             marked.map(|((y, x), _)| [y, x]).collect()
@@ -57,7 +56,7 @@ impl Seen {
             time: frame.time,
             unusable: None,
             masked,
-            claims: claims.to_vec(),
+            arrivals: arrivals.clone(),
         };
         Self {
             entry,
@@ -71,7 +70,7 @@ impl Seen {
             time,
             unusable,
             masked,
-            claims,
+            arrivals,
         } = self.entry;
         let Some(pixels) = self.pixels else {
             let reason = unusable.unwrap_or_default();
@@ -79,7 +78,7 @@ impl Seen {
                 index,
                 time,
                 reason,
-                claims,
+                arrivals,
             };
         };
         let masked = masked.map(|marked| {
@@ -97,7 +96,7 @@ impl Seen {
             pixels,
             masked,
         };
-        Next::Frame(frame, claims)
+        Next::Frame(frame, arrivals)
     }
 }
 
@@ -124,15 +123,15 @@ pub(super) struct TapeWriter {
 
 impl TapeWriter {
     /// Creates both files or neither.
-    pub fn create(path: &Path, shape: (usize, usize), claims: Vec<Claim>) -> Result<Self, Error> {
-        Self::create_both(path, shape, claims).inspect_err(|_| {
+    pub fn create(path: &Path, shape: (usize, usize), standing: Arrivals) -> Result<Self, Error> {
+        Self::create_both(path, shape, standing).inspect_err(|_| {
             // The first error is the one to report.
             let _ = std::fs::remove_file(path);
             let _ = std::fs::remove_file(index_of(path));
         })
     }
 
-    fn create_both(path: &Path, shape: (usize, usize), claims: Vec<Claim>) -> Result<Self, Error> {
+    fn create_both(path: &Path, shape: (usize, usize), standing: Arrivals) -> Result<Self, Error> {
         let frames = npy::Writer::create_with(create_private(path), path, shape)?;
         let index = create_private(&index_of(path)).map_err(|source| Error::Recording {
             path: index_of(path),
@@ -141,7 +140,7 @@ impl TapeWriter {
         let mut tape = Self { frames, index };
         tape.line(&Head {
             oapwatch_recording: 1,
-            claims,
+            standing,
         })?;
         Ok(tape)
     }
@@ -177,8 +176,8 @@ pub(in crate::frames) struct TapeReader {
 }
 
 impl TapeReader {
-    /// Opens a file; returns the claims in force when it begins.
-    pub fn open(path: &Path) -> Result<(Self, Vec<Claim>), Error> {
+    /// Opens a file; returns the claims in force and the poses known when it begins.
+    pub fn open(path: &Path) -> Result<(Self, Arrivals), Error> {
         let index = index_of(path);
         let file = File::open(&index).map_err(|source| Error::Recording { path: index, source })?;
         let mut tape = Self {
@@ -188,7 +187,7 @@ impl TapeReader {
             frames: None,
         };
         let head = tape.line::<Head>()?;
-        Ok((tape, head.map(|h| h.claims).unwrap_or_default()))
+        Ok((tape, head.map(|h| h.standing).unwrap_or_default()))
     }
 
     pub fn path(&self) -> &Path {

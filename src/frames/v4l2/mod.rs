@@ -31,7 +31,7 @@ use std::time::{Duration, Instant};
 use jiff::{SignedDuration, Timestamp};
 use v4l::v4l_sys::V4L2_BUF_FLAG_ERROR;
 
-use super::{Error, FrameSource, Next};
+use super::{Arrivals, Error, FrameSource, Next};
 use crate::frame::Frame;
 use crate::metric;
 use crate::optics::Camera;
@@ -264,7 +264,7 @@ impl V4l2 {
                     index,
                     time,
                     reason,
-                    claims: Vec::new(),
+                    arrivals: Arrivals::default(),
                 };
             }
         };
@@ -284,7 +284,7 @@ impl V4l2 {
             pixels,
             masked,
         };
-        Next::Frame(frame, Vec::new())
+        Next::Frame(frame, Arrivals::default())
     }
 
     /// Configured exposure over a frame's own.
@@ -360,7 +360,7 @@ impl FrameSource for V4l2 {
                     index: self.numbering.next(),
                     time,
                     reason,
-                    claims: Vec::new(),
+                    arrivals: Arrivals::default(),
                 };
             }
             if left.is_zero() {
