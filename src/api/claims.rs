@@ -14,12 +14,9 @@ use super::intake::Intake;
 use super::problem::Problem;
 use super::respond;
 use super::state::{Command, State, busy};
-use crate::claim::Claim;
-use crate::claims::{self, Format, LineReader};
+use crate::claims::{self, Claim, Format};
 use crate::metric;
 
-/// Claims taken from one body.
-const MAX_CLAIMS: usize = 20_000;
 /// Claims come as JSON or NDJSON, by whatever name, or in a format with a name of its own.
 const MEDIA_TYPES: [&str; 10] = [
     "application/json",
@@ -56,49 +53,6 @@ fn format_of(headers: &HeaderMap) -> Format {
     }
 }
 
-/// Cuts a body into what may be claims, each with the line that it begins on: lines, or XML events over any number of lines.
-fn pieces(body: &[u8], format: Format) -> Vec<(usize, &[u8])> {
-    let end: &[u8] = match format {
-        Format::Cot => b"</event>",
-        _ => b"\n",
-    };
-    let (mut found, mut rest, mut line) = (Vec::new(), body, 1);
-    while !rest.is_empty() {
-        let length = rest.windows(end.len()).position(|bytes| bytes == end);
-        let length = length.map_or(rest.len(), |at| at + end.len());
-        let (piece, after) = rest.split_at(length);
-        let blank = piece.iter().take_while(|byte| byte.is_ascii_whitespace());
-        let begins = line + blank.filter(|byte| **byte == b'\n').count();
-        if !piece.trim_ascii().is_empty() {
-            found.push((begins, piece));
-        }
-        line += piece.iter().filter(|byte| **byte == b'\n').count();
-        rest = after;
-    }
-    found
-}
-
-/// Claims of a body with the line each stands on: one JSON object over any number of lines, or one a line, or as the format has
-/// it. The fields are always the documented ones, whatever names the log has for them.
-fn parse(body: &[u8], reading: &claims::Config, intake: &mut Intake) -> Vec<(usize, Claim)> {
-    if let Ok(claim) = claims::parse_line(body, reading) {
-        return vec![(1, claim)];
-    }
-    let mut found = Vec::new();
-    let mut reader = LineReader::default();
-    for (line, piece) in pieces(body, reading.format) {
-        if found.len() == MAX_CLAIMS {
-            intake.refuse(line, format!("more than {MAX_CLAIMS} claims in one body"));
-            continue;
-        }
-        match reader.read(piece, reading) {
-            Ok(claim) => found.extend(claim.map(|claim| (line, claim))),
-            Err(e) => intake.refuse(line, e.to_string()),
-        }
-    }
-    found
-}
-
 /// Takes claims from the access network
 ///
 /// One claim as JSON, or one a line as NDJSON, at most 4 MiB of it; `Content-Encoding: gzip` is taken. Lines that cannot be taken
@@ -131,7 +85,9 @@ pub async fn post(
         axes: state.axes,
         ..claims::Config::default()
     };
-    let (lines, claims): (Vec<_>, Vec<_>) = parse(&body, &reading, &mut intake).into_iter().unzip();
+    // The fields are always the documented ones, whatever names the log has for them.
+    let parsed = claims::parse_body(&body, &reading, |line, why| intake.refuse(line, why));
+    let (lines, claims): (Vec<_>, Vec<_>) = parsed.into_iter().unzip();
     let sent = claims.len();
     metrics::counter!(metric::CLAIMS, "outcome" => "malformed").increment(intake.refused as u64);
     if sent > 0 {

@@ -99,8 +99,15 @@ struct Body<'a> {
 impl Published {
     /// Claims in and around the field of view, bounded in number.
     pub fn claims_in_view(&self) -> impl Iterator<Item = &Claim> {
-        let [half_x, half_y] = self.snapshot.status.field_of_view_m;
-        let near = move |c: &&Claim| c.x_m.abs() <= 1.5 * half_x && c.y_m.abs() <= 1.5 * half_y;
+        /// Of the width of what is watched, to either side.
+        const AROUND: f64 = 0.25;
+        let [low, high] = self.snapshot.status.bounds_m();
+        let near = move |c: &&Claim| {
+            [c.x_m, c.y_m].into_iter().enumerate().all(|(k, at)| {
+                let room = AROUND * (high[k] - low[k]);
+                (low[k] - room..=high[k] + room).contains(&at)
+            })
+        };
         self.snapshot.report.claims.iter().filter(near).take(CLAIMS_SHOWN)
     }
 

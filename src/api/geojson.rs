@@ -1,4 +1,5 @@
-//! `/v1/positions.geojson` and `/v1/alerts.geojson`: positions and alerts as features on the earth (RFC 7946).
+//! `/v1/positions.geojson`, `/v1/alerts.geojson` and `/v1/footprint.geojson`: positions, alerts and what the camera sees of the ground as
+//! features on the earth (RFC 7946).
 
 use axum::extract::State as Shared;
 use axum::http::{HeaderMap, HeaderValue, header};
@@ -9,9 +10,10 @@ use serde::Serialize;
 use super::alerts::{self, ListQuery, Page};
 use super::extract::Query;
 use super::problem::Problem;
+use super::snapshot::ViewStatus;
 use super::state::State;
 use super::{conditional, positions, respond};
-use crate::geo::Geodetic;
+use crate::geo::{Geodetic, LocalAxes};
 use crate::monitor::{Alert, Report, TrackedPosition};
 
 pub(super) const MEDIA_TYPE: &str = "application/geo+json";
@@ -36,6 +38,69 @@ struct Point {
     r#type: PointType,
     /// Longitude and latitude, degrees, and the height above the datum of `[world] origin`, m
     coordinates: [f64; 3],
+}
+
+#[derive(Debug, Serialize, utoipa::ToSchema)]
+enum PolygonType {
+    Polygon,
+}
+
+#[derive(Debug, Serialize, utoipa::ToSchema)]
+struct Polygon {
+    r#type: PolygonType,
+    /// One ring, closed, counter-clockwise: longitude, latitude, degrees, and the height above the datum of `[world] origin`, m
+    coordinates: [Vec<[f64; 3]>; 1],
+}
+
+/// What the camera sees of the ground in the latest frame.
+#[derive(Debug, Serialize, utoipa::ToSchema)]
+struct Footprint {
+    r#type: FeatureType,
+    /// Null where less than a triangle is seen
+    geometry: Option<Polygon>,
+    properties: FootprintProperties,
+}
+
+#[derive(Debug, Serialize, utoipa::ToSchema)]
+struct FootprintProperties {
+    #[schema(value_type = String, format = DateTime)]
+    time: Timestamp,
+    /// Of the platform, clockwise from north
+    heading_deg: f64,
+    pose_age_s: f64,
+}
+
+/// The footprint as the only feature; none as long as no pose has come.
+#[derive(Debug, Serialize, utoipa::ToSchema)]
+pub struct FootprintFeatures {
+    r#type: FeatureCollection,
+    features: Vec<Footprint>,
+}
+
+impl Footprint {
+    fn new(view: &ViewStatus, time: Timestamp, axes: &LocalAxes) -> Self {
+        let points = view.footprint_m.iter().zip(&view.footprint_z_m);
+        let mut ring: Vec<[f64; 3]> = points
+            .map(|([x, y], z)| {
+                let place = axes.to_geodetic([*x, *y, *z]);
+                [place.longitude_deg, place.latitude_deg, place.height_m]
+            })
+            .collect();
+        let is_area = ring.len() >= 3;
+        ring.extend(ring.first().copied());
+        Self {
+            r#type: FeatureType::Feature,
+            geometry: is_area.then_some(Polygon {
+                r#type: PolygonType::Polygon,
+                coordinates: [ring],
+            }),
+            properties: FootprintProperties {
+                time,
+                heading_deg: view.heading_deg,
+                pose_age_s: view.pose_age_s,
+            },
+        }
+    }
 }
 
 /// A track's number or an alert's id.
@@ -148,6 +213,29 @@ pub async fn positions(Shared(state): Shared<State>, headers: HeaderMap) -> Resu
     let latest = positions::latest(&state)?;
     Ok(conditional::answer(&headers, latest.seq, || {
         respond(&PositionFeatures::of(&latest.snapshot.report))
+    }))
+}
+
+/// What the camera sees of the ground in the latest frame, as GeoJSON (RFC 7946)
+#[utoipa::path(get, path = "/v1/footprint.geojson", tag = "positions",
+    responses(
+        (status = 200, description = "A polygon; none as long as no pose has come", body = FootprintFeatures, content_type = "application/geo+json"),
+        (status = 304, description = "Nothing new since the ETag given in If-None-Match"),
+        (status = 404, description = "The config has no [world] origin, or this is a hub", body = Problem, content_type = "application/problem+json"),
+        (status = 503, description = "No frame has been looked at yet", body = Problem, content_type = "application/problem+json"),
+    ))]
+pub async fn footprint(Shared(state): Shared<State>, headers: HeaderMap) -> Result<Response, Problem> {
+    check_origin(&state)?;
+    let axes = state.axes;
+    let axes = axes.ok_or_else(|| Problem::not_found("a hub has no camera: ask a station"))?;
+    let latest = positions::latest(&state)?;
+    let view = latest.snapshot.status.view.as_ref();
+    let features = view.map(|view| Footprint::new(view, latest.snapshot.report.time, &axes));
+    Ok(conditional::answer(&headers, latest.seq, || {
+        respond(&FootprintFeatures {
+            r#type: FeatureCollection::FeatureCollection,
+            features: features.into_iter().collect(),
+        })
     }))
 }
 

@@ -55,7 +55,7 @@ pub use pose_status::{PoseNow, PoseStatus};
 pub use server::{Error, Server};
 pub use snapshot::{
     ClaimsStatus, FrameCounts, JournalStatus, Latency, Snapshot, SourceState, SourceStatus, StationState,
-    StationStatus, Status,
+    StationStatus, Status, ViewStatus,
 };
 pub use state::{Acknowledged, Command, State, ZonesRefused};
 pub use tokens::TokenError;

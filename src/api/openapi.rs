@@ -42,6 +42,7 @@ pub fn router() -> (Router<State>, utoipa::openapi::OpenApi) {
     OpenApiRouter::with_openapi(Described::openapi())
         .routes(routes!(positions::positions))
         .routes(routes!(geojson::positions))
+        .routes(routes!(geojson::footprint))
         .routes(routes!(positions::user_position))
         .routes(routes!(positions::history))
         .routes(routes!(positions::history_csv))

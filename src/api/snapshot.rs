@@ -39,11 +39,46 @@ pub struct Status {
     pub estimator: String,
     /// Alerts not cleared, by kind.
     pub alerts_open: BTreeMap<AlertKind, u64>,
-    /// Half-widths of the watched area on the ground, m.
+    /// Half-widths of the watched area on the ground of a level camera over the origin, m.
     pub field_of_view_m: [f64; 2],
+    /// What the camera sees of the ground; null as long as no pose has come, and at a hub.
+    pub view: Option<ViewStatus>,
     /// The access points of a hub.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub stations: Vec<StationStatus>,
+}
+
+/// What the camera sees of the ground in the latest frame.
+#[derive(Clone, Debug, Default, Serialize, utoipa::ToSchema)]
+pub struct ViewStatus {
+    /// Outline on the ground, east and north, m, counter-clockwise; without the parts that see no ground.
+    pub footprint_m: Vec<[f64; 2]>,
+    /// Heights of the outline's points, m.
+    #[serde(skip)]
+    pub footprint_z_m: Vec<f64>,
+    /// The place below the lens, east and north, m.
+    pub nadir_m: [f64; 2],
+    /// Of the platform, clockwise from north, 0 to 360.
+    pub heading_deg: f64,
+    pub pose_age_s: f64,
+}
+
+impl Status {
+    /// Smallest and largest east and north of what is watched, m.
+    pub fn bounds_m(&self) -> [[f64; 2]; 2] {
+        let [x, y] = self.field_of_view_m;
+        let own = self.view.iter().flat_map(|view| &view.footprint_m);
+        let all = own.chain(self.stations.iter().flat_map(|station| &station.footprint_m));
+        let grow = |[low, high]: [[f64; 2]; 2], p: &[f64; 2]| {
+            [
+                [low[0].min(p[0]), low[1].min(p[1])],
+                [high[0].max(p[0]), high[1].max(p[1])],
+            ]
+        };
+        let nothing = [[f64::INFINITY; 2], [f64::NEG_INFINITY; 2]];
+        let bounds = all.fold(nothing, grow);
+        if bounds == nothing { [[-x, -y], [x, y]] } else { bounds }
+    }
 }
 
 /// One access point as its hub knows it.
@@ -59,8 +94,10 @@ pub struct StationStatus {
     /// Alert events that wait at the station for the link.
     pub alerts_waiting: u64,
     pub emitters: usize,
-    /// Half-widths of the watched area on the ground, m.
+    /// Half-widths of the watched area on the ground of a level camera over the origin, m.
     pub field_of_view_m: Option<[f64; 2]>,
+    /// Outline of what it sees of the ground, east and north, m, counter-clockwise.
+    pub footprint_m: Vec<[f64; 2]>,
     /// The station's own `GET /v1/status`.
     #[schema(value_type = Object)]
     pub status: serde_json::Value,

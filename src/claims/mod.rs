@@ -2,6 +2,7 @@
 //! monitor ever sees one.
 
 mod ahead;
+mod body;
 mod candidates;
 mod config;
 mod ellipse;
@@ -17,6 +18,7 @@ mod roster;
 mod rotated;
 mod store;
 
+pub use body::parse_body;
 pub use candidates::{Bearing, MOST_UNANSWERED};
 pub use config::{Config, ConfigError, Fields, Format};
 pub use follower::{Follower, LONGEST_LINE, Poll, Refused, read_log};

@@ -331,6 +331,7 @@ impl Compute {
             field_of_view_m: self
                 .camera
                 .to_ground([self.camera.x.half_width(), self.camera.y.half_width()]),
+            view: self.poses.view(),
             stations: Vec::new(),
         }
     }

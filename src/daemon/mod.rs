@@ -144,8 +144,15 @@ impl Daemon {
         endpoints.extend(exports.replace(self.exports));
         let (notifier, deliveries) =
             notify::spawn(endpoints, self.journal.clone(), notify::Clock::wall(), micros, stops());
+        let is_replay = self.config.source.kind == SourceKind::Replay;
+        let inbox = Inbox::new(self.pipeline.claims.roster());
         if let Some(station) = self.station {
-            let publishing = station.run(self.journal.clone(), feed.clone(), stops());
+            // A recording has its own claims.
+            let intake = (!is_replay).then(|| fleet::Intake {
+                reading: self.config.claims.clone(),
+                inbox: inbox.clone(),
+            });
+            let publishing = station.run(self.journal.clone(), feed.clone(), intake, stops());
             tokio::spawn(async move {
                 if let Err(error) = publishing.await {
                     tracing::error!(%error, "nothing is published to the fleet");
@@ -176,7 +183,6 @@ impl Daemon {
             "watching; API and page on {}",
             listener.url(self.server.scheme())?,
         );
-        let is_replay = source.kind == SourceKind::Replay;
         let telemetry = self.telemetry.zip(self.pipeline.pose_inbox());
         let telemetry = telemetry.map(|(link, inbox)| Telemetry::start(link, inbox, self.config.world.clone()));
         let _telemetry = telemetry.transpose()?;
@@ -184,7 +190,6 @@ impl Daemon {
         if !is_replay {
             self.pipeline.claims.expect_live_claims();
         }
-        let inbox = Inbox::new(self.pipeline.claims.roster());
         let compute = Compute {
             pipeline: self.pipeline,
             capture: Capture::start(self.source)?,
@@ -201,7 +206,7 @@ impl Daemon {
             journal: self.journal.clone(),
             webhooks: notifier.clone(),
             supervisor: Supervisor::default(),
-            poses: pose::Poses::new(&self.config.platform, self.config.world.axes(), self.camera.altitude_m),
+            poses: pose::Poses::new(&self.config.platform, self.config.world.axes(), &self.camera),
             camera: Arc::new(self.camera),
             claims_log: log.map(|l| l.display().to_string()),
             source: source.kind.name().to_owned(),

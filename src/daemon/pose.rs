@@ -1,10 +1,11 @@
-//! What the outside sees of the pose.
+//! What the outside sees of the pose and of the ground that the camera sees.
 
 use jiff::Timestamp;
 
-use crate::api::{PoseNow, PoseStatus};
-use crate::geo::LocalAxes;
+use crate::api::{PoseNow, PoseStatus, ViewStatus};
+use crate::geo::{LocalAxes, View};
 use crate::metric;
+use crate::optics::Camera;
 use crate::platform::{self, Placement, PoseAt};
 use crate::pose::Pose;
 
@@ -12,18 +13,18 @@ use crate::pose::Pose;
 pub struct Poses {
     source: &'static str,
     axes: Option<LocalAxes>,
-    altitude_m: f64,
+    /// Of the camera where it looked in the latest frame.
+    view: View,
     latest: PoseStatus,
 }
 
 impl Poses {
-    /// `altitude_m` is a level platform's.
-    pub fn new(config: &platform::Config, axes: Option<LocalAxes>, altitude_m: f64) -> Self {
+    pub fn new(config: &platform::Config, axes: Option<LocalAxes>, camera: &Camera) -> Self {
         let source = config.kind.name();
         Self {
             source,
             axes,
-            altitude_m,
+            view: View::level(camera),
             latest: PoseStatus {
                 source,
                 time: Timestamp::UNIX_EPOCH,
@@ -37,14 +38,28 @@ impl Poses {
         self.latest.clone()
     }
 
+    /// What the camera saw of the ground; nothing as long as no pose has come.
+    pub fn view(&self) -> Option<ViewStatus> {
+        let pose = self.latest.pose.as_ref()?;
+        let outline = self.view.outline_m();
+        Some(ViewStatus {
+            footprint_m: outline.iter().map(|[x, y, _]| [*x, *y]).collect(),
+            footprint_z_m: outline.iter().map(|[_, _, z]| *z).collect(),
+            nadir_m: [pose.x_m, pose.y_m],
+            heading_deg: pose.heading_deg,
+            pose_age_s: pose.age_s,
+        })
+    }
+
     /// Takes where the camera was in the frame of `time`.
     pub fn update(&mut self, time: Timestamp, placement: &Placement) {
         let (pose, is_lost) = match placement {
             Placement::Level => (
-                Some(self.now(&Pose::level(time, [0.0, 0.0, self.altitude_m]), 0.0)),
+                Some(self.now(&Pose::level(time, [0.0, 0.0, self.view.camera.altitude_m]), 0.0)),
                 false,
             ),
-            Placement::At { pose, is_lost, .. } => {
+            Placement::At { pose, is_lost, sight } => {
+                self.view.sight = Some(sight.clone());
                 let PoseAt { pose, age_s, .. } = &**pose;
                 metrics::gauge!(metric::POSE_AGE).set(*age_s);
                 (Some(self.now(pose, *age_s)), *is_lost)

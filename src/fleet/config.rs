@@ -25,6 +25,8 @@ pub struct Config {
     pub credentials_file: Option<PathBuf>,
     /// An NKey seed (`SU…`).
     pub nkey_file: Option<PathBuf>,
+    /// Subject on which the access network publishes claims; none are heard when left out.
+    pub claims_subject: Option<String>,
     /// Most messages with positions a second. More cost the link, fewer make the hub's map jump.
     pub positions_hz: f64,
     /// The hub misses a station after this time without a message, s. Shorter raises `station_lost` at hiccups of the link.
@@ -40,6 +42,7 @@ impl Default for Config {
             ca_file: None,
             credentials_file: None,
             nkey_file: None,
+            claims_subject: None,
             positions_hz: 10.0,
             lost_after_s: 10.0,
         }
@@ -59,6 +62,10 @@ pub enum ConfigError {
     Missing { key: &'static str },
     #[error("fleet.url: expected the NATS server of the fleet, found nothing")]
     NoUrl,
+    #[error("fleet.claims_subject: expected words of letters, digits, '-', '_' or '*' with dots between them, found {found:?}")]
+    Subject { found: String },
+    #[error("fleet.claims_subject: expected fleet.url beside it, found nothing")]
+    SubjectWithoutUrl,
     #[error("fleet.station: expected nothing, since a hub is no station; found {found:?}")]
     HubWithStation { found: String },
     #[error("fleet.{key}: expected one of credentials_file and nkey_file, found both")]
@@ -91,6 +98,16 @@ impl Config {
             if !url.as_ref().is_some_and(is_nats) {
                 let found = found.chars().take(200).collect();
                 return Err(ConfigError::Url { found });
+            }
+        }
+        if let Some(subject) = &self.claims_subject {
+            let is_word = |word: &str| word == "*" || is_name(word);
+            if !subject.split('.').all(is_word) {
+                let found = subject.chars().take(200).collect();
+                return Err(ConfigError::Subject { found });
+            }
+            if self.url.is_none() {
+                return Err(ConfigError::SubjectWithoutUrl);
             }
         }
         if self.credentials_file.is_some() && self.nkey_file.is_some() {
@@ -142,6 +159,9 @@ mod tests {
             "url = \"http://h:4222\"\nsite = \"a\"\nstation = \"b\"",
             "url = \"nats://h\"\nsite = \"a.b\"\nstation = \"b\"",
             "url = \"nats://h\"\nsite = \"a\"\nstation = \"*\"",
+            "claims_subject = \"network.claims\"",
+            "url = \"nats://h\"\nsite = \"a\"\nstation = \"b\"\nclaims_subject = \"network..claims\"",
+            "url = \"nats://h\"\nsite = \"a\"\nstation = \"b\"\nclaims_subject = \"network.>\"",
             "lost_after_s = 0",
             "positions_hz = -1",
         ] {

@@ -5,9 +5,11 @@ use std::time::Duration;
 
 use async_nats::jetstream::stream;
 use async_nats::{Client, ConnectOptions, jetstream};
+use metrics::counter;
 
 use super::config::Config;
 use super::subject::{Subject, Topic};
+use crate::metric;
 
 /// The stream of all alerts.
 const STREAM: &str = "OAPWATCH";
@@ -22,6 +24,8 @@ const LARGEST_STREAM: i64 = 1 << 30;
 const LARGEST_EVENT: i32 = 256 << 10;
 /// A dead link is noticed after two of these.
 const PING: Duration = Duration::from_secs(10);
+/// Messages of a subscription that wait to be read: ten seconds' of a thousand stations.
+pub const CAPACITY: usize = 1 << 16;
 /// Longest wait between two attempts to connect.
 const SLOWEST_RETRY: Duration = Duration::from_secs(5);
 
@@ -41,8 +45,9 @@ pub enum Error {
 }
 
 /// Connects in the background, for ever: the client is usable at once, and a link that is lost is taken up again. Answers come to
-/// subjects below `_INBOX.<name>`, so that the server can keep those of others from us.
-pub async fn connect(config: &Config, name: String) -> Result<Client, Error> {
+/// subjects below `_INBOX.<name>`, so that the server can keep those of others from us. Of each subscription `capacity` messages wait
+/// at most.
+pub async fn connect(config: &Config, name: String, capacity: usize) -> Result<Client, Error> {
     let unreadable = |key: &'static str, path: &Path| {
         let path = path.to_owned();
         move |source| Error::File { key, path, source }
@@ -51,6 +56,7 @@ pub async fn connect(config: &Config, name: String) -> Result<Client, Error> {
         .custom_inbox_prefix(format!("_INBOX.{name}"))
         .name(name)
         .retry_on_initial_connect()
+        .subscription_capacity(capacity)
         .ping_interval(PING)
         .reconnect_delay_callback(|attempts| {
             let attempts = u32::try_from(attempts).unwrap_or(u32::MAX);
@@ -63,6 +69,9 @@ pub async fn connect(config: &Config, name: String) -> Result<Client, Error> {
                 async_nats::Event::Connected => tracing::info!("connected to the NATS server"),
                 async_nats::Event::Disconnected => {
                     tracing::warn!("the NATS server is gone; alerts wait in the journal")
+                }
+                async_nats::Event::SlowConsumer(_) => {
+                    counter!(metric::FLEET_MESSAGES, "topic" => "heard", "outcome" => "dropped").increment(1);
                 }
                 other => tracing::debug!(%other, "NATS"),
             }

@@ -40,6 +40,9 @@ pub struct PositionsMessage {
     pub claims: Vec<Claim>,
     /// Half-widths of the watched area on the ground, m.
     pub field_of_view_m: [f64; 2],
+    /// Outline of what the station sees of the ground, east and north, m, counter-clockwise.
+    #[serde(default)]
+    pub footprint_m: Vec<[f64; 2]>,
 }
 
 /// Of topic `health`: once a second.

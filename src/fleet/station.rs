@@ -9,6 +9,7 @@ use jiff::Timestamp;
 use metrics::{counter, gauge};
 use tokio::time::MissedTickBehavior;
 
+use super::claims::{self, Intake};
 use super::config::{Config, ConfigError};
 use super::connection::{self, Error};
 use super::message::{AlertMessage, HealthMessage, PositionsMessage, VERSION};
@@ -53,16 +54,34 @@ impl Station {
         }
     }
 
-    /// Publishes until `shutdown` completes; what is left of the alerts waits in the journal for the next start.
-    pub async fn run(self, journal: Journal, feed: Arc<Feed>, shutdown: impl Future<Output = ()>) -> Result<(), Error> {
-        let client = connection::connect(&self.config, self.name.to_string()).await?;
+    /// Publishes, and hears claims where there is an intake, until `shutdown` completes; what is left of the alerts waits in the journal
+    /// for the next start.
+    pub async fn run(
+        self,
+        journal: Journal,
+        feed: Arc<Feed>,
+        intake: Option<Intake>,
+        shutdown: impl Future<Output = ()>,
+    ) -> Result<(), Error> {
+        let client = connection::connect(&self.config, self.name.to_string(), connection::CAPACITY).await?;
         tokio::select! {
             () = shutdown => {}
             () = self.alerts(&client, &journal) => {}
             () = self.positions(&client, &feed) => {}
             () = self.health(&client, &journal, &feed) => {}
+            heard = self.claims(intake) => heard?,
         }
         Ok(())
+    }
+
+    /// Over a connection of its own: however many claims come, nothing else waits behind them.
+    async fn claims(&self, intake: Option<Intake>) -> Result<(), Error> {
+        if let Some((subject, intake)) = self.config.claims_subject.as_deref().zip(intake) {
+            let name = format!("{}.claims", self.name);
+            let client = connection::connect(&self.config, name, claims::CAPACITY).await?;
+            claims::receive(&client, subject, &intake).await;
+        }
+        std::future::pending().await
     }
 
     fn subject(&self, topic: Topic) -> String {
@@ -165,6 +184,7 @@ impl Station {
             };
             last_seq = latest.seq;
             let report = &latest.snapshot.report;
+            let view = latest.snapshot.status.view.as_ref();
             let message = PositionsMessage {
                 version: VERSION,
                 name: self.name.clone(),
@@ -174,6 +194,7 @@ impl Station {
                 unseen: report.unseen.clone(),
                 claims: latest.claims_in_view().cloned().collect(),
                 field_of_view_m: latest.snapshot.status.field_of_view_m,
+                footprint_m: view.map(|view| view.footprint_m.clone()).unwrap_or_default(),
             };
             self.send(client, Topic::Positions, &message).await;
         }

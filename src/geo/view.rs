@@ -130,6 +130,30 @@ impl View {
         }
     }
 
+    /// Outline of the view on the ground, east, north and up, m, counter-clockwise; without the parts whose rays meet no ground.
+    pub fn outline_m(&self) -> Vec<[f64; 3]> {
+        /// Points of an edge: a distorted one is a curve.
+        const OF_AN_EDGE: usize = 4;
+        let half = [self.camera.x.half_width(), self.camera.y.half_width()];
+        let corners = [[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]];
+        let on_ground = |[x, y]: [f64; 2]| {
+            let sensor = [x * half[0], y * half[1]];
+            match &self.sight {
+                None => {
+                    let [x, y] = self.camera.to_ground(sensor);
+                    Some([x, y, 0.0])
+                }
+                Some(sight) => sight.ground(&self.camera, sensor).map(|point| point.position_m.into()),
+            }
+        };
+        let points = (0..4 * OF_AN_EDGE).filter_map(|k| {
+            let (from, to) = (corners[k / OF_AN_EDGE], corners[(k / OF_AN_EDGE + 1) % 4]);
+            let share = (k % OF_AN_EDGE) as f64 / OF_AN_EDGE as f64;
+            on_ground([0, 1].map(|i| from[i] + share * (to[i] - from[i])))
+        });
+        points.collect()
+    }
+
     /// ∂place/∂pose of a place on the ground, as [`GroundPoint::by_pose`](super::GroundPoint) has it; zero for a fixed platform.
     pub fn by_pose(&self, p: Vector2<f64>) -> Matrix2x6<f64> {
         let point = self.sight.as_ref().and_then(|s| s.ground_at(p.into()));
@@ -142,5 +166,41 @@ impl View {
             let by_pose = self.by_pose(p);
             by_pose * sight.cov() * by_pose.transpose()
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use jiff::Timestamp;
+    use nalgebra::UnitQuaternion;
+
+    use super::*;
+    use crate::optics;
+    use crate::pose::{Mount, Pose};
+
+    #[test]
+    fn the_outline_is_the_view_s_corners_and_ends_where_the_sky_begins() {
+        let camera = optics::Config::default().camera().unwrap();
+        let level = View::level(&camera).outline_m();
+        let [w, h] = camera.to_ground([camera.x.half_width(), camera.y.half_width()]);
+        let corner = |k: usize| [level[4 * k][0], level[4 * k][1]];
+        let expected = [[-w, -h], [w, -h], [w, h], [-w, h]];
+        for (k, at) in expected.iter().enumerate() {
+            assert!((corner(k)[0] - at[0]).hypot(corner(k)[1] - at[1]) < 1e-9, "{level:?}");
+        }
+        let seen = |pitch_deg: f64| {
+            let mut pose = Pose::level(Timestamp::UNIX_EPOCH, [1000.0, 0.0, camera.altitude_m]);
+            pose.attitude = UnitQuaternion::from_euler_angles(0.0, pitch_deg.to_radians(), 0.0);
+            let sight = Some(Sight::new(&pose, &Mount::default()));
+            let camera = camera.clone();
+            View { camera, sight }.outline_m()
+        };
+        // Pitched up, the view moves north (forward) and grows there.
+        let tilted = seen(20.0);
+        assert_eq!(tilted.len(), level.len());
+        assert!((tilted[0][0] + tilted[4][0] - 2000.0).abs() < 1e-6, "{tilted:?}");
+        assert!(tilted[0][1] > level[0][1] && tilted[8][1] > level[8][1] && tilted[8][0] - 1000.0 > w);
+        let horizon = seen(80.0);
+        assert!(!horizon.is_empty() && horizon.len() < level.len(), "{horizon:?}");
     }
 }

@@ -63,7 +63,7 @@ impl Hub {
     pub async fn run(self, _logging: logging::Handle) -> Result<()> {
         let listen = &self.config.api.listen;
         let listener = api::Listener::bind(listen).with_context(|| format!("api.listen: cannot listen on {listen}"))?;
-        let client = fleet::connect(&self.config.fleet, "hub".to_owned()).await?;
+        let client = fleet::connect(&self.config.fleet, "hub".to_owned(), fleet::CAPACITY).await?;
         let started_at = Timestamp::now();
         let (stop, stopped) = watch::channel(false);
         let stops = || {

@@ -303,6 +303,7 @@ impl Run {
                 estimator: "fleet".to_owned(),
                 alerts_open: self.alerts.open_by_kind(),
                 field_of_view_m,
+                view: None,
                 stations,
             },
             report: Report {

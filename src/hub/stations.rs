@@ -223,11 +223,21 @@ impl Stations {
                 alerts_waiting: station.health.as_ref().map_or(0, |h| h.alerts_waiting),
                 emitters: positions.map_or(0, |p| p.emitters.len()),
                 field_of_view_m: positions.map(|p| p.field_of_view_m),
+                footprint_m: positions.map(footprint).unwrap_or_default(),
                 status,
             }
         };
         self.known.iter().map(status).collect()
     }
+}
+
+/// The outline that a station states; nothing where it cannot be one.
+fn footprint(message: &PositionsMessage) -> Vec<[f64; 2]> {
+    /// Points of an outline: four times what ours have.
+    const MOST: usize = 64;
+    let points = &message.footprint_m;
+    let is_outline = points.len() <= MOST && points.iter().flatten().all(|v| v.is_finite());
+    if is_outline { points.clone() } else { Vec::new() }
 }
 
 /// All fresh positions together.

@@ -105,6 +105,12 @@ impl From<reqwest::Error> for Failure {
 #[derive(Debug)]
 pub struct Cause(reqwest::Error);
 
+impl From<reqwest::Error> for Cause {
+    fn from(error: reqwest::Error) -> Self {
+        Self(error)
+    }
+}
+
 impl fmt::Display for Cause {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let mut causes = Vec::new();

@@ -110,7 +110,7 @@ impl Endpoint {
         .map_err(|cause| Error::Common { index, cause })?;
         let webhook = Webhook {
             signer: read_secrets(index, config)?,
-            client: http::build(index, config, loopback)?,
+            client: http::build(index, config, &url, loopback)?,
             url: url.clone(),
         };
         Ok(Self {

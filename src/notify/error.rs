@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use super::channel::Cause;
 use super::signature::SecretError;
 use crate::journal;
 
@@ -39,8 +40,10 @@ pub enum Error {
     Twice { index: usize, earlier: usize, name: String },
     #[error("[[webhook]] {index}: {cause}")]
     Common { index: usize, cause: CommonError },
-    #[error("[[webhook]] {index}: {cause}")]
-    Client { index: usize, cause: reqwest::Error },
+    #[error(
+        "[[webhook]] {index}: url: expected certificate authorities on this host to check an https receiver by, found: {cause}; install ca-certificates"
+    )]
+    Client { index: usize, cause: Cause },
 }
 
 /// Why keys that `[[webhook]]` and `[[export]]` have in common cannot be used.

@@ -3,12 +3,13 @@
 use std::time::Duration;
 
 use reqwest::{Certificate, Client, redirect};
+use url::Url;
 
 use super::Config;
 use super::error::{AuthorityError, Error};
 
 /// `loopback`: the receiver is on this host, so that no proxy lies between.
-pub(super) fn build(index: usize, config: &Config, loopback: bool) -> Result<Client, Error> {
+pub(super) fn build(index: usize, config: &Config, url: &Url, loopback: bool) -> Result<Client, Error> {
     // Any earlier choice of the process stands.
     let _ = rustls::crypto::ring::default_provider().install_default();
     let mut builder = Client::builder()
@@ -20,7 +21,10 @@ pub(super) fn build(index: usize, config: &Config, loopback: bool) -> Result<Cli
     if loopback {
         builder = builder.no_proxy();
     }
-    if let Some(path) = &config.ca_file {
+    if url.scheme() == "http" {
+        // A host without authorities can send all the same.
+        builder = builder.tls_certs_only([]);
+    } else if let Some(path) = &config.ca_file {
         let authority = |cause| Error::Authority {
             index,
             path: path.clone(),
@@ -33,5 +37,8 @@ pub(super) fn build(index: usize, config: &Config, loopback: bool) -> Result<Cli
         }
         builder = builder.tls_certs_merge(certificates);
     }
-    builder.build().map_err(|cause| Error::Client { index, cause })
+    builder.build().map_err(|error| Error::Client {
+        index,
+        cause: error.into(),
+    })
 }

@@ -392,6 +392,7 @@ pub fn snapshot(number: u64) -> api::Snapshot {
             estimator: "fit".into(),
             alerts_open: BTreeMap::new(),
             field_of_view_m: [125.0, 125.0],
+            view: None,
             stations: Vec::new(),
         },
         camera,

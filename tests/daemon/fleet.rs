@@ -4,6 +4,8 @@ use std::collections::BTreeMap;
 use std::net::{TcpListener, TcpStream};
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use serde_json::Value;
@@ -138,6 +140,53 @@ fn alerts_reach_the_hub_once_each_whoever_is_killed() {
         assert!(Instant::now() < end, "{at_station:?}\nat the hub: {at_hub:?}");
         std::thread::sleep(Duration::from_millis(200));
     }
+}
+
+#[test]
+fn claims_come_over_nats_in_the_format_of_the_log() {
+    let dir = tempfile::tempdir().unwrap();
+    let Some(server) = Server::start(dir.path(), None) else {
+        return;
+    };
+    let port = server.port;
+    let config = format!(
+        "[claims]\nformat = \"csv\"\n[fleet]\nurl = \"nats://127.0.0.1:{port}\"\nsite = \"harbour\"\nstation = \"ap7\"\n\
+         claims_subject = \"network.*.claims\"\n"
+    );
+    let daemon = Daemon::start(dir.path(), &config);
+    daemon.wait_until_up();
+    let stop = Arc::new(AtomicBool::new(false));
+    let publishing = {
+        let stop = stop.clone();
+        move || async move {
+            let client = async_nats::connect(format!("127.0.0.1:{port}")).await.unwrap();
+            while !stop.load(Ordering::Relaxed) {
+                let now = jiff::Timestamp::now();
+                let lines = format!("time,user,x_m,y_m\n{now},by-nats,40,-60\n{now},nowhere,far,away\n");
+                client.publish("network.harbour.claims", lines.into()).await.unwrap();
+                client.flush().await.unwrap();
+                tokio::time::sleep(Duration::from_millis(100)).await;
+            }
+        }
+    };
+    let publisher = std::thread::spawn(|| {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+        runtime.block_on(publishing());
+    });
+    // No beam comes from there.
+    daemon.wait_for("/v1/alerts?kind=user_unseen", "unseen user", |v| {
+        alerts(v).iter().any(|a| a["user"] == "by-nats")
+    });
+    stop.store(true, Ordering::Relaxed);
+    publisher.join().unwrap();
+    let metrics = daemon.get("/metrics").1;
+    let malformed = metrics.lines().find_map(|l| l.strip_prefix("oapwatch_claims_total{outcome=\"malformed\"} "));
+    assert!(malformed.is_some_and(|n| n.parse::<u64>().unwrap() > 0), "{metrics}");
+    daemon.signal("-TERM");
+    let (code, log) = daemon.end();
+    assert_eq!(code, Some(0));
+    let told: Vec<_> = log.iter().filter(|l| l.contains("a claim cannot be taken: line 3: ")).collect();
+    assert_eq!(told.len(), 1, "{log:?}");
 }
 
 #[test]

@@ -1,6 +1,7 @@
 //! The daemon as an operator meets it: a process, an address, signals.
 
 mod fleet;
+mod geojson;
 mod over_http;
 mod places;
 mod process;

@@ -64,6 +64,10 @@ impl Daemon {
     }
 
     /// Host and port.
+    pub fn url(&self) -> &str {
+        &self.url
+    }
+
     pub fn address(&self) -> &str {
         self.url.trim_start_matches("http://")
     }

@@ -13,6 +13,26 @@ use super::receiver::{Answer, Seen, take};
 use super::sender::{Daemon, event, on_disk, until, webhook};
 
 #[test]
+fn a_host_without_authorities_is_named_and_needs_none_for_plain_http() {
+    let dir = tempfile::tempdir().unwrap();
+    std::fs::write(dir.path().join("secret"), "whsec_MfKQ9r8GKYqrTwjUPD8ILPZIo2LaLaSw").unwrap();
+    let check = |url: &str| {
+        let file = dir.path().join("oapwatch.toml");
+        std::fs::write(&file, format!("[[webhook]]\nurl = {url:?}\nsecret_file = \"secret\"\n")).unwrap();
+        let mut program = std::process::Command::new(env!("CARGO_BIN_EXE_oapwatch"));
+        let nothing = dir.path().join("nothing");
+        program.arg("check").arg(&file).env("SSL_CERT_FILE", &nothing).env("SSL_CERT_DIR", &nothing);
+        let said = program.output().unwrap();
+        (said.status.code(), String::from_utf8(said.stderr).unwrap())
+    };
+    let (code, told) = check("https://hooks.example.org/in");
+    assert_eq!(code, Some(2), "{told}");
+    assert!(told.contains("[[webhook]] 1: url: ") && told.contains("ca-certificates") && !told.contains("builder error"), "{told}");
+    let (code, told) = check("http://127.0.0.1:9/in");
+    assert_eq!(code, Some(0), "{told}");
+}
+
+#[test]
 fn a_webhook_that_cannot_work_is_a_clear_config_error() {
     let dir = tempfile::tempdir().unwrap();
     let good = webhook(dir.path(), "https://hooks.example.org/in?token=hunter2");

@@ -67,6 +67,7 @@ fn snapshot() -> api::Snapshot {
             estimator: "ml".into(),
             alerts_open: BTreeMap::new(),
             field_of_view_m: [125.0, 125.0],
+            view: None,
             stations: Vec::new(),
         },
     }

@@ -157,7 +157,7 @@ function draw() {
     claims: live ? latest.claims : [],
     unseen: live ? latest.unseen : [],
     trails: timeline.trails(moment.emitters),
-    half: latest.status.field_of_view_m,
+    ...ground(latest.status, live),
   };
   map.show(scene);
   const time = Date.parse(moment.time);
@@ -167,6 +167,21 @@ function draw() {
   timeline.render(alerts.known.values());
   beams.show(scene);
   past(live ? null : time);
+}
+
+// What is watched: the outlines on the ground, and the smallest and largest place of them all.
+function ground({ view, stations = [], field_of_view_m: [w, h] }, live) {
+  const outlines = [view?.footprint_m, ...stations.map((s) => s.footprint_m)].filter((points) => points?.length > 2);
+  const points = outlines.length ? outlines.flat() : [[-w, -h], [w, h]];
+  const bounds = [Math.min, Math.max].map((pick) => [0, 1].map((k) => points.reduce((v, p) => pick(v, p[k]), points[0][k])));
+  if (!live) return { bounds, views: [] };
+  const views = stations.filter((s) => s.footprint_m?.length > 2).map((s) => ({ outline: s.footprint_m, title: `seen by ${shown(s.site)}.${shown(s.station)}` }));
+  if (view?.footprint_m.length > 2) {
+    const age = view.pose_age_s > 0.5 ? `; pose ${view.pose_age_s.toFixed(1)} s old` : "";
+    views.push({ outline: view.footprint_m, nadir: view.nadir_m, heading: view.heading_deg, title: `the UAV is above ${view.nadir_m.map((v) => Math.round(v)).join(", ")} m, heading ${Math.round(view.heading_deg)}°${age}` });
+  }
+  if (!views.length) views.push({ outline: [[-w, -h], [w, -h], [w, h], [-w, h]], title: "the field of view" });
+  return { bounds, views };
 }
 
 // Looking back, everything on the page is of that time, or says that it is not.

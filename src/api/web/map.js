@@ -1,4 +1,4 @@
-// The ground in metres: x to the right, y up, the UAV's nadir in the middle.
+// The ground in metres: x to the right, y up, what is watched in the middle.
 
 import { metres, shown, svg } from "./words.js";
 import { place } from "./labels.js";
@@ -15,8 +15,11 @@ export class GroundMap {
     this.pointed = null; // the beam or user that is pointed at elsewhere
     this.search = "";
     this.half = [125, 125];
+    this.seen = null;
+    this.home = [0, 0];
     this.zoom = 1;
     this.centre = [0, 0];
+    this.isFollowing = true; // what is watched, until the reader looks elsewhere
     this.beams = new Map();
     this.scene = null;
     this.picked = null;
@@ -63,6 +66,7 @@ export class GroundMap {
         this.zoomBy(gap(now) / Math.max(1, gap(before)), this.place(e));
       } else {
         moved += Math.hypot(e.clientX - before[0], e.clientY - before[1]);
+        this.isFollowing = false;
         this.centre[0] -= (e.clientX - before[0]) / this.scale;
         this.centre[1] += (e.clientY - before[1]) / this.scale;
       }
@@ -84,6 +88,7 @@ export class GroundMap {
       const moves = { ArrowLeft: [-step, 0], ArrowRight: [step, 0], ArrowUp: [0, step], ArrowDown: [0, -step] };
       if (moves[e.key]) {
         e.preventDefault();
+        this.isFollowing = false;
         this.centre[0] += moves[e.key][0];
         this.centre[1] += moves[e.key][1];
         this.redraw();
@@ -182,6 +187,7 @@ export class GroundMap {
 
   zoomBy(factor, about = this.centre) {
     const before = this.zoom;
+    this.isFollowing = false;
     this.zoom = Math.min(400, Math.max(0.5, this.zoom * factor));
     const kept = before / this.zoom;
     this.centre = this.centre.map((c, k) => about[k] + (c - about[k]) * kept);
@@ -190,7 +196,8 @@ export class GroundMap {
 
   all() {
     this.zoom = 1;
-    this.centre = [0, 0];
+    this.isFollowing = true;
+    this.centre = [...this.home];
     this.picked = null;
     this.pickedKey = null;
     this.redraw();
@@ -201,14 +208,27 @@ export class GroundMap {
     this.picked = place;
     this.pickedKey = key;
     const inside = place.every((p, k) => Math.abs(p - this.centre[k]) < (0.45 * [this.width, this.height][k]) / this.scale);
-    if (!inside) this.centre = [...place];
+    if (!inside) {
+      this.isFollowing = false;
+      this.centre = [...place];
+    }
     this.redraw();
   }
 
   show(scene) {
     this.scene = scene;
-    this.half = scene.half;
+    this.frame(scene.bounds);
     this.redraw();
+  }
+
+  // Takes in all that a swaying platform has seen, so that the ground stays where it is on the page; one that travels is followed.
+  frame([low, high]) {
+    const all = this.seen ? [low.map((v, k) => Math.min(v, this.seen[0][k])), high.map((v, k) => Math.max(v, this.seen[1][k]))] : [low, high];
+    const isFar = low.some((v, k) => all[1][k] - all[0][k] > 1.6 * (high[k] - v));
+    this.seen = isFar ? [low, high] : all;
+    this.home = this.seen[0].map((v, k) => (v + this.seen[1][k]) / 2);
+    this.half = this.seen[0].map((v, k) => Math.max(1, (this.seen[1][k] - v) / 2));
+    if (this.isFollowing) this.centre = [...this.home];
   }
 
   px([x, y]) {
@@ -236,25 +256,26 @@ export class GroundMap {
   }
 
   drawBack() {
-    const [left, top] = this.px([-this.half[0], this.half[1]]);
-    const [right, bottom] = this.px([this.half[0], -this.half[1]]);
     const step = STEPS.find((s) => s * this.scale >= 70) ?? 1000;
-    const nodes = [svg("rect", { class: "view", x: left, y: top, width: right - left, height: bottom - top })];
+    const nodes = this.scene.views.map((view) => svg("path", { class: "view", d: this.path([view.outline]) }, svg("title", {}, view.title)));
     const [x0, y0] = [this.centre[0] - this.width / 2 / this.scale, this.centre[1] - this.height / 2 / this.scale];
     const [x1, y1] = [this.centre[0] + this.width / 2 / this.scale, this.centre[1] + this.height / 2 / this.scale];
     const round = (v) => +v.toFixed(1);
     for (let x = Math.ceil(x0 / step) * step; x <= x1; x += step) {
       const [px] = this.px([x, 0]);
-      nodes.push(svg("line", { class: round(x) === 0 ? "axis" : "grid", x1: px, x2: px, y1: Math.max(0, top), y2: Math.min(this.height, bottom) }));
+      nodes.push(svg("line", { class: round(x) === 0 ? "axis" : "grid", x1: px, x2: px, y1: 0, y2: this.height }));
       if (px > 30 && px < this.width - 60 - step * this.scale) nodes.push(svg("text", { class: "tick", x: px + 4, y: this.height - 6 }, `${round(x)}`));
     }
     for (let y = Math.ceil(y0 / step) * step; y <= y1; y += step) {
       const [, py] = this.px([0, y]);
-      nodes.push(svg("line", { class: round(y) === 0 ? "axis" : "grid", y1: py, y2: py, x1: Math.max(0, left), x2: Math.min(this.width, right) }));
+      nodes.push(svg("line", { class: round(y) === 0 ? "axis" : "grid", y1: py, y2: py, x1: 0, x2: this.width }));
       if (py > 14 && py < this.height - 24) nodes.push(svg("text", { class: "tick", x: 6, y: py - 4 }, `${round(y)}`));
     }
-    const [cx, cy] = this.px([0, 0]);
-    nodes.push(svg("path", { class: "nadir", d: `M${cx - 9} ${cy}h18M${cx} ${cy - 9}v18` }, svg("title", {}, "the UAV's nadir")));
+    for (const { nadir, heading, title } of this.scene.views) {
+      if (!nadir) continue;
+      const [cx, cy] = this.px(nadir);
+      nodes.push(svg("path", { class: "nadir", d: `M${cx - 9} ${cy}h18M${cx} ${cy + 9}v-22M${cx - 4} ${cy - 9}l4 -5l4 5`, transform: `rotate(${heading} ${cx} ${cy})` }, svg("title", {}, title)));
+    }
     const long = step * this.scale;
     nodes.push(
       svg("path", { class: "scale-bar", d: `M${this.width - 14 - long} ${this.height - 16}v6h${long}v-6` }),

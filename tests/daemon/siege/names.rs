@@ -13,9 +13,8 @@ use super::super::process::{Daemon, alerts};
 use super::{FLOOR_US, RATE_HZ, SAMPLE, number, status};
 
 const LOG: &str = "claims.ndjson";
-/// How long a flood lasts, and for how long it is calm before and after.
-const FLOOD: Duration = Duration::from_secs(20);
-const CALM_SAMPLES: usize = 3;
+/// How long a flood lasts, and for how long it is calm before and after: the eavesdropper comes as often in each.
+const PHASE: Duration = Duration::from_millis(21_100);
 /// The eavesdropper comes every so often, for so long, the first time after so long, s.
 const EVERY_S: f64 = 7.0;
 const STAYS_S: f64 = 3.0;
@@ -82,14 +81,22 @@ pub fn append(dir: &Path, text: &str) {
     log.write_all(text.as_bytes()).unwrap();
 }
 
-/// How long after each time the eavesdropper came on between two frames the alert was there, s; `None` where there was none.
+/// How long after each time the eavesdropper came on between two frames the alert was there, s: at once where the alert of the time before is
+/// still open. `None` where there was none.
 pub fn times_to_alert(daemon: &Daemon, rate_hz: f64, from_frame: u64, to_frame: u64) -> Vec<Option<f64>> {
     let (code, body) = daemon.get("/v1/alerts?kind=unclaimed_emitter&limit=500");
     assert_eq!(code, 200, "{body}");
     let list: Value = serde_json::from_str(&body).unwrap();
-    let raised: Vec<f64> = alerts(&list)
+    let time = |alert: &Value, key: &str| alert[key].as_str()?.parse::<Timestamp>().ok();
+    // From when to when each alert is open.
+    let open: Vec<(f64, f64)> = alerts(&list)
         .iter()
-        .filter_map(|a| Some(a["source"]["frame"].as_u64()? as f64 / rate_hz))
+        .filter_map(|alert| {
+            let from_s = alert["source"]["frame"].as_u64()? as f64 / rate_hz;
+            let raised_at = time(alert, "raised_at")?;
+            let lasts_s = time(alert, "cleared_at").map_or(f64::INFINITY, |t| t.duration_since(raised_at).as_secs_f64());
+            Some((from_s, from_s + lasts_s))
+        })
         .collect();
     let (from_s, to_s) = (from_frame as f64 / rate_hz, to_frame as f64 / rate_hz);
     let came = (0..)
@@ -97,8 +104,8 @@ pub fn times_to_alert(daemon: &Daemon, rate_hz: f64, from_frame: u64, to_frame: 
         .take_while(|t| *t < to_s);
     came.filter(|t| *t >= from_s && t + STAYS_S < to_s)
         .map(|t| {
-            let within = raised.iter().filter(|r| (t..t + STAYS_S).contains(*r));
-            within.map(|r| r - t).min_by(f64::total_cmp)
+            let meanwhile = open.iter().filter(|(from, to)| *from < t + STAYS_S && *to > t);
+            meanwhile.map(|(from, _)| (from - t).max(0.0)).min_by(f64::total_cmp)
         })
         .collect()
 }
@@ -187,10 +194,9 @@ fn idle(_: Duration) {
 /// Calm, flood, calm: prints all and asks for what must hold.
 fn besiege(what: &str, dir: &Path, mut flood: impl FnMut(&Daemon, Duration)) {
     let daemon = start(dir, RATE_HZ);
-    let calm = SAMPLE * CALM_SAMPLES as u32 + Duration::from_millis(100);
-    let before = Phase::watch(&daemon, calm, idle);
-    let during = Phase::watch(&daemon, FLOOD, |since| flood(&daemon, since));
-    let after = Phase::watch(&daemon, calm, idle);
+    let before = Phase::watch(&daemon, PHASE, idle);
+    let during = Phase::watch(&daemon, PHASE, |since| flood(&daemon, since));
+    let after = Phase::watch(&daemon, PHASE, idle);
     let alerted = times_to_alert(&daemon, RATE_HZ, during.frames[0], during.frames[1]);
     let flooded = daemon
         .get("/v1/alerts?kind=claims_flooded")
@@ -274,8 +280,8 @@ fn siege_a_log_of_three_hundred_thousand_old_names() {
     }
     drop(log);
     let daemon = start(dir.path(), RATE_HZ);
-    let began = Phase::watch(&daemon, FLOOD, idle);
-    let later = Phase::watch(&daemon, FLOOD, idle);
+    let began = Phase::watch(&daemon, PHASE, idle);
+    let later = Phase::watch(&daemon, PHASE, idle);
     println!("start with 300,000 old names in the log");
     println!("  first 20 s {}\n  next 20 s  {}", began.told(), later.told());
     let alerted = times_to_alert(&daemon, RATE_HZ, 0, later.frames[1]);
