@@ -54,7 +54,8 @@ pub struct Places {
 
 impl Places {
     pub fn of(config: &Config) -> Result<Self, Error> {
-        let zones = zones::load(&config.zone).map_err(|e| Error::Places(e.to_string()))?;
+        let zones =
+            zones::load(&config.zone, config.world.axes().as_ref()).map_err(|e| Error::Places(e.to_string()))?;
         let known = notify::names(&config.webhook);
         for zone in &zones {
             if let Some(name) = zone.webhooks.iter().flatten().find(|name| !known.contains(name)) {

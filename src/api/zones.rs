@@ -5,15 +5,17 @@ use axum::extract::State as Shared;
 use axum::extract::rejection::BytesRejection;
 use axum::http::{HeaderMap, HeaderValue, StatusCode, header};
 use axum::response::{IntoResponse, Response};
+use serde::Deserialize;
 use serde_json::Value;
 
 use super::client::Caller;
+use super::extract::Query;
 use super::geojson::MEDIA_TYPE;
 use super::known_lights::{body_of, written};
 use super::problem::Problem;
 use super::state::{Command, State, ZonesRefused};
 use crate::journal::AuditAction;
-use crate::monitor::zones::{Zone, ZoneError, ZoneMap, collection, parse};
+use crate::monitor::zones::{Coordinates, Zone, ZoneError, ZoneMap, collection, parse};
 
 const LARGEST_BODY: usize = 4 << 20;
 
@@ -23,15 +25,28 @@ impl From<ZoneError> for Problem {
     }
 }
 
-fn answer(map: &ZoneMap) -> Response {
-    let mut response = collection(map.zones().iter()).to_string().into_response();
+#[derive(Debug, Deserialize, utoipa::IntoParams)]
+#[into_params(parameter_in = Query)]
+#[serde(deny_unknown_fields)]
+pub struct ZonesQuery {
+    /// What corners are, in what is put and in what is answered: "metres" (east and north, when left out) or "degrees" (longitude and
+    /// latitude, as RFC 7946 says), which need `[world] origin`
+    #[param(inline)]
+    #[serde(default)]
+    coordinates: Coordinates,
+}
+
+fn answer(map: &ZoneMap, state: &State, coordinates: Coordinates) -> Result<Response, Problem> {
+    let mut zones = collection(map.zones().iter());
+    coordinates.write(&mut zones, state.axes.as_ref())?;
+    let mut response = zones.to_string().into_response();
     let headers = response.headers_mut();
     headers.insert(header::CONTENT_TYPE, HeaderValue::from_static(MEDIA_TYPE));
     headers.insert(header::CACHE_CONTROL, HeaderValue::from_static("no-cache"));
     if let Ok(tag) = HeaderValue::from_str(&tag(map)) {
         headers.insert(header::ETAG, tag);
     }
-    response
+    Ok(response)
 }
 
 fn tag(map: &ZoneMap) -> String {
@@ -59,16 +74,18 @@ fn changed() -> Problem {
 
 /// The zones in force, as a GeoJSON feature collection
 ///
-/// Coordinates are metres east and north. `properties` has `name`, `kind` ("ignore", "restricted" or "watch"), `users`,
+/// `properties` has `name`, `kind` ("ignore", "restricted" or "watch"), `users`,
 /// `tolerated_distance_m`, `severity`, `webhooks`, and `source`, "config" or "api".
-#[utoipa::path(get, path = "/v1/zones", tag = "places",
+#[utoipa::path(get, path = "/v1/zones", tag = "places", params(ZonesQuery),
     responses(
         (status = 200, description = "A feature for each zone; the ETag is for If-Match", body = Object, content_type = "application/geo+json"),
+        (status = 400, description = "The query cannot be read", body = Problem, content_type = "application/problem+json"),
+        (status = 422, description = "Degrees need [world] origin", body = Problem, content_type = "application/problem+json"),
         (status = 503, description = "The monitor is too busy; come back", body = Problem, content_type = "application/problem+json"),
     ))]
-pub async fn get(Shared(state): Shared<State>) -> Result<Response, Problem> {
+pub async fn get(Shared(state): Shared<State>, Query(query): Query<ZonesQuery>) -> Result<Response, Problem> {
     let map = state.ask(|reply| Command::Zones { reply }).await?;
-    Ok(answer(&map))
+    answer(&map, &state, query.coordinates)
 }
 
 /// Puts zones in force in place of those put before
@@ -76,11 +93,12 @@ pub async fn get(Shared(state): Shared<State>) -> Result<Response, Problem> {
 /// Those of the config stay as they are; features with `"source": "config"` are left out, so that what was read can be changed and
 /// put. With `If-Match` only if nobody else has changed them since.
 #[utoipa::path(put, path = "/v1/zones", tag = "places",
-    params(("If-Match" = Option<String>, Header, description = "The ETag of the zones that were changed")),
+    params(ZonesQuery, ("If-Match" = Option<String>, Header, description = "The ETag of the zones that were changed")),
     request_body(description = "A feature collection, at most 4 MiB and 1000 zones", content(
         (Object = "application/geo+json"), (Object = "application/json"))),
     responses(
         (status = 200, description = "The zones in force", body = Object, content_type = "application/geo+json"),
+        (status = 400, description = "The query cannot be read", body = Problem, content_type = "application/problem+json"),
         (status = 409, description = "This is a hub", body = Problem, content_type = "application/problem+json"),
         (status = 412, description = "Somebody else has changed them since", body = Problem, content_type = "application/problem+json"),
         (status = 413, description = "The body is too large", body = Problem, content_type = "application/problem+json"),
@@ -91,11 +109,17 @@ pub async fn get(Shared(state): Shared<State>) -> Result<Response, Problem> {
 pub async fn put(
     Shared(state): Shared<State>,
     caller: Caller,
+    Query(query): Query<ZonesQuery>,
     headers: HeaderMap,
     body: Result<Bytes, BytesRejection>,
 ) -> Result<Response, Problem> {
-    let value: Value = body_of(&headers, body, LARGEST_BODY, &[MEDIA_TYPE, "application/json"])?;
-    let zones = tokio::task::spawn_blocking(move || parse(&value))
+    let mut value: Value = body_of(&headers, body, LARGEST_BODY, &[MEDIA_TYPE, "application/json"])?;
+    let (coordinates, axes) = (query.coordinates, state.axes);
+    let read = move || {
+        coordinates.read(&mut value, axes.as_ref())?;
+        parse(&value)
+    };
+    let zones = tokio::task::spawn_blocking(read)
         .await
         .expect("reading zones does not panic")?;
     check_webhooks(&state, &zones)?;
@@ -127,7 +151,7 @@ pub async fn put(
     state
         .audit
         .change(AuditAction::PutZones, &caller, "zones", Some(detail));
-    Ok(answer(&map))
+    answer(&map, &state, coordinates)
 }
 
 /// A zone whose webhook does not exist would send its alerts nowhere.

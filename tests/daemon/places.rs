@@ -252,3 +252,33 @@ fn zones_that_cannot_be_used_end_the_program() {
         assert_eq!(output.status.code(), Some(64), "{said}");
     }
 }
+
+#[test]
+fn zones_in_degrees_are_the_same_ground_as_in_metres() {
+    let dir = tempfile::tempdir().unwrap();
+    scene(dir.path());
+    let origin = "latitude_deg = 0.0, longitude_deg = 11.0, height_m = 0.0, datum = \"ellipsoid\"";
+    // On the equator a degree of latitude is 110.574 km, one of longitude 111.320 km.
+    let features = json!([{ "type": "Feature", "properties": {}, "geometry": { "type": "Polygon", "coordinates": [
+        [[11.0005, 0.0005], [11.0006, 0.0005], [11.0006, 0.0006], [11.0005, 0.0005]]
+    ] } }]);
+    let file = json!({ "type": "FeatureCollection", "features": features });
+    std::fs::write(dir.path().join("gate.geojson"), file.to_string()).unwrap();
+    let gate = "[[zone]]\nname = \"gate\"\nkind = \"watch\"\ngeojson = \"gate.geojson\"\ncoordinates = \"degrees\"\n";
+    let daemon = Daemon::start(dir.path(), &format!("{gate}[world]\norigin = {{ {origin} }}\n{CONFIG}"));
+    let (_, metres) = json_of(daemon.get("/v1/zones"));
+    let corner = metres["features"][0]["geometry"]["coordinates"][0][0][0].clone();
+    let [x, y] = [0, 1].map(|k| corner[k].as_f64().unwrap());
+    assert!((x - 55.660).abs() < 0.01 && (y - 55.287).abs() < 0.01, "{corner}");
+    let (status, degrees) = json_of(daemon.get("/v1/zones?coordinates=degrees"));
+    let corner = degrees["features"][0]["geometry"]["coordinates"][0][0][0].clone();
+    assert!(
+        status == 200 && (corner[0].as_f64().unwrap() - 11.0005).abs() < 1e-9,
+        "{corner}"
+    );
+    let road = collection(vec![square("road", "ignore", 0.0, 0.001)]);
+    let (status, after) = json_of(daemon.send("PUT", "/v1/zones?coordinates=degrees", "", &road));
+    assert_eq!(status, 422, "longitude 0 lies far beyond: {after}");
+    let (status, problem) = json_of(daemon.get("/v1/zones?coordinates=feet"));
+    assert_eq!(status, 400, "{problem}");
+}

@@ -1,4 +1,4 @@
-//! Zones as GeoJSON (RFC 7946): a feature for each, its keys in `properties`. Coordinates are metres east and north.
+//! Zones as GeoJSON (RFC 7946): a feature for each, its keys in `properties`. Coordinates are metres east and north here.
 
 use serde_json::{Value, json};
 

@@ -2,6 +2,7 @@
 
 mod check;
 mod config;
+mod degrees;
 mod geojson;
 mod index;
 mod shape;
@@ -10,6 +11,7 @@ mod zone;
 pub use check::ZoneError;
 pub(in crate::monitor) use check::check_all;
 pub use config::{Config, load};
+pub use degrees::Coordinates;
 pub use geojson::{collection, parse};
 pub use index::{Inside, ZoneMap, ignored_share};
 pub use shape::{MAX_COORDINATE_M, Shape, ShapeError};

@@ -108,12 +108,13 @@ fn restricted(stories: u64, seed: u64) -> (String, bool) {
         kind: ZoneKind::Restricted,
         polygon: Some(vec![[20.0, -10.0], [50.0, -10.0], [50.0, 20.0], [20.0, 20.0]]),
         geojson: None,
+        coordinates: zones::Coordinates::Metres,
         users: Vec::new(),
         tolerated_distance_m: None,
         severity: None,
         webhooks: None,
     };
-    let yard = zones::load(&[yard]).expect("a square");
+    let yard = zones::load(&[yard], None).expect("a square");
     let mut late: Vec<f64> = Vec::new();
     let mut all = 0;
     for is_claimed in [false, true] {

@@ -13,7 +13,7 @@ fn zones(text: &str) -> Vec<Zone> {
     struct File {
         zone: Vec<oapwatch::monitor::zones::Config>,
     }
-    load(&toml::from_str::<File>(text).unwrap().zone).unwrap()
+    load(&toml::from_str::<File>(text).unwrap().zone, None).unwrap()
 }
 
 fn in_force(zones: Vec<Zone>) -> impl Fn(f64, &mut Monitor, &[AlertEvent]) + 'static {
