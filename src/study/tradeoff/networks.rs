@@ -23,14 +23,22 @@ struct Card {
     noise_std_j: f64,
     samples: u64,
     training_seconds: f64,
+    #[serde(default = "one_core")]
+    trained_on: String,
+}
+
+fn one_core() -> String {
+    "one processor core".to_owned()
 }
 
 /// What a network cost to train.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Training {
     pub samples: u64,
-    /// Of one processor core.
+    /// Of the machine.
     pub seconds: f64,
+    #[serde(default = "one_core")]
+    pub machine: String,
 }
 
 /// One estimator as it is run in one cell.
@@ -79,6 +87,7 @@ impl Trained {
         Training {
             samples: self.card.samples,
             seconds: self.card.training_seconds,
+            machine: self.card.trained_on.clone(),
         }
     }
 

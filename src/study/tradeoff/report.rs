@@ -163,28 +163,34 @@ fn beside(text: &mut String, study: &Study, is_wanted: impl Fn(&Row) -> bool) {
     }
 }
 
-/// What the networks cost to train, with what a mean over matched pairs alone hides.
+/// What the networks cost to train and what a mean over matched pairs alone hides, with what else was measured in their cells.
 fn networks(text: &mut String, study: &Study) {
-    let learned: Vec<&Row> = study.rows.iter().filter(|r| r.training.is_some()).collect();
-    if learned.is_empty() {
+    let is_learned = |cell| study.rows.iter().any(|r| r.cell == cell && r.training.is_some());
+    let rows: Vec<&Row> = study.rows.iter().filter(|r| is_learned(r.cell)).collect();
+    if rows.is_empty() {
         return;
     }
     text.push_str(
-        "\n## Networks\n\nMissed and invented are shares of the emitters; seconds are of one processor core.\n\n\
-         | cell | estimator | samples | training s | mean m² | median m² | missed | invented | OSPA m |\n\
-         |---|---|---|---|---|---|---|---|---|\n",
+        "\n## Networks\n\nThe mean's 95 % interval is a bootstrap over frames. Missed and invented are shares of the emitters.\n\n\
+         | cell | estimator | samples | trained | frames | mean m² | median m² | missed | invented | OSPA m |\n\
+         |---|---|---|---|---|---|---|---|---|---|\n",
     );
     let number = |v: Option<f64>| v.map_or("–".to_owned(), |v| format!("{v:.3}"));
-    for row in learned {
-        let Some(training) = row.training else { continue };
+    for row in rows {
+        let [samples, trained] = match &row.training {
+            Some(t) => [t.samples.to_string(), format!("{:.0} s on {}", t.seconds, t.machine)],
+            None => ["–".to_owned(), "–".to_owned()],
+        };
+        let interval = row
+            .mean_interval_m2
+            .map_or(String::new(), |[low, high]| format!(" ({low:.3} to {high:.3})"));
         let share = |count: usize| 100.0 * count as f64 / row.emitters.max(1) as f64;
         let _ = writeln!(
             text,
-            "| {} | {} | {} | {:.0} | {} | {} | {:.1} % | {:.1} % | {:.2} |",
+            "| {} | {} | {samples} | {trained} | {} | {}{interval} | {} | {:.1} % | {:.1} % | {:.2} |",
             row.cell.name(),
             row.estimator,
-            training.samples,
-            training.seconds,
+            row.frames,
             number(row.mean_m2),
             number(row.median_m2),
             share(row.missed),

@@ -2,6 +2,8 @@
 
 use std::time::Instant;
 
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
 use super::Error;
@@ -35,6 +37,9 @@ pub struct Row {
     pub training: Option<Training>,
     /// Squared error over matched pairs, both axes summed; none where nothing was matched.
     pub mean_m2: Option<f64>,
+    /// 95 % confidence interval of the mean.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub mean_interval_m2: Option<[f64; 2]>,
     pub median_m2: Option<f64>,
     /// Mean of the smallest 95 %.
     pub trimmed_m2: Option<f64>,
@@ -75,6 +80,7 @@ pub(super) fn measure(cell: &Cell, candidate: &Candidate, scenes: &[Scene], seed
     let mut estimator = estimate::build(&config, &camera)?;
     let (mut squared, mut ratios, mut bounds, mut known_bounds, mut latencies) =
         (vec![], vec![], vec![], vec![], vec![]);
+    let mut of_frames = Vec::with_capacity(scenes.len());
     let (mut total_ospa, mut missed, mut invented) = (0.0, 0, 0);
     let (mut right, mut clear, mut clear_right, mut resolvable) = (0, 0, 0, 0);
     if let Some(scene) = scenes.first() {
@@ -101,6 +107,7 @@ pub(super) fn measure(cell: &Cell, candidate: &Candidate, scenes: &[Scene], seed
         bounds.extend_from_slice(&scene.bound_m2);
         known_bounds.extend_from_slice(&scene.known_bound_m2);
         squared.extend_from_slice(&answer.squared_m2);
+        of_frames.push((answer.squared_m2.iter().sum(), answer.squared_m2.len()));
         ratios.extend_from_slice(&answer.ratios);
     }
     let frames = scenes.len();
@@ -115,6 +122,7 @@ pub(super) fn measure(cell: &Cell, candidate: &Candidate, scenes: &[Scene], seed
         frames,
         seed,
         mean_m2: mean(&squared),
+        mean_interval_m2: interval(&of_frames, seed),
         median_m2: quantile(&squared, 0.5),
         trimmed_m2: trimmed(&squared),
         bound_median_m2: quantile(&bounds, 0.5),
@@ -130,6 +138,26 @@ pub(super) fn measure(cell: &Cell, candidate: &Candidate, scenes: &[Scene], seed
         latency_median_us: quantile(&latencies, 0.5).unwrap_or(0.0),
         latency_p99_us: quantile(&latencies, 0.99).unwrap_or(0.0),
     })
+}
+
+/// 95 % confidence interval of the mean over pairs, from each frame's sum and number of pairs: percentiles of the bootstrap over frames
+/// (Efron 1979), since pairs of one frame are not independent and few carry the mean. `None` where nothing is paired.
+fn interval(of_frames: &[(f64, usize)], seed: u64) -> Option<[f64; 2]> {
+    /// Percentiles of 2.5 and 97.5 are then those of 25 values each.
+    const RESAMPLES: usize = 1000;
+    if of_frames.iter().all(|(_, pairs)| *pairs == 0) {
+        return None;
+    }
+    let mut random = ChaCha8Rng::seed_from_u64(seed);
+    let mut means: Vec<f64> = (0..RESAMPLES)
+        .filter_map(|_| {
+            let drawn = (0..of_frames.len()).map(|_| of_frames[random.random_range(0..of_frames.len())]);
+            let (sum, pairs) = drawn.fold((0.0, 0), |(sum, pairs), (s, p)| (sum + s, pairs + p));
+            (pairs > 0).then(|| sum / pairs as f64)
+        })
+        .collect();
+    means.sort_by(f64::total_cmp);
+    Some([quantile(&means, 0.025)?, quantile(&means, 0.975)?])
 }
 
 /// How an answer compares with the truth of its frame.
@@ -202,4 +230,29 @@ fn quantile(sorted: &[f64], share: f64) -> Option<f64> {
 /// The estimators of single frames: each of the trade-off's frames is a scene of its own.
 pub(in crate::study) fn of_single_frames() -> impl Iterator<Item = &'static EstimatorSpec> {
     ESTIMATORS.iter().filter(|r| !r.remembers())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_interval_of_a_mean_holds_it_as_often_as_it_says() {
+        let mut random = ChaCha8Rng::seed_from_u64(1);
+        // Frames of one to three pairs with exponential errors of mean 2.
+        let held = (0..400).filter(|k| {
+            let mut frame = || {
+                let pairs = random.random_range(1..4);
+                let sum: f64 = (0..pairs).map(|_| -2.0 * (1.0 - random.random::<f64>()).ln()).sum();
+                (sum, pairs)
+            };
+            let frames: Vec<_> = (0..200).map(|_| frame()).collect();
+            let [low, high] = interval(&frames, *k).unwrap();
+            (low..high).contains(&2.0)
+        });
+        // Within three standard deviations of 95 %.
+        let held = held.count();
+        assert!((367..=393).contains(&held), "{held} of 400");
+        assert_eq!(interval(&[(0.0, 0)], 1), None);
+    }
 }
