@@ -67,7 +67,8 @@ scene = "{layout["scene"]}"
 spot_sigma_px = {layout["spot_sigma_px"][0]}
 noise_std_j = {layout["noise_std_j"]}
 samples = {state["seen"]}
-training_seconds = {state["seconds"]:.0f}          # of one processor core{begun}
+training_seconds = {state["seconds"]:.0f}
+trained_on = "{state.get("machine", "one processor core")}"{begun}
 
 # {VALIDATION} frames of another seed: heatmap maxima, held to the nearest emitter within 10 m.
 [validation]

@@ -1,4 +1,4 @@
-"""The paper's two networks. Inputs are (batch, 1, Ny, Nx), normalised as `normalise` does; heatmaps are (batch, 1, Ny, Nx).
+"""The paper's two networks, and variants. Inputs are (batch, 1, Ny, Nx), normalised as `normalise` does; heatmaps are (batch, 1, Ny, Nx).
 
 A network is `body` behind `front`. `front` passes frames on as they are, or whitens them.
 """
@@ -94,6 +94,26 @@ class Hybrid(nn.Module):
         return torch.sigmoid(self.layers(frames).float())
 
 
+class Dilated(nn.Module):
+    """Nine 3×3 convolutions, dilated by 1, 2, 4, 8, 16, 8, 4, 2, 1, so that each pixel sees 93: for spots that melt into each other
+    (Yu and Koltun 2016). A 1×1 sigmoid head."""
+
+    def __init__(self, width: int = 16):
+        super().__init__()
+        layers: list[nn.Module] = []
+        inputs = 1
+        for dilation in (1, 2, 4, 8, 16, 8, 4, 2, 1):
+            convolution = nn.Conv2d(inputs, width, 3, padding=dilation, dilation=dilation, bias=False)
+            layers += [convolution, nn.BatchNorm2d(width), nn.ReLU()]
+            inputs = width
+        head = nn.Conv2d(width, 1, 1)
+        nn.init.constant_(head.bias, -4.0)
+        self.layers = nn.Sequential(*layers, head)
+
+    def forward(self, frames: torch.Tensor) -> torch.Tensor:
+        return torch.sigmoid(self.layers(frames).float())
+
+
 class Stage(nn.Sequential):
     """Two 3×3 convolutions with batch normalisation and LeakyReLU."""
 
@@ -144,6 +164,7 @@ BODIES = {
     "cnn16": lambda: Hybrid(16),
     "cnn16-separable": lambda: Hybrid(16, separable=True),
     "cnn32": lambda: Hybrid(32),
+    "dilated16": Dilated,
     "unet": UNet,
 }
 NETWORKS = [*BODIES, *(f"{name}-white" for name in BODIES)]

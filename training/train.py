@@ -3,6 +3,7 @@
 import argparse
 import json
 import math
+import os
 import time
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from torch.nn import functional
 from tqdm import tqdm
 
 from networks import NETWORKS, build, normalise
-from samples import Stream, heatmaps, offsets
+from samples import Stream, Streams, heatmaps, offsets
 
 VALIDATION = 256
 VALIDATION_SEED = 2
@@ -54,13 +55,14 @@ def peaks(output, threshold=0.3, radius=1):
     return [found[frame == k] for k in range(len(heatmap))]
 
 
-def validate(network, batches, sigma_px, metre_px):
+def validate(network, batches, sigma_px, metre_px, device):
     """Loss, and what the heatmaps' maxima alone are worth within 10 m: recall, precision, median and mean squared error, m²."""
     network.eval()
     losses, found, total, named, squared = [], 0, 0, 0, []
     with torch.no_grad():
         for frames, emitters in batches:
-            output = network(normalise(frames))
+            output = network(normalise(frames.to(device)))
+            output = tuple(o.cpu() for o in output) if isinstance(output, tuple) else output.cpu()
             losses.append(loss_of(output, frames, emitters, sigma_px).item())
             for at, slots in zip(peaks(output), emitters):
                 truth = slots[~slots[:, 0].isnan(), :2]
@@ -81,6 +83,20 @@ def validate(network, batches, sigma_px, metre_px):
     }
 
 
+def device_of(name: str) -> torch.device:
+    """`auto` is a GPU where there is one."""
+    if name == "cuda" and not torch.cuda.is_available():
+        raise SystemExit("--device cuda: expected a GPU that PyTorch can use, found none")
+    has_gpu = name != "cpu" and torch.cuda.is_available()
+    return torch.device("cuda" if has_gpu else "cpu")
+
+
+def machine_of(device: torch.device, threads: int) -> str:
+    if device.type == "cuda":
+        return f"one {torch.cuda.get_device_name(device)}"
+    return "one processor core" if threads == 1 else f"{threads} processor cores"
+
+
 def save(path: Path, state: dict) -> None:
     part = path.with_suffix(".part")
     torch.save(state, part)
@@ -95,7 +111,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="folder of the checkpoint and the validation curve")
     parser.add_argument("--samples", type=int, default=500_000)
     parser.add_argument(
-        "--minutes", type=float, default=math.inf, help="CPU time of the whole training, whatever the number of samples; the schedule heeds it"
+        "--minutes", type=float, default=math.inf, help="time of the whole training (of the processor, or by the clock beside a GPU), whatever the number of samples; the schedule heeds it"
     )
     parser.add_argument("--batch", type=int, default=32)
     parser.add_argument("--rate", type=float, default=3e-3, help="largest learning rate; falls as a cosine to nothing")
@@ -104,8 +120,12 @@ def main() -> None:
     parser.add_argument("--precision", choices=("bf16", "f32"), default="bf16", help="of the convolutions while training")
     parser.add_argument("--validations", type=int, default=10, help="how often to validate and keep a checkpoint")
     parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
+    parser.add_argument("--processes", type=int, help="that make samples; one beside a processor, those of the machine beside a GPU")
     args = parser.parse_args()
 
+    device = device_of(args.device)
+    processes = args.processes or (max(1, (os.cpu_count() or 2) - 2) if device.type == "cuda" else 1)
     torch.set_num_threads(args.threads)
     torch.manual_seed(0)
     args.out.mkdir(parents=True, exist_ok=True)
@@ -116,34 +136,38 @@ def main() -> None:
     held_out.close()
     metre_px = layout["ground_m_per_px"][0]
 
-    network = build(args.network, layout["nx"], layout["ny"]).to(memory_format=torch.channels_last)
+    network = build(args.network, layout["nx"], layout["ny"]).to(device, memory_format=torch.channels_last)
     optimiser = torch.optim.Adam(network.parameters(), lr=args.rate)
     seen, curve, spent = 0, [], 0.0
     checkpoint = args.out / "checkpoint.pt"
     if checkpoint.exists():
-        state = torch.load(checkpoint)
+        state = torch.load(checkpoint, map_location=device)
         network.load_state_dict(state["network"])
         optimiser.load_state_dict(state["optimiser"])
         seen, curve, spent = state["seen"], state["curve"], state["seconds"]
     else:
         if args.from_run:
-            network.body.load_state_dict(torch.load(args.from_run / "checkpoint.pt")["body"])
+            network.body.load_state_dict(torch.load(args.from_run / "checkpoint.pt", map_location=device)["body"])
         if args.network.endswith("-white"):
             first = Stream(args.program, args.scene, WHITENING, 0, TRAINING_SEED)
-            network.front.learn(next(first.batches(WHITENING))[0])
+            network.front.learn(next(first.batches(WHITENING))[0].to(device))
             first.close()
     about = {"name": args.network, "target_sigma_px": args.target_sigma_px, "layout": layout}
+    about["machine"] = machine_of(device, args.threads)
+    # A processor's time leaves out what else the machine does; a GPU has no such clock.
+    clock = time.monotonic if device.type == "cuda" else time.process_time
+    began = clock() if device.type == "cuda" else 0.0
     about["from_run"] = args.from_run and args.from_run.name
 
     def seconds():
-        return spent + time.process_time()
+        return spent + clock() - began
 
     def progress():
         return min(1.0, max(seen / args.samples, seconds() / 60 / args.minutes))
 
     def keep():
         at = seconds()
-        curve.append({"samples": seen, "seconds": round(at), **validate(network, validation, args.target_sigma_px, metre_px)})
+        curve.append({"samples": seen, "seconds": round(at), **validate(network, validation, args.target_sigma_px, metre_px, device)})
         bar.write(json.dumps(curve[-1]))
         state = {"network": network.state_dict(), "body": network.body.state_dict(), "optimiser": optimiser.state_dict()}
         save(checkpoint, {**state, "seen": seen, "curve": curve, "seconds": at, **about})
@@ -152,24 +176,29 @@ def main() -> None:
     if progress() >= 1.0:
         print(f"{args.out} is trained: {seen} samples in {spent:.0f} s")
         return
-    stream = Stream(args.program, args.scene, args.samples - seen, seen, TRAINING_SEED)
+    stream = Streams(args.program, args.scene, seen, args.samples, TRAINING_SEED, processes)
     bar = tqdm(total=args.samples, initial=seen, unit="sample", smoothing=0.05, mininterval=1.0)
-    done = progress()
-    for frames, emitters in stream.batches(args.batch):
+    done = kept = progress()
+    for frames, emitters, is_leg in stream.batches(args.batch):
+        if device.type == "cuda":
+            frames, emitters = (batch.pin_memory().to(device, non_blocking=True) for batch in (frames, emitters))
         for group in optimiser.param_groups:
             group["lr"] = args.rate * min(1.0, done / WARM_UP + 0.05) * 0.5 * (1 + math.cos(math.pi * done))
         optimiser.zero_grad()
-        with torch.autocast("cpu", torch.bfloat16, enabled=args.precision == "bf16"):
+        with torch.autocast(device.type, torch.bfloat16, enabled=args.precision == "bf16"):
             output = network(normalise(frames).contiguous(memory_format=torch.channels_last))
         loss = loss_of(output, frames, emitters, args.target_sigma_px)
         loss.backward()
         optimiser.step()
         seen += len(frames)
-        before, done = done, progress()
+        done = progress()
         bar.update(len(frames))
         bar.set_postfix(loss=f"{loss.item():.2e}", done=f"{100 * done:.0f} %")
-        if int(done * args.validations) > int(before * args.validations):
+        # What is kept between two legs can be taken up without a sample twice or never.
+        is_due = int(done * args.validations) > int(kept * args.validations)
+        if done >= 1.0 or (is_leg and is_due):
             keep()
+            kept = done
         if done >= 1.0:
             break
     stream.close()

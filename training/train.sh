@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
 # Trains, exports and draws every network of the paper's table: ./training/train.sh [MINUTES] [SAMPLES]
 # MINUTES is the CPU time for each 64 × 64 network; others get their share by the number of pixels (between 1/4 and 2 times).
+# On a GPU where PyTorch finds one (DEVICE=cpu prevents it); MINUTES are then the clock's.
 # Can be stopped at any time and started again. Then: oapwatch tradeoff --networks training/models
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -11,6 +12,7 @@ readings=${READINGS:-energy-1mm paper-8mm}
 networks=${NETWORKS:-cnn16 cnn16-separable unet}
 python=${PYTHON:-training/.venv/bin/python}
 program=${PROGRAM:-target/release/oapwatch}
+device=${DEVICE:-auto}
 if [ ! -x "$python" ]; then
   python3 -m venv training/.venv
   training/.venv/bin/pip install -r training/requirements.txt
@@ -33,7 +35,7 @@ for pixels in $sizes; do
       from=()
       if [ "$network" = unet ] && [ -n "${smaller[$name-$reading]:-}" ]; then from=(--from-run "${smaller[$name-$reading]}"); fi
       smaller[$name-$reading]=$run
-      "$python" training/train.py --program "$program" --network "$name" --scene "$scene" --out "$run" --samples "$samples" --minutes "$share" "${from[@]}"
+      "$python" training/train.py --program "$program" --network "$name" --scene "$scene" --out "$run" --samples "$samples" --minutes "$share" --device "$device" "${from[@]}"
       "$python" training/export.py --program "$program" --run "$run" --scene "$scene" --out "training/models/$name-$reading-$pixels.onnx"
     done
   done
