@@ -119,11 +119,27 @@ impl Config {
         config.rebase(&base);
         config.validate(path)?;
         config.claims.axes = config.world.axes();
+        let scene = config.source.scene.as_ref();
+        let scene = scene.filter(|_| config.source.kind == frames::SourceKind::Simulator);
+        // A scene that cannot be read is refused where it is used.
+        if let Some(scene) = scene.and_then(|path| scene::Scene::load(path).ok()) {
+            config.adopt_platform(&scene);
+        }
         if given.contains_key("record") && config.record.folder.is_none() {
             return Err(Error::NoRecordFolder { path: path.to_owned() });
         }
         config.unused = config.unused_among(&given);
         Ok(config)
+    }
+
+    /// A scene's platform that moves says where it is, unless `[platform]` tells otherwise.
+    pub fn adopt_platform(&mut self, scene: &scene::Scene) {
+        if let Some(moving) = &scene.platform
+            && self.platform == platform::Config::default()
+        {
+            self.platform.kind = platform::Kind::Frames;
+            self.platform.mount = moving.mount;
+        }
     }
 
     /// Checks the numbers of the tables that do not check them where they are used.
@@ -193,7 +209,7 @@ impl Config {
     /// Zones in which a stranger raises nothing, where they are much of the view. A config whose zones cannot be used is refused
     /// elsewhere.
     fn ignored_ground(&self, camera: &optics::Camera) -> Option<String> {
-        let zones = monitor::zones::load(&self.zone).ok()?;
+        let zones = monitor::zones::load(&self.zone, self.world.axes().as_ref()).ok()?;
         let half = camera.to_ground([camera.x.half_width(), camera.y.half_width()]);
         let share = monitor::zones::ignored_share(zones, half);
         (share > MUCH_IGNORED).then(|| {

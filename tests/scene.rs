@@ -10,6 +10,8 @@ mod detector;
 mod files;
 #[path = "scene/light.rs"]
 mod light;
+#[path = "scene/platform.rs"]
+mod platform;
 #[path = "scene/streams.rs"]
 mod streams;
 

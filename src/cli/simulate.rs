@@ -1,4 +1,4 @@
-//! `oapwatch simulate`: writes the frames, truth and claims of a scene.
+//! `oapwatch simulate`: writes the frames, truth, claims and poses of a scene.
 
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
@@ -25,7 +25,7 @@ pub struct Args {
     /// The same seed gives the same frames
     #[arg(long, default_value_t = 0)]
     seed: u64,
-    /// Folder for frames.npy (f8, J), truth.ndjson, claims.ndjson and oapwatch.toml, a config with which `review` runs on them;
+    /// Folder for frames.npy (f8, J), truth.ndjson, claims.ndjson, poses.ndjson where the platform moves, and oapwatch.toml, a config with which `review` runs on them;
     /// made when it is not there, files are replaced, except a config of another origin
     #[arg(long)]
     out: PathBuf,
@@ -43,7 +43,7 @@ pub fn run(args: Args) -> Outcome {
     let plan = plan.starting_at(args.start);
     let interrupted = interrupt::watch().map_err(Failure::other)?;
     let shape = plan.camera().shape();
-    let mut recording = Recording::create(&args.out, shape).map_err(Failure::other)?;
+    let mut recording = Recording::create(&args.out, shape, scene.platform.is_some()).map_err(Failure::other)?;
 
     let bar = progress::bar(args.frames, "frames");
     let batch = (BATCH_PIXELS / (shape.0 * shape.1)).clamp(1, 256) as u64;
@@ -70,6 +70,11 @@ pub fn run(args: Args) -> Outcome {
             args.out.display()
         )));
     }
+    if let Some(last) = next.checked_sub(1) {
+        recording
+            .append_poses(&plan.poses_after(last))
+            .map_err(Failure::other)?;
+    }
     eprintln!("{next} frames in {}", args.out.display());
     let config = args.out.join("oapwatch.toml");
     match write_config(&config, &scene, args.start).map_err(Failure::other)? {
@@ -90,10 +95,17 @@ fn write_config(path: &Path, scene: &Scene, start: Timestamp) -> anyhow::Result<
         _ => {}
     }
     let optics = toml::to_string(&scene.optics).context("the scene's [optics] as TOML")?;
+    let platform = match &scene.platform {
+        Some(moving) => {
+            let mount = toml::Table::try_from(moving.mount).context("the scene's mount as TOML")?;
+            format!("[platform]\nkind = \"replay\"\nposes = \"poses.ndjson\"\n[platform.mount]\n{mount}\n")
+        }
+        None => String::new(),
+    };
     // A table below [optics] would take in the keys after it, so it comes last.
     let text = format!(
         "{CONFIG_HEAD}\n\n[source]\nkind = \"replay\"\nframes = \"frames.npy\"\nstart = \"{start}\"\nrate_hz = {:?}\n\n\
-         [claims]\nlog = \"claims.ndjson\"\n\n[optics]\n{}",
+         [claims]\nlog = \"claims.ndjson\"\n\n{platform}[optics]\n{}",
         scene.rate_hz,
         optics.replace("[blur]", "[optics.blur]"),
     );

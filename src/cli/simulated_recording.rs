@@ -1,10 +1,11 @@
-//! Writes a simulated recording: frames.npy, truth.ndjson and claims.ndjson, which hold the same frames even after an error.
+//! Writes a simulated recording: frames.npy, truth.ndjson, claims.ndjson and the poses of a platform that moves, which hold the same frames even after an error.
 
 use std::fs::File;
 use std::io::{self, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 
 use crate::frames::npy;
+use crate::pose::Pose;
 use crate::scene::SimulatedFrame;
 
 /// Why a file of the recording could not be written.
@@ -23,6 +24,7 @@ pub struct Recording {
     frames: npy::Writer,
     truth: Lines,
     claims: Lines,
+    poses: Option<Lines>,
 }
 
 #[derive(Debug)]
@@ -33,8 +35,8 @@ struct Lines {
 }
 
 impl Recording {
-    /// Creates `folder` and, in it, the three files without a frame. `shape` is (Ny, Nx).
-    pub fn create(folder: &Path, shape: (usize, usize)) -> Result<Self, WriteError> {
+    /// Creates `folder` and, in it, the files without a frame; that of poses where the platform moves. `shape` is (Ny, Nx).
+    pub fn create(folder: &Path, shape: (usize, usize), moves: bool) -> Result<Self, WriteError> {
         std::fs::create_dir_all(folder).map_err(|reason| WriteError::Io {
             path: folder.to_owned(),
             reason,
@@ -43,6 +45,7 @@ impl Recording {
             frames: npy::Writer::create(folder.join("frames.npy"), shape)?,
             truth: Lines::create(folder.join("truth.ndjson"))?,
             claims: Lines::create(folder.join("claims.ndjson"))?,
+            poses: moves.then(|| Lines::create(folder.join("poses.ndjson"))).transpose()?,
         })
     }
 
@@ -60,8 +63,17 @@ impl Recording {
             let kept = &batch[..(self.frames() - before) as usize];
             let _ = self.truth.cut_to(kept, truth_lines);
             let _ = self.claims.cut_to(kept, claim_lines);
+            if let Some(poses) = &mut self.poses {
+                let _ = poses.cut_to(kept, pose_lines);
+            }
         }
         done
+    }
+
+    /// Appends the poses after the last frame.
+    pub fn append_poses(&mut self, poses: &[Pose]) -> Result<(), WriteError> {
+        let lines: Vec<u8> = poses.iter().flat_map(pose_line).collect();
+        self.poses.as_mut().map_or(Ok(()), |file| file.append(&lines))
     }
 
     fn append_parts(&mut self, batch: &[SimulatedFrame]) -> Result<(), WriteError> {
@@ -69,11 +81,18 @@ impl Recording {
         let claims: Vec<u8> = batch.iter().flat_map(claim_lines).collect();
         self.truth.append(&truth)?;
         self.claims.append(&claims)?;
+        let poses: Vec<u8> = batch.iter().flat_map(pose_lines).collect();
+        if let Some(file) = &mut self.poses {
+            file.append(&poses)?;
+        }
         for simulated in batch {
             self.frames.push(simulated.frame.pixels.view())?;
         }
         self.truth.length += truth.len() as u64;
         self.claims.length += claims.len() as u64;
+        if let Some(file) = &mut self.poses {
+            file.length += poses.len() as u64;
+        }
         Ok(())
     }
 }
@@ -84,6 +103,25 @@ fn truth_lines(simulated: &SimulatedFrame) -> Vec<u8> {
 
 fn claim_lines(simulated: &SimulatedFrame) -> Vec<u8> {
     simulated.claims.iter().flat_map(line).collect()
+}
+
+fn pose_lines(simulated: &SimulatedFrame) -> Vec<u8> {
+    simulated.poses.iter().flat_map(pose_line).collect()
+}
+
+/// As files of `[platform] poses` have it.
+fn pose_line(pose: &Pose) -> Vec<u8> {
+    let [x_m, y_m, z_m] = pose.position_m;
+    let q = pose.attitude.quaternion();
+    line(&serde_json::json!({
+        "time": pose.time,
+        "x_m": x_m,
+        "y_m": y_m,
+        "z_m": z_m,
+        "q": [q.w, q.i, q.j, q.k],
+        "attitude_sigma_rad": pose.cov[(0, 0)].sqrt(),
+        "position_sigma_m": pose.cov[(3, 3)].sqrt(),
+    }))
 }
 
 fn line(value: &impl serde::Serialize) -> Vec<u8> {

@@ -4,8 +4,7 @@ use std::time::{Duration, Instant};
 
 use jiff::Timestamp;
 
-use super::{Config, Error, FrameSource, Next};
-use crate::claim::Claim;
+use super::{Arrivals, Config, Error, FrameSource, Next};
 use crate::metric;
 use crate::optics::Camera;
 use crate::scene::{Fate, Plan, Scene};
@@ -22,8 +21,8 @@ pub struct Simulator {
     plan: Plan,
     began: Instant,
     next: u64,
-    /// Claims of frames that did not arrive.
-    waiting: Vec<Claim>,
+    /// Claims and poses of frames that did not arrive.
+    waiting: Arrivals,
     /// The frame after the last one that arrived or was reported missing.
     unreported: u64,
 }
@@ -48,7 +47,7 @@ impl Simulator {
             plan: plan.starting_at(config.start.unwrap_or_else(Timestamp::now)),
             began: Instant::now(),
             next: 0,
-            waiting: Vec::new(),
+            waiting: Arrivals::default(),
             unreported: 0,
         })
     }
@@ -69,7 +68,7 @@ impl Simulator {
             index,
             time: self.plan.time(index),
             reason: format!("no frame for {:.0} s", silent.as_secs_f64()),
-            arrivals: std::mem::take(&mut self.waiting).into(),
+            arrivals: std::mem::take(&mut self.waiting),
         }
     }
 }
@@ -86,21 +85,30 @@ impl FrameSource for Simulator {
         let latest = (self.began.elapsed().as_secs_f64() * self.plan.rate_hz()) as u64;
         let index = latest.max(self.next);
         let passed_over = self.next.max(index.saturating_sub(MOST_CAUGHT_UP))..index;
-        self.waiting.extend(passed_over.flat_map(|k| self.plan.claims(k)));
+        for k in passed_over {
+            self.waiting.append(Arrivals {
+                claims: self.plan.claims(k),
+                poses: self.plan.poses(k),
+            });
+        }
         self.next = index + 1;
         let made = self.plan.frame(index);
-        self.waiting.extend(made.claims);
+        self.waiting.append(Arrivals {
+            claims: made.claims,
+            poses: made.poses,
+        });
         if made.fate == Fate::Dropped {
             return self.lost(index);
         }
         self.unreported = self.next;
-        Next::Frame(made.frame, std::mem::take(&mut self.waiting).into())
+        Next::Frame(made.frame, std::mem::take(&mut self.waiting))
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::claim::Claim;
     use crate::scene::FrameLoss;
 
     fn simulator() -> Simulator {
@@ -152,7 +160,7 @@ mod tests {
             plan: Plan::compile(&scene, 3).unwrap(),
             began: Instant::now(),
             next: 0,
-            waiting: Vec::new(),
+            waiting: Arrivals::default(),
             unreported: 0,
         };
         let mut came = Vec::new();

@@ -42,6 +42,8 @@ pub enum Kind {
     Fixed,
     Mavlink,
     Replay,
+    /// With the frames: of the simulator, or of a recording that holds them.
+    Frames,
 }
 
 impl Kind {
@@ -50,6 +52,7 @@ impl Kind {
             Self::Fixed => "fixed",
             Self::Mavlink => "mavlink",
             Self::Replay => "replay",
+            Self::Frames => "frames",
         }
     }
 }

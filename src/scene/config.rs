@@ -9,6 +9,7 @@ use super::effect::Effect;
 use super::effects::{Effects, SpotEffect};
 use super::error::Error;
 use super::motion::{Motion, Schedule};
+use super::platform::PlatformConfig;
 use crate::toml_file::{Key, OutOfRange};
 use crate::{optics, toml_file};
 
@@ -28,6 +29,8 @@ pub struct Scene {
     pub user: Vec<UserConfig>,
     pub intruder: Vec<IntruderConfig>,
     pub claims: ClaimsConfig,
+    /// Level over (0, 0) when left out.
+    pub platform: Option<PlatformConfig>,
     pub effects: Effects,
 }
 
@@ -119,6 +122,7 @@ impl Default for Scene {
             user: Vec::new(),
             intruder: Vec::new(),
             claims: ClaimsConfig::default(),
+            platform: None,
             effects: Effects::default(),
         }
     }
@@ -161,6 +165,10 @@ impl Scene {
         if let (Some(SpotEffect::Template { file, .. }), Some(folder)) = (&mut scene.effects.spot, path.parent()) {
             *file = folder.join(&*file);
         }
+        let log = scene.platform.as_mut().and_then(|platform| platform.log.as_mut());
+        if let (Some(log), Some(folder)) = (log, path.parent()) {
+            log.file = folder.join(&log.file);
+        }
         match scene.validate() {
             Ok(()) => Ok(scene),
             Err(e) => Err(Error::Scene {
@@ -202,6 +210,9 @@ impl Scene {
         }
         for (k, intruder) in self.intruder.iter().enumerate() {
             self.validate_intruder(intruder, &root.item("intruder", k))?;
+        }
+        if let Some(platform) = &self.platform {
+            platform.validate(&root.at("platform"))?;
         }
         let effects = root.at("effects");
         if let (Some(spot), Some(_)) = (&self.effects.spot, &self.effects.aberrations) {

@@ -46,6 +46,10 @@ macro_rules! declare_effect {
             ClaimDelay = 3,
             ClaimLoss = 4,
             ClaimNoise = 5,
+            /// Motion of the platform.
+            Platform = 6,
+            /// What the autopilot says of it.
+            Telemetry = 7,
             $($effect = $number,)*
         }
 
@@ -63,6 +67,8 @@ macro_rules! declare_effect {
                     Self::ClaimDelay => "claims.delay",
                     Self::ClaimLoss => "claims.lost",
                     Self::ClaimNoise => "claims.noise",
+                    Self::Platform => "platform",
+                    Self::Telemetry => "platform.telemetry",
                 }
             }
         }

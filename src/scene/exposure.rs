@@ -4,6 +4,7 @@ use super::config::Scene;
 use super::effect::Effect;
 use super::effects::{Shaker, Wander};
 use super::error::Error;
+use super::platform::Flight;
 use super::population::Population;
 use super::report::{Decisions, Status};
 use super::stream::{Ledger, Streams};
@@ -26,6 +27,7 @@ impl Exposure {
     pub fn new(
         scene: &Scene,
         population: &Population,
+        flight: Option<&Flight>,
         streams: Streams,
         decisions: &mut Decisions,
         moved: impl Fn(f64) -> f64,
@@ -64,7 +66,13 @@ impl Exposure {
             steps = steps.max(needed(time_s / w.time_s, field.at("wander").at("time_s"), w.time_s)?);
         }
         let scale = scene.optics.plane_distance_m / scene.optics.altitude_m;
-        let path = population.top_speed() * time_s * scale;
+        let mut path = population.top_speed() * time_s * scale;
+        if let Some(flight) = flight {
+            let [speed, turn_rate] = flight.top_rates();
+            let [width, height] = scene.optics.sensor_size_m;
+            let corner = 0.5 * width.hypot(height);
+            path += (speed * scale + turn_rate * z * (1.0 + (corner / z).powi(2))) * time_s;
+        }
         let blur = decisions.weigh(Effect::MotionBlur, &effects.motion_blur, |_| moved(0.5 * path));
         if blur.is_some() {
             steps = steps.max(16);
@@ -93,6 +101,11 @@ impl Exposure {
 
     /// Middle of sub-frame `s` of an exposure centred on `t`, s.
     pub fn middle(&self, t: f64, s: usize) -> f64 {
-        t + self.time_s * ((s as f64 + 0.5) / self.steps as f64 - 0.5)
+        self.part(t, s, self.steps)
+    }
+
+    /// Middle of part `s` of `parts` of an exposure centred on `t`, s.
+    pub fn part(&self, t: f64, s: usize, parts: usize) -> f64 {
+        t + self.time_s * ((s as f64 + 0.5) / parts as f64 - 0.5)
     }
 }

@@ -8,6 +8,7 @@ use super::effects::{Pose, Rays, SpotImages, attitude};
 use super::error::Error;
 use super::exposure::Exposure;
 use super::moment::Moment;
+use super::platform::{Flight, Sight};
 use super::population::{Beam, Population};
 use super::render::Spot;
 use super::report::{Decisions, Status};
@@ -24,6 +25,7 @@ pub(super) struct Light {
     straight_j_per_w: f64,
     attenuation: Option<Attenuation>,
     average: Average,
+    flight: Option<Flight>,
     pose: Option<Pose>,
     vignetting: Option<Vignetting>,
     rays: Option<Rays>,
@@ -35,11 +37,19 @@ pub(super) struct Light {
 /// Values that all beams of a frame share, and buffers.
 #[derive(Debug, Default)]
 pub(super) struct Shot {
+    /// From where the camera looks in each sub-frame, or in all; none from a platform that stands.
+    sights: Vec<Sight>,
     rotation: attitude::Rotation,
     /// Common shift of the angles in each sub-frame, rad.
     shaken: Vec<[f64; 2]>,
     wandered: Vec<[f64; 2]>,
     factors: Vec<f64>,
+}
+
+impl Shot {
+    fn middle(&self) -> Option<&Sight> {
+        self.sights.get(self.sights.len() / 2)
+    }
 }
 
 /// The steepest slope of a unit Gaussian, exp(−1/2).
@@ -94,7 +104,32 @@ impl Light {
             );
         }
 
-        let exposure = Exposure::new(scene, population, streams, decisions, moved, z)?;
+        let flight = match &scene.platform {
+            Some(platform) => Some(Flight::new(
+                platform,
+                camera.altitude_m,
+                &Key::new("platform"),
+                streams,
+                &ledger,
+            )?),
+            None => None,
+        };
+        let exposure = Exposure::new(scene, population, flight.as_ref(), streams, decisions, moved, z)?;
+        match &flight {
+            Some(_) if exposure.motion_blur => {
+                decisions.note(
+                    Effect::Platform,
+                    Status::On,
+                    "one rotation a sub-frame, common to all spots",
+                );
+            }
+            Some(_) => decisions.note(
+                Effect::Platform,
+                Status::On,
+                "one rotation a frame, common to all spots",
+            ),
+            None => decisions.note(Effect::Platform, Status::Off, "not in the scene"),
+        }
         let average = Average::new(scene, camera, exposure.steps, peak, decisions)?;
 
         let tilted = |angle: f64| moved(z * angle * (1.0 + (corner / z).powi(2)));
@@ -166,6 +201,7 @@ impl Light {
             straight_j_per_w: straight_j_per_w(scene, camera),
             attenuation,
             average,
+            flight,
             pose,
             vignetting,
             exposure,
@@ -185,8 +221,35 @@ impl Light {
         std::array::from_fn(|k| (sensor[k] - axis[k]) / corner)
     }
 
+    /// The platform's true motion, where it moves.
+    pub fn flight(&self) -> Option<&Flight> {
+        self.flight.as_ref()
+    }
+
+    /// Whether a ground position is imaged onto the array in the frame that `shot` was opened for.
+    pub fn sees(&self, ground: [f64; 2], shot: &Shot) -> bool {
+        let Some(sight) = shot.middle() else {
+            return self.lens.sees(ground);
+        };
+        let [x, y] = self
+            .lens
+            .distortion
+            .project(self.lens.plane_distance_m, sight.tangents(ground));
+        sight.range_m(ground)[1] > 0.0 && x.abs() <= self.lens.x.half_width() && y.abs() <= self.lens.y.half_width()
+    }
+
     /// Computes the values that all beams of a frame share.
     pub fn open(&self, at: Moment<'_>, shot: &mut Shot) {
+        if let Some(flight) = &self.flight {
+            let steps = if self.exposure.motion_blur {
+                self.exposure.steps
+            } else {
+                1
+            };
+            shot.sights.clear();
+            shot.sights
+                .extend((0..steps).map(|s| flight.sight(self.exposure.part(at.t, s, steps))));
+        }
         if let Some(pose) = &self.pose {
             shot.rotation = pose.at(at.k, at.t, at.streams, at.ledger);
         }
@@ -206,8 +269,17 @@ impl Light {
         shot: &mut Shot,
         out: &mut Vec<Spot>,
     ) -> f64 {
-        let length_m = geometry::link_length(self.lens.altitude_m, beam.ground);
-        let mut energy = self.straight_j_per_w * beam.power_w * self.lens.altitude_m / length_m;
+        let [length_m, axial_m] = match shot.middle() {
+            Some(sight) => sight.range_m(beam.ground),
+            None => [
+                geometry::link_length(self.lens.altitude_m, beam.ground),
+                self.lens.altitude_m,
+            ],
+        };
+        if axial_m <= 0.0 {
+            return 0.0;
+        }
+        let mut energy = self.straight_j_per_w * beam.power_w * axial_m / length_m;
         if let Some(attenuation) = &self.attenuation {
             energy *= attenuation.transmittance(length_m);
         }
@@ -225,7 +297,10 @@ impl Light {
                 Some(actor) if self.exposure.motion_blur => population.position(actor, self.exposure.middle(at.t, s)),
                 _ => beam.ground,
             };
-            let mut tangents = self.lens.tangents(ground);
+            let mut tangents = match shot.sights.get(s).or(shot.sights.first()) {
+                Some(sight) => sight.tangents(ground),
+                None => self.lens.tangents(ground),
+            };
             if self.pose.is_some() {
                 tangents = shot.rotation.apply(tangents);
             }

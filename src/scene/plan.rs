@@ -14,6 +14,7 @@ use super::error::Error;
 use super::light::{Light, Shot};
 use super::moment::Moment;
 use super::network::{Network, Statement};
+use super::platform::Telemetry;
 use super::population::{Beam, Population};
 use super::render::{Renderer, Spot};
 use super::report;
@@ -23,6 +24,7 @@ use super::truth::{EmitterTruth, Role, SimulatedFrame, Truth};
 use crate::claim::Claim;
 use crate::frame::Frame;
 use crate::optics::{Calibration, Camera};
+use crate::pose::Pose;
 
 /// A scene compiled with a seed into the cheapest chain that makes its frames.
 #[derive(Debug)]
@@ -34,6 +36,7 @@ pub struct Plan {
     population: Population,
     network: Network,
     light: Light,
+    telemetry: Option<Telemetry>,
     detector: Detector,
     frame_loss: Option<FrameLoss>,
     decisions: Vec<Decision>,
@@ -50,6 +53,8 @@ pub struct Maker<'p> {
     renderer: Renderer,
 }
 
+/// Poses begin this long before the first frame, s.
+const LEAD_S: f64 = 0.5;
 /// Most earlier frames that are searched for the delivered one that a repeated frame shows.
 const LOOK_BACK: u64 = 1000;
 
@@ -69,6 +74,14 @@ impl Plan {
         let blur = format!("σ_eff = {:.4} mm, computed once", camera.spot_sigma_m * 1e3);
         decisions.note(Effect::Blur, Status::Folded, blur);
         let light = Light::new(scene, &camera, &population, streams, &mut decisions)?;
+        let telemetry = scene.platform.as_ref().map(|p| Telemetry::new(p.telemetry.clone()));
+        match &telemetry {
+            Some(telemetry) => {
+                let reason = format!("{} poses a second, noise drawn for each", telemetry.rate_hz());
+                decisions.note(Effect::Telemetry, Status::On, reason);
+            }
+            None => decisions.note(Effect::Telemetry, Status::Off, "not in the scene"),
+        }
         let detector = Detector::new(scene, &light, streams, &mut decisions)?;
         let frame_loss = decisions
             .weigh(Effect::FrameLoss, &scene.effects.frame_loss, |_| f64::INFINITY)
@@ -85,6 +98,7 @@ impl Plan {
             population,
             network,
             light,
+            telemetry,
             detector,
             frame_loss,
             decisions,
@@ -182,6 +196,26 @@ impl Plan {
         arrivals.into_iter().map(claim).collect()
     }
 
+    /// The poses that came after frame k − 1 and not after frame k; with frame 0 those of the half second before.
+    pub fn poses(&self, k: u64) -> Vec<Pose> {
+        let after = if k == 0 { -LEAD_S } else { self.seconds(k - 1) };
+        self.poses_between(after, self.seconds(k), &Ledger::default())
+    }
+
+    /// The poses of the half second after frame k.
+    pub fn poses_after(&self, k: u64) -> Vec<Pose> {
+        let last = self.seconds(k);
+        self.poses_between(last, last + LEAD_S, &Ledger::default())
+    }
+
+    fn poses_between(&self, after: f64, until: f64, ledger: &Ledger) -> Vec<Pose> {
+        let (Some(telemetry), Some(flight)) = (&self.telemetry, self.light.flight()) else {
+            return Vec::new();
+        };
+        let date = |t| self.date(t);
+        telemetry.poses(flight, [after, until], date, self.streams, ledger)
+    }
+
     /// The fate of frame `k`, and the frame whose pixels arrive in its place.
     fn fate(&self, k: u64, ledger: &Ledger) -> (Fate, u64) {
         let Some(loss) = &self.frame_loss else {
@@ -241,6 +275,7 @@ impl Maker<'_> {
                 emitters,
             },
             claims: plan.claims_counting(k, &self.ledger),
+            poses: plan.poses(k),
             fate,
         }
     }
@@ -294,7 +329,7 @@ impl Maker<'_> {
                 energy_j,
                 user: actor.map(|a| a.name.clone()),
                 role: actor.map_or(Role::Random, |a| a.role),
-                in_view: plan.light.lens.sees(beam.ground),
+                in_view: plan.light.sees(beam.ground, &self.shot),
             });
         }
         emitters

@@ -6,6 +6,7 @@ use serde::{Deserialize, Serialize};
 use super::Fate;
 use crate::claim::Claim;
 use crate::frame::Frame;
+use crate::pose::Pose;
 
 /// A simulated frame with its truth and claims.
 #[derive(Clone, Debug)]
@@ -14,6 +15,8 @@ pub struct SimulatedFrame {
     pub truth: Truth,
     /// The claims that reached the network's log since the frame before, in the order of their arrival.
     pub claims: Vec<Claim>,
+    /// What the autopilot said since the frame before, in the order of its times.
+    pub poses: Vec<Pose>,
     /// Whether the frame arrived; a live source passes on only the claims of a lost one.
     pub fate: Fate,
 }

@@ -139,6 +139,7 @@ fn ask_scene(questions: &Questions, path: &Path) -> Result<Vec<Answer>, Error> {
     let plan = scene::Plan::compile(&scene, questions.seed)?;
     let mut config = Config::default();
     config.source.scene = Some(path.to_owned());
+    config.adopt_platform(&scene);
     let mut pipeline = pipeline::Pipeline::new(&config, plan.camera())?;
     let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
     let mut maker = plan.maker();
@@ -146,6 +147,7 @@ fn ask_scene(questions: &Questions, path: &Path) -> Result<Vec<Answer>, Error> {
     for k in 0..questions.scene_frames {
         let made = maker.frame(k);
         pipeline.claim(made.claims, made.frame.time);
+        pipeline.receive_poses(made.poses, made.frame.time);
         if made.fate == Fate::Dropped {
             continue;
         }

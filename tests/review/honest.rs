@@ -88,6 +88,7 @@ fn the_scenes_without_an_attacker_raise_nothing() {
         ("bad-network", 60.0),
         ("narrow-beam", 40.0),
         ("windy", 60.0),
+        ("flight", 60.0),
     ] {
         let mut story = scene_file(1, &format!("config/scenes/{name}.toml"));
         story.seconds = seconds;

@@ -19,7 +19,7 @@ fn named(name: &str) -> Plan {
 
 #[test]
 fn every_scene_in_the_box_makes_usable_frames_with_truth() {
-    assert!(files().len() >= 12);
+    assert!(files().len() >= 15);
     for file in files() {
         let scene = Scene::load(&file).unwrap_or_else(|e| panic!("{e}"));
         assert!(!scene.about.is_empty(), "{}", file.display());
@@ -134,6 +134,8 @@ fn the_nastiest_scene_calls_for_every_effect_but_the_lens_s() {
         .filter(|d| d.status == Status::Off && d.effect != Effect::Population)
         // Eighty sub-frames of some hundred rays a spot would take a quarter of a second a frame; a lens's own spots are the lens scenes'.
         .filter(|d| !matches!(d.effect, Effect::Aberrations | Effect::Spot))
+        // Of scene flight.
+        .filter(|d| !matches!(d.effect, Effect::Platform | Effect::Telemetry))
         .map(|d| d.effect)
         .collect();
     assert_eq!(missing, []);
@@ -188,6 +190,14 @@ fn a_bad_scene_is_refused_with_its_field_named() {
         (
             "[effects]\nquantisation = { bits = 12 }",
             "effects.quantisation.joules_per_count: expected a value here or in optics.joules_per_count, found \"neither\"",
+        ),
+        (
+            "[platform]\nyaw_rate_deg_s = 1.0\nlog = { file = \"flight.ulg\" }",
+            "platform.log: expected no law of motion beside a flight log, found \"yaw_rate_deg_s\"",
+        ),
+        (
+            "[platform.telemetry]\nrate_hz = 0.1",
+            "platform.telemetry.rate_hz: expected 1 to 1000 (poses per second: from one a second to faster than any autopilot), found 0.1",
         ),
         (
             "[random_emitters]\ncount = [9, 5]\narea_m = [250, 250]",

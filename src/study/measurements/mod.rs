@@ -3,6 +3,7 @@
 
 mod alone;
 mod calibration;
+mod flights;
 mod formats;
 mod lens;
 mod measured;
@@ -38,6 +39,7 @@ pub const ALL: &[Measurement] = &[
     measurement("stranger-near", 300, pixels::strangers_near),
     measurement("stranger-in-crowd", 200, pixels::strangers_in_crowd),
     measurement("shadow", 10, pixels::shadows),
+    measurement("flights", 10, flights::flights),
     measurement("calibration", 5, calibration::error_left),
     measurement("lens", 40, lens::lenses),
     measurement("zones", 40, zones::known_lights_and_zones),

@@ -123,6 +123,7 @@ pub fn review(story: &PixelStory) -> Reviewed {
     let plan = plan.starting_at(start());
     let mut config = story.config.clone();
     config.source.rate_hz = Some(RATE_HZ);
+    config.adopt_platform(&story.scene);
     let mut pipeline = Pipeline::new(&config, plan.camera()).expect("a config that describes a pipeline");
     let mut told = Reviewed {
         events: Vec::new(),
@@ -134,10 +135,12 @@ pub fn review(story: &PixelStory) -> Reviewed {
         let mut made = maker.frame(k);
         if made.fate == Fate::Dropped {
             pipeline.claim(made.claims, made.frame.time);
+            pipeline.receive_poses(made.poses, made.frame.time);
             continue;
         }
         (story.tamper)(k as f64 / RATE_HZ, &mut made);
         pipeline.claim(made.claims, made.frame.time);
+        pipeline.receive_poses(made.poses, made.frame.time);
         let step = pipeline.step(&made.frame);
         told.events.extend(step.report.events.iter().cloned());
         told.reports.push(step.report);
