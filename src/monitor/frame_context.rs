@@ -22,6 +22,7 @@ use super::stats::error_budget::{ErrorBudget, TestFamily};
 use super::stats::gaussian::largest_eigenvalue;
 use super::track::association::Association;
 use super::track::beam_track::Track;
+use super::track::common_course::{CommonCourse, Pull};
 use super::track::detection::{Detection, OVERLAP, spot_m};
 use super::track::registration::register;
 use super::track::tracker::Tracker;
@@ -39,9 +40,6 @@ const SYSTEMATIC_M: f64 = 0.05;
 /// alert of a displaced user, smaller takes such a rest for a displacement. Not measured.
 const UNMODELLED: f64 = 0.05;
 
-/// Time within which tracks follow the poses, s. Longer lets all tracks drift off together, shorter lets them follow a pose that is
-/// late to and fro. Not measured.
-const PULL_S: f64 = 5.0;
 /// Age of a pose up to which it says where tracks are, s.
 const FRESH_S: f64 = 0.3;
 
@@ -85,7 +83,7 @@ pub(super) struct FrameContext {
     pub bias: PoseBias,
     /// How that and the rest of the displacement change.
     pub wander: PoseWander,
-    /// The error of this frame's pose that its beams share.
+    /// The error of this frame's pose that its beams share, but for a steady course.
     pub pose_error: Option<Vector6<f64>>,
     /// Whether it is known where the camera is.
     pub is_placed: bool,
@@ -95,6 +93,8 @@ pub(super) struct FrameContext {
     pub pose_lost_s: Option<f64>,
     /// Covariance of the pose error that all tracks share.
     track_frame_cov: Option<Matrix6<f64>>,
+    /// How fast tracks follow the poses.
+    course: CommonCourse,
     pub users: UserTracks,
     pub alerts: AlertLifecycle,
     pub light: LightHistory,
@@ -138,6 +138,7 @@ impl FrameContext {
             pose_age_s: 0.0,
             pose_lost_s: None,
             track_frame_cov: None,
+            course: CommonCourse::default(),
             users: UserTracks::default(),
             alerts: AlertLifecycle::new(source.kind, source.file, config.cool_down_s),
             light: LightHistory::default(),
@@ -173,6 +174,7 @@ impl FrameContext {
         self.bias = PoseBias::default();
         self.wander = PoseWander::default();
         self.track_frame_cov = None;
+        self.course.restart();
         self.users = UserTracks::default();
         self.lights.forget_tracks();
         self.light = LightHistory::default();
@@ -202,14 +204,22 @@ impl FrameContext {
         let Some(sight) = &self.view.sight else {
             return;
         };
-        let leak = if self.pose_age_s < FRESH_S {
-            (dt / PULL_S).min(1.0)
-        } else {
-            0.0
+        if self.tracker.tracks.iter().all(|t| !t.confirmed) {
+            self.course.restart();
+        }
+        let pull = match self.pose_age_s < FRESH_S {
+            true => self.course.pull(dt),
+            false => Pull::default(),
         };
-        let Some(found) = register(&self.tracker.tracks, detections, sight.cov(), leak) else {
+        let Some(found) = register(&self.tracker.tracks, detections, sight.cov(), pull.position) else {
             return;
         };
+        for track in &mut self.tracker.tracks {
+            if let Some(point) = sight.ground_at(track.filter.position().into()) {
+                let off = point.by_pose * found.error;
+                track.filter.shift(off * pull.position, off * pull.velocity);
+            }
+        }
         let drifted = self.track_frame_cov.map(|cov| cov + found.cov);
         let of = |cov: &Matrix6<f64>| {
             let seen = sight.corrected(&Vector6::zeros(), *cov);
@@ -221,8 +231,8 @@ impl FrameContext {
             _ => *sight.cov(),
         };
         self.track_frame_cov = Some(cov);
-        self.pose_error = Some(found.error);
-        self.view.sight = Some(sight.corrected(&(-found.error * (1.0 - leak)), cov));
+        self.pose_error = Some(self.course.take(&found.error, pull, dt));
+        self.view.sight = Some(sight.corrected(&(-found.error * (1.0 - pull.position)), cov));
     }
 
     /// Takes the time of a frame.

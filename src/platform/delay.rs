@@ -1,16 +1,19 @@
 //! The time by which pose stamps are behind the frames', learned from the light: where poses are late by τ, what all beams share
 //! against their tracks goes with the platform's rates, −ω·τ.
 
-use nalgebra::Vector6;
+use nalgebra::{Matrix2, Matrix4, Vector4, Vector6};
 
 /// Standard deviation of the delay before anything is learned, s: telemetry over a serial port is 10 to 30 ms late. Larger widens
 /// positions while the platform turns, smaller alerts users then.
 const UNKNOWN_S: f64 = 0.03;
 /// Largest delay that is learned, s: beyond it poses are lost rather than late.
 const MAX_S: f64 = 0.25;
-/// Time over which a steady turn, and a steady error, are taken for what they are, s: they do not show a delay. Longer takes a slow
-/// turn for a sway.
-const STEADY_S: f64 = 5.0;
+/// Length of a block, s, in which what is not the delay's is taken for a straight line of time: lasting errors, and tracks that began
+/// with the sway's velocity and settle over half a minute. Longer blocks tell a slow sway better from such a line, shorter ones
+/// follow its bends.
+const BLOCK_S: f64 = 10.0;
+/// Least part of a block that says anything, s: half a sway looks like a line.
+const LEAST_BLOCK_S: f64 = 5.0;
 /// Time over which frames count, s: clocks drift by milliseconds within minutes.
 const MEMORY_S: f64 = 60.0;
 /// Least standard deviation of a frame's turn error, rad, and of what is learned, s: a tenth of a pixel, and half of the 0.5 ms that
@@ -18,52 +21,97 @@ const MEMORY_S: f64 = 60.0;
 const LEAST_RAD: f64 = 1e-4;
 const LEAST_S: f64 = 2.5e-4;
 
-/// A slowly learned delay.
+/// A slowly learned delay: τ by least squares over blocks of time, in each of which the error is −ω·τ and a straight line.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct DelayEstimate {
-    delay_s: f64,
-    /// Of the frames so far, 1/s².
+    /// Of the blocks so far and of the one that is under way.
+    closed: Said,
+    open: Said,
+    block: Block,
+}
+
+/// What is known of the delay: its information, 1/s², and that times the delay.
+#[derive(Clone, Copy, Debug, Default)]
+struct Said {
     information: f64,
-    mean_rates: Vector6<f64>,
-    mean_error: Vector6<f64>,
-    /// Mean square of a frame's turn error about its mean, rad², and the time over which it was taken, s.
-    scatter: f64,
+    vector: f64,
+}
+
+/// Second moments of (1, time, rate, rate × delay) of both tilts.
+#[derive(Clone, Copy, Debug, Default)]
+struct Block {
     seen_s: f64,
+    frames: u32,
+    moments: [Matrix4<f64>; 2],
+}
+
+impl Block {
+    /// The delay of this block alone, its lines eliminated (Schur complement).
+    fn said(&self) -> Option<Said> {
+        let mut left = Matrix2::zeros();
+        for moments in &self.moments {
+            let line: Matrix2<f64> = moments.fixed_view::<2, 2>(0, 0).into();
+            let cross: Matrix2<f64> = moments.fixed_view::<2, 2>(0, 2).into();
+            let own: Matrix2<f64> = moments.fixed_view::<2, 2>(2, 2).into();
+            left += own - cross.transpose() * line.try_inverse()? * cross;
+        }
+        let (rates, product, squares) = (left[(0, 0)], left[(0, 1)], left[(1, 1)]);
+        // Two lines and the delay are fitted.
+        let freedom = (2 * self.frames).checked_sub(5).filter(|f| *f > 0)?;
+        if !(self.seen_s >= LEAST_BLOCK_S && rates > 0.0) {
+            return None;
+        }
+        let variance = ((squares - product * product / rates) / f64::from(freedom)).max(LEAST_RAD * LEAST_RAD);
+        Some(Said {
+            information: rates / variance,
+            vector: product / variance,
+        })
+    }
 }
 
 impl DelayEstimate {
     /// Pose stamps minus frame stamps, s.
     pub fn delay_s(&self) -> f64 {
-        self.delay_s
+        let vector = self.closed.vector + self.open.vector;
+        (vector / self.information()).clamp(-MAX_S, MAX_S)
     }
 
     /// Standard deviation of it, s.
     pub fn std_s(&self) -> f64 {
-        (UNKNOWN_S.powi(-2) + self.information).sqrt().recip().max(LEAST_S)
+        self.information().sqrt().recip().max(LEAST_S)
     }
 
-    /// Takes the pose error that a frame's beams share (as a registration gives it), the platform's rates then, and the time since
-    /// the last frame.
-    pub fn learn(&mut self, error: &Vector6<f64>, rates: &Vector6<f64>, dt_s: f64) {
+    fn information(&self) -> f64 {
+        UNKNOWN_S.powi(-2) + self.closed.information + self.open.information
+    }
+
+    /// Takes the pose error that a frame's beams share (as a registration gives it) where poses were taken `delay_s` late, the
+    /// platform's rates then, and the time since the last frame.
+    pub fn learn(&mut self, error: &Vector6<f64>, delay_s: f64, rates: &Vector6<f64>, dt_s: f64) {
         if !(dt_s > 0.0 && dt_s < 1.0) {
+            self.close();
             return;
         }
-        self.seen_s += dt_s;
-        let blend = (dt_s / self.seen_s.min(STEADY_S)).min(1.0);
-        self.mean_rates += (rates - self.mean_rates) * blend;
-        self.mean_error += (error - self.mean_error) * blend;
-        let (rate, off) = (rates - self.mean_rates, error - self.mean_error);
+        self.block.seen_s += dt_s;
+        self.block.frames += 1;
         // The tilt alone: beams show it best, and a heading's error is not seen near the nadir.
-        let (rate, off) = (rate.fixed_rows::<2>(0), off.fixed_rows::<2>(0));
-        self.scatter += (0.5 * off.norm_squared() - self.scatter) * blend;
-        self.information *= (-dt_s / MEMORY_S).exp();
-        if self.seen_s < STEADY_S {
-            return;
+        for axis in 0..2 {
+            let row = Vector4::new(1.0, self.block.seen_s, rates[axis], rates[axis] * delay_s - error[axis]);
+            self.block.moments[axis] += row * row.transpose();
         }
-        let variance = self.scatter.max(LEAST_RAD * LEAST_RAD);
-        self.information += rate.norm_squared() / variance;
-        let gain = 1.0 / (UNKNOWN_S.powi(-2) + self.information) / variance;
-        self.delay_s = (self.delay_s - gain * rate.dot(&off)).clamp(-MAX_S, MAX_S);
+        self.open = self.block.said().unwrap_or_default();
+        if self.block.seen_s >= BLOCK_S {
+            self.close();
+        }
+    }
+
+    /// Ends a block.
+    fn close(&mut self) {
+        let keep = (-self.block.seen_s / MEMORY_S).exp();
+        self.closed.information = self.closed.information * keep + self.open.information;
+        self.closed.vector = self.closed.vector * keep + self.open.vector;
+        self.open = Said::default();
+        self.block = Block::default();
     }
 }
 
@@ -81,7 +129,7 @@ mod tests {
             // Poses are 30 ms late; a tilt of 3 mrad lasts.
             let mut error = rates * (estimate.delay_s() - 0.03);
             error[0] += 0.003 + 1e-4 * (37.0 * t).sin();
-            estimate.learn(&error, &rates, 0.1);
+            estimate.learn(&error, estimate.delay_s(), &rates, 0.1);
         }
         assert!((estimate.delay_s() - 0.03).abs() < 1e-3, "{estimate:?}");
         assert!(estimate.std_s() < 2e-3, "{}", estimate.std_s());

@@ -73,7 +73,14 @@ pub struct Platform {
     /// The newest frame that has been learned from.
     learned_at: Option<Timestamp>,
     /// Pose errors by the time of their pose, until the poses after them are there.
-    unlearned: VecDeque<(Timestamp, Vector6<f64>)>,
+    unlearned: VecDeque<Unlearned>,
+}
+/// The pose error of a frame, by the time of its pose, which was taken `delay_s` late.
+#[derive(Clone, Copy)]
+struct Unlearned {
+    time: Timestamp,
+    error: Vector6<f64>,
+    delay_s: f64,
 }
 
 #[allow(clippy::large_enum_variant, reason = "a platform has one")]
@@ -219,11 +226,15 @@ impl Platform {
         if self.unlearned.len() == MOST_WAITING {
             self.unlearned.pop_front();
         }
-        self.unlearned.push_back((pose.pose.time, *error));
+        self.unlearned.push_back(Unlearned {
+            time: pose.pose.time,
+            error: *error,
+            delay_s: self.delay_s(),
+        });
         let Some(newest) = self.source.read(|poses| poses.newest().map(|pose| pose.time)).flatten() else {
             return;
         };
-        while let Some((time, error)) = self.unlearned.front().copied()
+        while let Some(Unlearned { time, error, delay_s }) = self.unlearned.front().copied()
             && seconds(time, newest) >= RATES_OVER_S
         {
             self.unlearned.pop_front();
@@ -231,7 +242,7 @@ impl Platform {
             if let Some(rates) = rates.flatten() {
                 let dt_s = self.learned_at.map_or(0.0, |t| seconds(t, time));
                 self.learned_at = Some(time);
-                self.learned.learn(&error, &rates, dt_s);
+                self.learned.learn(&error, delay_s, &rates, dt_s);
             }
         }
     }

@@ -100,6 +100,14 @@ impl KalmanFilter {
         }
     }
 
+    /// Moves the state, m and m/s: the axes have moved, not the beam.
+    pub fn shift(&mut self, by: Vector2<f64>, velocity: Vector2<f64>) {
+        for k in 0..2 {
+            self.state[k] += by[k];
+            self.state[k + 2] += velocity[k];
+        }
+    }
+
     pub fn position(&self) -> Vector2<f64> {
         self.state.fixed_rows::<2>(0).into()
     }

@@ -2,6 +2,7 @@
 
 pub(super) mod association;
 pub(super) mod beam_track;
+pub(super) mod common_course;
 pub(super) mod detection;
 pub(super) mod eligibility;
 pub(super) mod kalman;

@@ -43,14 +43,14 @@ struct Pair {
     weight: f64,
 }
 
-/// Takes the pose error that `detections` share out of them, but for a `leak` (0 to 1): that share of it pulls the tracks to
-/// where the pose puts them, or a velocity that all tracks share by chance would carry them off. `tracks` are predicted to their
-/// time, and `prior` is the covariance of the pose. `None` where the prior is no covariance.
+/// Takes the pose error that `detections` share out of them, but for a share of it that is `left` (0 to 1), by which the tracks
+/// themselves are moved. `tracks` are predicted to their time, and `prior` is the covariance of the pose. `None` where the prior is
+/// no covariance.
 pub fn register(
     tracks: &[Track],
     detections: &mut [Detection],
     prior: &Matrix6<f64>,
-    leak: f64,
+    left: f64,
 ) -> Option<Registration> {
     let least = [LEAST_RAD, LEAST_RAD, LEAST_RAD, LEAST_M, LEAST_M, LEAST_M].map(|s| s * s);
     let prior = prior + Matrix6::from_diagonal(&least.into());
@@ -83,7 +83,7 @@ pub fn register(
     }
     for (detection, own) in detections.iter_mut().zip(&corrections) {
         let found = own.as_ref().unwrap_or(&all);
-        detection.position -= detection.by_pose * found.error * (1.0 - leak);
+        detection.position -= detection.by_pose * found.error * (1.0 - left);
         detection.cov += detection.by_pose * found.cov * detection.by_pose.transpose();
     }
     Some(all)
