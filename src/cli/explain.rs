@@ -94,7 +94,7 @@ fn table(scene: &Scene, plan: &Plan, costs: &Costs) -> String {
         camera.y.n,
         plan.rate_hz()
     );
-    let _ = writeln!(text, "{:<16} {:<16} {:>12}  why", "effect", "", "µs a frame");
+    let _ = writeln!(text, "{:<18} {:<16} {:>12}  why", "effect", "", "µs a frame");
     for decision in plan.decisions() {
         let cost = costs.each.iter().find(|c| c.0 == decision.effect).map(|c| c.1);
         let cost = match (decision.status, cost) {
@@ -106,7 +106,7 @@ fn table(scene: &Scene, plan: &Plan, costs: &Costs) -> String {
             (Status::Off | Status::BelowTolerance, _) => "0".to_owned(),
         };
         let (name, status) = (decision.effect.name(), decision.status.name());
-        let _ = writeln!(text, "{name:<16} {status:<16} {cost:>12}  {}", decision.reason);
+        let _ = writeln!(text, "{name:<18} {status:<16} {cost:>12}  {}", decision.reason);
     }
     let _ = writeln!(
         text,

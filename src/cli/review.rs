@@ -38,6 +38,9 @@ pub fn run(args: Args) -> Outcome {
     config.source.speed = 0.0;
     config.source.r#loop = false;
     let mut pipeline = Pipeline::new(&config, &camera).map_err(Failure::config)?;
+    for warning in pipeline.warnings() {
+        eprintln!("oapwatch: {}: warning: {warning}", args.config.display());
+    }
     let mut source = frames::open(&config.source, &camera).map_err(|e| match e.is_config() {
         true => Failure::config(e),
         false => Failure::input(e),

@@ -1,5 +1,5 @@
 //! What the light of a beam says of its source: whether it scintillates as a beam through the air does, flickers as a lamp on the mains
-//! does, or fades with another beam as a reflection of that does. Evidence in alerts; it decides nothing.
+//! does, fades with another beam as a reflection of that does, or stays on the sensor while the camera moves, as a glint does. Evidence in alerts; it decides nothing.
 
 use std::collections::{BTreeMap, VecDeque};
 
@@ -7,6 +7,7 @@ use nalgebra::Vector2;
 use serde_json::{Value, json};
 
 use crate::estimate::Flags;
+use crate::geo::View;
 use crate::monitor::track::beam_track::Track;
 use crate::monitor::track::tracker::Tracker;
 
@@ -28,6 +29,9 @@ const NAMED: f64 = 15.0;
 /// Scatter of a reflection's offset from its beam, m, at most. Larger names neighbours, smaller misses ghosts of beams that move.
 const OFFSET_STD_M: f64 = 0.5;
 
+/// Scatter of what rests, m, per axis: a walker's step, and what a pose error leaves. Larger needs a camera that moves more.
+const RESTS_STD_M: f64 = 0.5;
+
 /// A track's light in one frame.
 #[derive(Clone, Copy, Debug)]
 struct Shown {
@@ -36,6 +40,8 @@ struct Shown {
     /// Of ln energy, by the detector's noise.
     noise: f64,
     position: Vector2<f64>,
+    /// Where a level camera would have it, m, where the camera moves: the place on the sensor.
+    on_sensor: Option<Vector2<f64>>,
 }
 
 /// The newest frames of every track.
@@ -57,7 +63,7 @@ pub struct Ghost {
 
 impl LightHistory {
     /// Takes a frame.
-    pub fn update(&mut self, tracker: &Tracker) {
+    pub fn update(&mut self, tracker: &Tracker, view: &View) {
         self.frame += 1;
         self.tracks.retain(|id, _| tracker.get(*id).is_some());
         let incomplete = Flags::SATURATED | Flags::MASKED | Flags::NEAR_EDGE | Flags::OUT_OF_TIME;
@@ -71,6 +77,10 @@ impl LightHistory {
                 ln_energy: detection.energy_j.ln(),
                 noise: 1.0 / detection.snr.max(1.0),
                 position: detection.position,
+                on_sensor: view.sight.is_some().then(|| {
+                    let sensor = Vector2::from(view.to_sensor(detection.position.into()));
+                    sensor * view.ground_scale()
+                }),
             };
             let known = self.tracks.entry(track.id).or_default();
             known.push_back(shown);
@@ -102,6 +112,25 @@ impl LightHistory {
         }))
     }
 
+    /// Whether the light rests on the ground or on the sensor, where the camera moves: the likelihood of the first over the second.
+    pub fn rests_in(&self, track: &Track) -> Option<Value> {
+        let shown = self.tracks.get(&track.id)?;
+        let on_sensor: Vec<Vector2<f64>> = shown.iter().filter_map(|s| s.on_sensor).collect();
+        if on_sensor.len() < MIN_FRAMES {
+            return None;
+        }
+        let in_world = variance_m2(shown.iter().filter(|s| s.on_sensor.is_some()).map(|s| s.position));
+        let on_sensor_m2 = variance_m2(on_sensor.iter().copied());
+        let independent = INDEPENDENT * on_sensor.len() as f64;
+        let ln_ratio = independent * (on_sensor_m2 - in_world) / (RESTS_STD_M * RESTS_STD_M);
+        Some(json!({
+            "frames": on_sensor.len(),
+            "on_ground_std_m": in_world.sqrt(),
+            "on_sensor_std_m": on_sensor_m2.sqrt(),
+            "likelihood_ratio": ln_ratio.clamp(-LARGEST_RATIO.ln(), LARGEST_RATIO.ln()).exp(),
+        }))
+    }
+
     /// The beam that the track fades with at a fixed offset.
     pub fn ghost_of(&self, track: &Track, tracker: &Tracker) -> Option<Ghost> {
         let own = self.tracks.get(&track.id).filter(|s| s.len() >= MIN_FRAMES)?;
@@ -110,6 +139,13 @@ impl LightHistory {
         let ghosts = brighter.filter_map(|t| reflection(own, self.tracks.get(&t.id)?, t.id));
         ghosts.max_by(|a, b| a.neg_log_p.total_cmp(&b.neg_log_p))
     }
+}
+
+/// Variance per axis, m².
+fn variance_m2(places: impl Iterator<Item = Vector2<f64>> + Clone) -> f64 {
+    let n = places.clone().count() as f64;
+    let mean = places.clone().sum::<Vector2<f64>>() / n;
+    0.5 * places.map(|p| (p - mean).norm_squared()).sum::<f64>() / n
 }
 
 /// Likelihood of a sample variance of `n` normal deviates under a beam's over a lamp's standard deviations.
@@ -184,12 +220,20 @@ fn reflection(own: &VecDeque<Shown>, other: &VecDeque<Shown>, of: u64) -> Option
 #[cfg(test)]
 mod tests {
     use jiff::Timestamp;
+    use nalgebra::UnitQuaternion;
     use rand::SeedableRng;
     use rand_chacha::ChaCha8Rng;
     use rand_distr::{Distribution, StandardNormal};
 
     use super::*;
+    use crate::geo::Sight;
     use crate::monitor::track::detection::fixture::detection;
+    use crate::optics::{self, Camera};
+    use crate::pose::{Mount, Pose};
+
+    fn camera() -> Camera {
+        optics::Config::default().camera().unwrap()
+    }
 
     /// 128 frames of lights at these x, whose ln energies `light` gives.
     fn watched(places: &[f64], rate_hz: f64, light: impl Fn(f64, &[f64]) -> Vec<f64>) -> (LightHistory, Tracker) {
@@ -210,7 +254,7 @@ mod tests {
                 &beams,
                 1.0 / rate_hz,
             );
-            history.update(&tracker);
+            history.update(&tracker, &View::level(&camera()));
         }
         (history, tracker)
     }
@@ -236,6 +280,36 @@ mod tests {
         assert_eq!(shows(70.0)[0]["mains_hz"], 50.0);
         assert_eq!(shows(330.0)[0]["mains_hz"], 50.0);
         assert_eq!(shows(100.0), json!([]));
+    }
+
+    #[test]
+    fn a_glint_rests_on_the_sensor_while_the_camera_sways() {
+        let camera = camera();
+        let (mut history, mut tracker) = (LightHistory::default(), Tracker::new(50.0));
+        for k in 0..100i32 {
+            let t = 0.1 * f64::from(k);
+            let pose = Pose {
+                attitude: UnitQuaternion::from_euler_angles(0.05 * (0.8 * t).sin(), 0.04 * (0.7 * t).cos(), 0.0),
+                ..Pose::level(Timestamp::UNIX_EPOCH, [0.0, 0.0, camera.altitude_m])
+            };
+            let sight = Sight::new(&pose, &Mount::default());
+            let glint = sight.ground(&camera, [0.003, 0.002]).unwrap().horizontal_m();
+            let view = View {
+                camera: camera.clone(),
+                sight: Some(sight),
+            };
+            let beams = [detection(-40.0, 10.0), detection(glint.x, glint.y)];
+            tracker.step(Timestamp::from_millisecond(i64::from(k) * 100).unwrap(), &beams, 0.1);
+            history.update(&tracker, &view);
+        }
+        let said = |k: usize| history.rests_in(&tracker.tracks[k]).unwrap();
+        let (user, glint) = (said(0), said(1));
+        assert!(user["likelihood_ratio"].as_f64().unwrap() > 1e5, "{user}");
+        assert!(user["on_ground_std_m"].as_f64().unwrap() < 1e-9, "{user}");
+        assert!(glint["likelihood_ratio"].as_f64().unwrap() < 1e-5, "{glint}");
+        assert!(glint["on_sensor_std_m"].as_f64().unwrap() < 1e-6, "{glint}");
+        let (history, tracker) = watched(&[0.0], 10.0, |_, z| vec![0.1 * z[0]]);
+        assert_eq!(history.rests_in(&tracker.tracks[0]), None, "a camera that stands tells nothing");
     }
 
     #[test]

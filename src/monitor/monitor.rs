@@ -217,7 +217,7 @@ impl Monitor {
         frame.tracker.predict(frame.now);
         frame.register(&mut detections, dt);
         frame.tracker.take(frame.now, &detections, dt);
-        frame.light.update(&frame.tracker);
+        frame.light.update(&frame.tracker, &frame.view);
         let hit = frame.tracker.tracks.iter().filter(|t| t.hit);
         let beams: Vec<Vector2<f64>> = hit.map(|t| t.filter.position()).collect();
         let period_s = frame.timing.period_s().unwrap_or(ASSUMED_PERIOD_S);

@@ -21,6 +21,7 @@ const TELL = {
       near && near.second_beam_for_claim && ["It is a second beam for the claim of ", named(near.user), `, ${roughly(near.distance_m)} from the claimed place.`],
       near && !near.second_beam_for_claim && ["The nearest claimed user, ", named(near.user), `, is ${roughly(near.distance_m)} away.`],
       isNumber(ratio) && [ratio > 1.5 ? `It is ${+ratio.toPrecision(2)} times as bright as the users usually are.` : ratio < 1 / 1.5 ? `It is ${+(1 / ratio).toPrecision(2)} times fainter than the users usually are.` : "It is about as bright as the users are."],
+      ...ofLight(e),
       e.vanished_users?.length && ["Since about then no beam is seen of ", ...list(e.vanished_users.map((v) => v.user)), "."],
       strength(e.log_likelihood_ratio, e.threshold),
     ];
@@ -94,6 +95,19 @@ const TELL = {
     return [[named(alert.user ?? "The user"), ` is in two places, ${roughly(e.distance_m)} apart: ${places.map(place).join("; ")}.`]];
   },
 };
+
+// What the light says of its source; it decides nothing.
+function ofLight(e) {
+  const light = e.lamp_or_beam;
+  const times = (ratio) => (Math.max(ratio, 1 / ratio) > 1e4 ? "more than ten thousand times" : `${+Math.max(ratio, 1 / ratio).toPrecision(2)} times`);
+  const decided = (ratio) => isNumber(ratio) && ratio > 0 && Math.max(ratio, 1 / ratio) > 3;
+  return [
+    decided(light?.likelihood_ratio) && [`Its light is ${times(light.likelihood_ratio)} likelier ${light.likelihood_ratio > 1 ? "a beam's than a lamp's" : "a lamp's than a beam's"}, by how it scintillates.`],
+    light?.mains_flicker?.length && [`It flickers with the mains (${light.mains_flicker[0].mains_hz} Hz), as a lamp does.`],
+    decided(e.rests_in?.likelihood_ratio) && [e.rests_in.likelihood_ratio > 1 ? "It rests on the ground while the camera moves." : "It moves with the camera, as a glint or a faulty pixel does."],
+    e.ghost_of && ["It fades with ", e.ghost_of.user ? named(e.ghost_of.user) : `track ${e.ghost_of.track}`, `, ${roughly(e.ghost_of.offset_m)} away: perhaps a reflection of that beam.`],
+  ];
+}
 
 function list(users) {
   return users.flatMap((user, k) => (k ? [", ", named(user)] : [named(user)]));

@@ -207,6 +207,7 @@ fn content(frame: &FrameContext, track: &Track, since: Timestamp) -> Content {
     });
     let of_light = [
         ("lamp_or_beam", frame.light.lamp_or_beam(track, frame.budget.rate_hz())),
+        ("rests_in", frame.light.rests_in(track)),
         ("ghost_of", ghost_of(frame, track)),
     ];
     for (key, value) in of_light {

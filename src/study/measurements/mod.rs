@@ -6,6 +6,7 @@ mod calibration;
 mod flights;
 mod formats;
 mod lens;
+mod light;
 mod measured;
 mod pixels;
 mod zones;
@@ -42,6 +43,7 @@ pub const ALL: &[Measurement] = &[
     measurement("flights", 10, flights::flights),
     measurement("calibration", 5, calibration::error_left),
     measurement("lens", 40, lens::lenses),
+    measurement("lamp-or-beam", 100, light::lamp_or_beam),
     measurement("zones", 40, zones::known_lights_and_zones),
     measurement("formats", 200, formats::cost),
 ];
