@@ -93,8 +93,8 @@ pub(crate) fn distance2(a: [f64; 2], b: [f64; 2]) -> f64 {
     (a[0] - b[0]).powi(2) + (a[1] - b[1]).powi(2)
 }
 
-/// The spot error that a fitted hypothesis of bright spots shows, 0 where their residuals have nothing in common.
-pub(crate) fn common_misfit(search: &mut Search, candidate: &mut Candidate) -> f64 {
+/// The spot error that a fitted hypothesis of at least `least` bright spots shows, 0 where their residuals have nothing in common.
+pub(crate) fn common_misfit(search: &mut Search, candidate: &mut Candidate, least: usize) -> f64 {
     let (mx, my) = (search.compressed().mx, search.compressed().my);
     let bases = search.context.bases;
     let norm = halo::spot_norm(bases);
@@ -106,7 +106,7 @@ pub(crate) fn common_misfit(search: &mut Search, candidate: &mut Candidate) -> f
     let mut bright: Vec<&PointSource> = sources.iter().filter(|s| s.a > BRIGHT * brightest).collect();
     bright.sort_by(|a, b| b.a.total_cmp(&a.a));
     let near = |s: &&PointSource| bright.iter().filter(|t| distance2(s.u, t.u) < NEAR * NEAR).count() - 1;
-    if 2 * bright.iter().filter(|s| near(s) > MAX_NEAR).count() > bright.len() {
+    if bright.len() < least || 2 * bright.iter().filter(|s| near(s) > MAX_NEAR).count() > bright.len() {
         return 0.0;
     }
     bright.truncate(MAX_SPOTS);

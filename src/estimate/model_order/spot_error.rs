@@ -87,7 +87,8 @@ pub(crate) fn inspect_shape(
                 return Shape::Simpler(candidate.into_hypothesis());
             }
         }
-        let error = common_misfit(&mut search, &mut candidate);
+        let least = if is_explained && !has_width { LEAST_SPOTS } else { 1 };
+        let error = common_misfit(&mut search, &mut candidate, least);
         if error > 0.0 {
             return Shape::Different(error, candidate.into_hypothesis());
         }
