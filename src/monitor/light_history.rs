@@ -309,7 +309,11 @@ mod tests {
         assert!(glint["likelihood_ratio"].as_f64().unwrap() < 1e-5, "{glint}");
         assert!(glint["on_sensor_std_m"].as_f64().unwrap() < 1e-6, "{glint}");
         let (history, tracker) = watched(&[0.0], 10.0, |_, z| vec![0.1 * z[0]]);
-        assert_eq!(history.rests_in(&tracker.tracks[0]), None, "a camera that stands tells nothing");
+        assert_eq!(
+            history.rests_in(&tracker.tracks[0]),
+            None,
+            "a camera that stands tells nothing"
+        );
     }
 
     #[test]

@@ -7,7 +7,8 @@ use oapwatch::scene::Plan;
 use super::plan;
 
 /// One bright user far from the middle, no noise.
-const LONE_USER: &str = "rate_hz = 10.0\n[link]\nintegration_time_s = 0.1\n[[user]]\nname = \"u\"\nmotion.still = [40, -25]\n";
+const LONE_USER: &str =
+    "rate_hz = 10.0\n[link]\nintegration_time_s = 0.1\n[[user]]\nname = \"u\"\nmotion.still = [40, -25]\n";
 const MOVING: &str = "[platform]\nmount = { roll_deg = 2, pitch_deg = -3, yaw_deg = 90 }\nheading_deg = 30\nyaw_rate_deg_s = 2.0\n\
     velocity_m_s = [1.0, -0.5, 0.3]\nsway = { amplitude_deg = [4, 3], period_s = [8, 9] }\norbit = { radius_m = 5, period_s = 40 }\n";
 
@@ -89,7 +90,11 @@ fn an_exposure_smears_what_turns_within_it_where_the_scene_calls_for_it() {
     let smeared = width(&format!("{fast}[effects]\nmotion_blur = {{}}\n"));
     // 9° in the exposure at a distance of 5.66 mm from the middle: 0.89 mm of even light, of variance 0.89²/12 mm².
     let expected = (9f64.to_radians() * 0.036 * 40f64.hypot(25.0) / 300.0).powi(2) / 12.0;
-    assert!(((smeared - sharp) / expected - 1.0).abs() < 0.02, "{} {expected}", smeared - sharp);
+    assert!(
+        ((smeared - sharp) / expected - 1.0).abs() < 0.02,
+        "{} {expected}",
+        smeared - sharp
+    );
 }
 
 #[test]
@@ -142,9 +147,22 @@ fn a_flight_log_moves_the_platform() {
     let hovering = plan(&log("hover", 2.0));
     assert!(stated(&hovering, 0).position_m.map(|v| v.round()) == [0.0, 0.0, 300.0]);
     let there = stated(&hovering, 100).position_m;
-    assert!(there[0].hypot(there[1]) > 0.02 && (there[2] - 300.0).abs() < 5.0, "{there:?}");
-    let error = Plan::compile(&super::scene(&log("hover", 500.0)), 0).unwrap_err().to_string();
-    assert!(error.starts_with("platform.log.start_s: expected less than the log's"), "{error}");
-    let error = Plan::compile(&super::scene(&log("missing", 0.0)), 0).unwrap_err().to_string();
-    assert!(error.starts_with("platform.log.file: expected a flight log of PX4"), "{error}");
+    assert!(
+        there[0].hypot(there[1]) > 0.02 && (there[2] - 300.0).abs() < 5.0,
+        "{there:?}"
+    );
+    let error = Plan::compile(&super::scene(&log("hover", 500.0)), 0)
+        .unwrap_err()
+        .to_string();
+    assert!(
+        error.starts_with("platform.log.start_s: expected less than the log's"),
+        "{error}"
+    );
+    let error = Plan::compile(&super::scene(&log("missing", 0.0)), 0)
+        .unwrap_err()
+        .to_string();
+    assert!(
+        error.starts_with("platform.log.file: expected a flight log of PX4"),
+        "{error}"
+    );
 }

@@ -345,7 +345,7 @@ impl AnalyticEstimator {
         let mut spot_error = 0.0;
         let mut is_simpler = false;
         if self.spec.chooses_order() {
-            let is_explained = compressed.is_explained_by(&hypothesis);
+            let is_explained = compressed.is_nearly_explained_by(&hypothesis);
             let Reweighting { space, compressed } = &mut self.reweighting;
             let (frame, budget) = (&self.frame, &mut budgets.reweighting);
             let shape = match self.camera.spot_error {

@@ -216,9 +216,19 @@ impl CompressedFrame {
 
     /// Whether the deviance of a hypothesis is that of noise alone.
     pub fn is_explained_by(&self, hypothesis: &Hypothesis) -> bool {
+        self.excess(hypothesis) < 2.5
+    }
+
+    /// The same with room for what chance does in one of some hundred frames.
+    pub fn is_nearly_explained_by(&self, hypothesis: &Hypothesis) -> bool {
+        self.excess(hypothesis) < 5.0
+    }
+
+    /// Deviance beyond its expectation, in units of about its standard deviation.
+    fn excess(&self, hypothesis: &Hypothesis) -> f64 {
         let freedom = (self.data_count - hypothesis.parameters() as f64).max(1.0);
-        let spread = 2.5 * (2.0 * freedom).sqrt() + 2.5;
-        hypothesis.deviance < self.mean_variance * freedom + self.light_weighted_variance * spread
+        let spread = (2.0 * freedom).sqrt() + 1.0;
+        (hypothesis.deviance - self.mean_variance * freedom) / (self.light_weighted_variance * spread)
     }
 
     /// Deviance over its expectation; 1 where the hypothesis explains the frame.

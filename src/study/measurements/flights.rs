@@ -48,8 +48,16 @@ const fn kind(name: &'static str, laws: &'static str, shift_m: [f64; 2]) -> Kind
 }
 
 const KINDS: &[Kind] = &[
-    kind("sway of 3°", "sway = { amplitude_deg = [3, 3], period_s = [8, 9] }", [0.0; 2]),
-    kind("sway of 8°", "sway = { amplitude_deg = [8, 8], period_s = [8, 9] }", [0.0; 2]),
+    kind(
+        "sway of 3°",
+        "sway = { amplitude_deg = [3, 3], period_s = [8, 9] }",
+        [0.0; 2],
+    ),
+    kind(
+        "sway of 8°",
+        "sway = { amplitude_deg = [8, 8], period_s = [8, 9] }",
+        [0.0; 2],
+    ),
     kind(
         "sway of 3°, turning 60° a minute",
         "yaw_rate_deg_s = 1\nsway = { amplitude_deg = [3, 3], period_s = [8, 9] }",
@@ -120,7 +128,12 @@ fn stranger(kind: &Kind, seed: u64) -> String {
 /// Errors of users' positions, m, and their squares over the stated variance, per axis.
 fn errors(told: &Reviewed) -> (Vec<f64>, Vec<f64>) {
     let (mut metres, mut normalised) = (Vec::new(), Vec::new());
-    for (report, truth) in told.reports.iter().zip(&told.truths).skip((SETTLED_S * RATE_HZ) as usize) {
+    for (report, truth) in told
+        .reports
+        .iter()
+        .zip(&told.truths)
+        .skip((SETTLED_S * RATE_HZ) as usize)
+    {
         for seen in &report.emitters {
             let is_theirs = |e: &&crate::scene::EmitterTruth| e.user.is_some() && e.user == seen.user;
             let Some(user) = truth.emitters.iter().find(is_theirs) else {
@@ -180,10 +193,16 @@ pub fn flights(stories: u64, seed: u64) -> Measured {
             })
             .collect();
         let within = |stories: &[(u64, Raised)], wanted, from_s, limit_s| {
-            let in_time = stories.iter().filter(|(_, raised)| delay_s(raised, wanted, from_s) <= limit_s);
+            let in_time = stories
+                .iter()
+                .filter(|(_, raised)| delay_s(raised, wanted, from_s) <= limit_s);
             in_time.count()
         };
-        let false_alerts: Vec<_> = honest.iter().map(|h| h.0.clone()).filter(|(_, raised)| !raised.is_empty()).collect();
+        let false_alerts: Vec<_> = honest
+            .iter()
+            .map(|h| h.0.clone())
+            .filter(|(_, raised)| !raised.is_empty())
+            .collect();
         let seen = within(&strangers, UnclaimedEmitter, COMES_S, STRANGER_LIMIT_S);
         let told = within(&dragged, PoseInconsistent, DRAGGED_S, DRAG_LIMIT_S);
         writeln!(
@@ -196,8 +215,12 @@ pub fn flights(stories: u64, seed: u64) -> Measured {
         )
         .expect("text takes all");
         holds &= false_alerts.is_empty() && seen as f64 >= GOAL * stories as f64 && told as u64 == stories;
-        let late = strangers.into_iter().filter(|(_, r)| delay_s(r, UnclaimedEmitter, COMES_S) > STRANGER_LIMIT_S || r.len() > 1);
-        let unsaid = dragged.into_iter().filter(|(_, r)| delay_s(r, PoseInconsistent, DRAGGED_S) > DRAG_LIMIT_S);
+        let late = strangers
+            .into_iter()
+            .filter(|(_, r)| delay_s(r, UnclaimedEmitter, COMES_S) > STRANGER_LIMIT_S || r.len() > 1);
+        let unsaid = dragged
+            .into_iter()
+            .filter(|(_, r)| delay_s(r, PoseInconsistent, DRAGGED_S) > DRAG_LIMIT_S);
         let named = [false_alerts, late.collect(), unsaid.collect()].concat();
         if !named.is_empty() {
             others.push(format!("{}:\n{}", kind.name, exceptions(&named)));

@@ -81,7 +81,9 @@ pub fn lamp_or_beam(stories: u64, seed: u64) -> Measured {
         for scintillation in SCINTILLATIONS {
             let beams: Vec<f64> = seeds().filter_map(|k| ratio(k, rate_hz, beam(scintillation))).collect();
             let area = area(&beams, &lamps);
-            let above = |ratios: &[f64]| 100.0 * ratios.iter().filter(|r| **r > 1.0).count() as f64 / ratios.len().max(1) as f64;
+            let above = |ratios: &[f64]| {
+                100.0 * ratios.iter().filter(|r| **r > 1.0).count() as f64 / ratios.len().max(1) as f64
+            };
             writeln!(
                 text,
                 "| {rate_hz} | {scintillation} | {area:.3} | {:.0} % of {} | {:.0} % of {} |",
