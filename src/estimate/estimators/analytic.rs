@@ -205,9 +205,10 @@ impl AnalyticEstimator {
         if is_complete {
             return found;
         }
+        let excess = self.compressed.excess(&found.hypothesis);
         if !self.compressed.is_explained_by(&found.hypothesis) {
             let Reweighting { space, compressed } = &mut self.reweighting;
-            let shape = inspect_shape(space, compressed, &self.frame, &found.hypothesis, false, budget);
+            let shape = inspect_shape(space, compressed, &self.frame, &found.hypothesis, excess, budget);
             if matches!(shape, Shape::Different(..)) {
                 return found;
             }
@@ -345,13 +346,14 @@ impl AnalyticEstimator {
         let mut spot_error = 0.0;
         let mut is_simpler = false;
         if self.spec.chooses_order() {
-            let is_explained = compressed.is_nearly_explained_by(&hypothesis);
+            let is_explained = compressed.is_explained_by(&hypothesis);
+            let excess = compressed.excess(&hypothesis);
             let Reweighting { space, compressed } = &mut self.reweighting;
             let (frame, budget) = (&self.frame, &mut budgets.reweighting);
             let shape = match self.camera.spot_error {
                 Some(0.0) => Shape::AsModelled,
                 Some(error) => Shape::of_spot_error(error, &hypothesis),
-                None => inspect_shape(space, compressed, frame, &hypothesis, is_explained, budget),
+                None => inspect_shape(space, compressed, frame, &hypothesis, excess, budget),
             };
             match shape {
                 Shape::AsModelled => {}

@@ -14,6 +14,8 @@ use crate::optics::Camera;
 const LOSS: f64 = 0.02;
 /// Most emitters of a frame: bounds time and memory whatever the frame shows.
 const MAX_SOURCES: usize = 80;
+/// Excess of the deviance up to which noise alone explains it. Larger leaves faint sources unfound, smaller searches frames again.
+pub(crate) const MOST_EXCESS: f64 = 2.5;
 
 /// Coefficients of a preprocessed frame and the statistics of the rest of it.
 #[derive(Clone, Default)]
@@ -216,16 +218,11 @@ impl CompressedFrame {
 
     /// Whether the deviance of a hypothesis is that of noise alone.
     pub fn is_explained_by(&self, hypothesis: &Hypothesis) -> bool {
-        self.excess(hypothesis) < 2.5
-    }
-
-    /// The same with room for what chance does in one of some hundred frames.
-    pub fn is_nearly_explained_by(&self, hypothesis: &Hypothesis) -> bool {
-        self.excess(hypothesis) < 5.0
+        self.excess(hypothesis) < MOST_EXCESS
     }
 
     /// Deviance beyond its expectation, in units of about its standard deviation.
-    fn excess(&self, hypothesis: &Hypothesis) -> f64 {
+    pub fn excess(&self, hypothesis: &Hypothesis) -> f64 {
         let freedom = (self.data_count - hypothesis.parameters() as f64).max(1.0);
         let spread = (2.0 * freedom).sqrt() + 1.0;
         (hypothesis.deviance - self.mean_variance * freedom) / (self.light_weighted_variance * spread)

@@ -3,7 +3,7 @@
 
 use crate::estimate::fit::work_budget::WorkBudget;
 use crate::estimate::model::bases::Bases;
-use crate::estimate::model::compressed_frame::CompressedFrame;
+use crate::estimate::model::compressed_frame::{CompressedFrame, MOST_EXCESS};
 use crate::estimate::model::halo::{Halo, height, spot_norm};
 use crate::estimate::model::hypothesis::{Hypothesis, Nuisances, PointSource, Width};
 use crate::estimate::model_order::candidate::Candidate;
@@ -22,8 +22,11 @@ const ROUNDS: usize = 3;
 const STRONG_PEAK: f64 = 0.1;
 /// Peaks of the frame above this share of the highest one are taken for spots of their own: higher than any ring or tail.
 const HIGH_PEAK: f64 = 0.2;
-/// Spots from which what stands beside them may be a lens's though sources explain it: a single pair is two sources.
+/// Spots from which what stands beside them may be a lens's though sources explain it: a single pair is two sources. Also where sources
+/// explain all but an excess of [`CHANCE`]: chance leaves one of some hundred frames unexplained, and two melted spots always have
+/// something in common.
 const LEAST_SPOTS: usize = 3;
+const CHANCE: f64 = 5.0;
 /// Share of the variance that the halo of other spots adds to a position: their misfit is smooth across a spot, while the weights must hold
 /// at its worst place. Found from Airy discs at SNR 1000, the kind of spot whose positions others move most.
 const POSITION_SHARE: f64 = 0.1;
@@ -50,16 +53,17 @@ impl Shape {
     }
 }
 
-/// Compares the residuals around the bright spots of `hypothesis`. Where it explains the frame, that stands unless its sources are
+/// Compares the residuals around the bright spots of `hypothesis`, whose deviance has this excess. Where it explains the frame, that stands unless its sources are
 /// arranged as a lens's misfit is.
 pub(crate) fn inspect_shape(
     space: &mut SearchSpace,
     compressed: &mut CompressedFrame,
     frame: &PreprocessedFrame,
     hypothesis: &Hypothesis,
-    is_explained: bool,
+    excess: f64,
     budget: &mut WorkBudget,
 ) -> Shape {
+    let is_explained = excess < MOST_EXCESS;
     let has_width = hypothesis.nuisances.width != Width::Known;
     let (merged, separate) = (bright_spots(hypothesis, true), bright_spots(hypothesis, false));
     let mut alternatives = match is_explained {
@@ -87,7 +91,7 @@ pub(crate) fn inspect_shape(
                 return Shape::Simpler(candidate.into_hypothesis());
             }
         }
-        let least = if is_explained && !has_width { LEAST_SPOTS } else { 1 };
+        let least = if excess < CHANCE && !has_width { LEAST_SPOTS } else { 1 };
         let error = common_misfit(&mut search, &mut candidate, least);
         if error > 0.0 {
             return Shape::Different(error, candidate.into_hypothesis());
