@@ -6,7 +6,8 @@ use std::sync::Arc;
 use jiff::Timestamp;
 use serde::{Serialize, Serializer};
 
-use crate::monitor::{PositionStatus, Report};
+use crate::geo::Geodetic;
+use crate::monitor::{GeodeticFields, PositionStatus, Report};
 
 /// Moments kept, and the time between two of them: an hour of trails.
 const MOMENTS_KEPT: usize = 3600;
@@ -36,6 +37,10 @@ pub struct PastBeam {
     /// Metres, to the centimetre.
     pub x_m: f32,
     pub y_m: f32,
+    /// The same on the earth, where `[world] origin` places it.
+    #[serde(flatten)]
+    #[schema(value_type = GeodeticFields)]
+    pub geodetic: Option<Geodetic>,
     pub status: PositionStatus,
     /// One name for all moments.
     #[serde(skip_serializing_if = "Option::is_none", serialize_with = "name")]
@@ -79,6 +84,7 @@ impl History {
             track: e.track,
             x_m: centimetres(e.x_m),
             y_m: centimetres(e.y_m),
+            geodetic: e.geodetic,
             status: e.status,
             user: e.user.as_deref().map(shared),
         });

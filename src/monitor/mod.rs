@@ -30,8 +30,8 @@ mod track;
 pub mod zones;
 
 pub use alert::{
-    Acknowledgement, Alert, AlertEvent, AlertEventKind, AlertKind, AlertSource, AlertState, Severity, StationName,
-    Withdrawal,
+    Acknowledgement, Alert, AlertEvent, AlertEventKind, AlertKind, AlertSource, AlertState, GeodeticFields, Severity,
+    StationName, Withdrawal,
 };
 pub use config::{Config, ConfigError, Source};
 pub use input::sensor_health::BLINDING_SHARE;

@@ -266,12 +266,12 @@ fn zones_in_degrees_are_the_same_ground_as_in_metres() {
     std::fs::write(dir.path().join("gate.geojson"), file.to_string()).unwrap();
     let gate = "[[zone]]\nname = \"gate\"\nkind = \"watch\"\ngeojson = \"gate.geojson\"\ncoordinates = \"degrees\"\n";
     let daemon = Daemon::start(dir.path(), &format!("{gate}[world]\norigin = {{ {origin} }}\n{CONFIG}"));
-    let (_, metres) = json_of(daemon.get("/v1/zones"));
-    let corner = metres["features"][0]["geometry"]["coordinates"][0][0][0].clone();
+    let metres = daemon.wait_for("/v1/zones", "the zone", |v| v["features"][0].is_object());
+    let corner = metres["features"][0]["geometry"]["coordinates"][0][0].clone();
     let [x, y] = [0, 1].map(|k| corner[k].as_f64().unwrap());
     assert!((x - 55.660).abs() < 0.01 && (y - 55.287).abs() < 0.01, "{corner}");
     let (status, degrees) = json_of(daemon.get("/v1/zones?coordinates=degrees"));
-    let corner = degrees["features"][0]["geometry"]["coordinates"][0][0][0].clone();
+    let corner = degrees["features"][0]["geometry"]["coordinates"][0][0].clone();
     assert!(
         status == 200 && (corner[0].as_f64().unwrap() - 11.0005).abs() < 1e-9,
         "{corner}"
