@@ -1,10 +1,17 @@
 //! `oapwatch fleet`: the alerts and positions of many access points as one, with what only all of them together show.
 
 mod alerts;
+pub mod chain;
 mod conflicts;
 mod intake;
+mod picture;
+mod record;
+mod review;
+#[allow(clippy::disallowed_methods, reason = "silence is measured in the hub's own time")]
 mod run;
+mod snapshot;
 mod stations;
+mod stream;
 
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
@@ -18,10 +25,18 @@ use tokio::sync::{mpsc, watch};
 use crate::config::Config;
 use crate::journal::Journal;
 use crate::{api, export, fleet, logging, metric, notify};
+pub use review::{ReviewError, review};
 use run::Run;
 
 /// Requests that wait for the hub; further ones are answered 503.
 const COMMANDS: usize = 64;
+
+/// Checks that a config is a hub's; its files are not opened.
+pub fn validate(config: &Config) -> Result<()> {
+    config.fleet.validate_hub()?;
+    config.journal.validate()?;
+    Ok(())
+}
 
 /// A hub whose config has been checked and whose files have been opened; no port is bound yet.
 pub struct Hub {
@@ -36,8 +51,7 @@ pub struct Hub {
 impl Hub {
     /// Checks and opens everything a config names.
     pub fn new(config: Config) -> Result<Self> {
-        config.fleet.validate_hub()?;
-        config.journal.validate()?;
+        validate(&config)?;
         let recorder = metric::recorder()?;
         let metrics = recorder.handle();
         // A second daemon in one process (a test) counts into the first one's recorder.
@@ -60,6 +74,7 @@ impl Hub {
     }
 
     /// Runs until SIGTERM or SIGINT.
+    #[allow(clippy::disallowed_methods, reason = "the hub's own time begins here")]
     pub async fn run(self, _logging: logging::Handle) -> Result<()> {
         let listen = &self.config.api.listen;
         let listener = api::Listener::bind(listen).with_context(|| format!("api.listen: cannot listen on {listen}"))?;
