@@ -1,10 +1,11 @@
 //! The NATS server's config that is shipped: TLS, NKeys, and each station under its own subjects only.
 
-use std::path::Path;
+use std::os::unix::fs::PermissionsExt;
+use std::path::{Path, PathBuf};
+use std::process::Command;
 use std::time::Duration;
 
 use async_nats::{ConnectOptions, Event};
-use nkeys::KeyPair;
 use serde_json::{Value, json};
 use tokio::sync::mpsc;
 
@@ -13,8 +14,37 @@ use crate::process::{Daemon, alerts};
 
 const CA: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/data/tls/ca.pem");
 
+/// A key that the program made.
+struct Key {
+    file: PathBuf,
+    public: String,
+}
+
+impl Key {
+    fn new(file: PathBuf) -> Self {
+        let nkey = || {
+            Command::new(env!("CARGO_BIN_EXE_oapwatch"))
+                .arg("nkey")
+                .arg(&file)
+                .output()
+                .unwrap()
+        };
+        let made = nkey();
+        let public = String::from_utf8(made.stdout).unwrap().trim().to_owned();
+        assert!(made.status.success() && public.starts_with('U'), "{public}");
+        let mode = std::fs::metadata(&file).unwrap().permissions().mode();
+        assert_eq!(mode & 0o077, 0, "{mode:o}");
+        assert_eq!(nkey().status.code(), Some(2), "a key in use is not replaced");
+        Self { file, public }
+    }
+
+    fn seed(&self) -> String {
+        std::fs::read_to_string(&self.file).unwrap().trim().to_owned()
+    }
+}
+
 /// The shipped config with keys, certificates and folders that are here.
-fn config(dir: &Path, port: u16, ap7: &KeyPair, hub: &KeyPair) -> String {
+fn config(dir: &Path, port: u16, ap7: &Key, hub: &Key) -> String {
     let tls = format!("{}/tests/data/tls", env!("CARGO_MANIFEST_DIR"));
     let store = dir.join("nats").display().to_string();
     let mut text = include_str!("../../deploy/nats-server.conf").to_owned();
@@ -23,8 +53,8 @@ fn config(dir: &Path, port: u16, ap7: &KeyPair, hub: &KeyPair) -> String {
         ("/etc/nats/server-cert.pem", format!("{tls}/server.pem")),
         ("/etc/nats/server-key.pem", format!("{tls}/server.key")),
         ("/var/lib/nats", store),
-        ("UREPLACEWITHTHEPUBLICKEYOFAP7", ap7.public_key()),
-        ("UREPLACEWITHTHEPUBLICKEYOFTHEHUB", hub.public_key()),
+        ("UREPLACEWITHTHEPUBLICKEYOFAP7", ap7.public.clone()),
+        ("UREPLACEWITHTHEPUBLICKEYOFTHEHUB", hub.public.clone()),
     ] {
         assert_eq!(text.matches(shipped).count(), 1, "{shipped}");
         text = text.replace(shipped, &here);
@@ -33,21 +63,21 @@ fn config(dir: &Path, port: u16, ap7: &KeyPair, hub: &KeyPair) -> String {
 }
 
 /// A config that speaks for `station`, or the hub's, with `key`.
-fn start(dir: &Path, command: &str, names: &str, port: u16, key: &KeyPair) -> Daemon {
+fn start(dir: &Path, command: &str, names: &str, port: u16, key: &Key) -> Daemon {
     let dir = dir.join(format!("{command}-{}", names.len()));
     std::fs::create_dir_all(&dir).unwrap();
-    std::fs::write(dir.join("nkey"), key.seed().unwrap()).unwrap();
+    let nkey = &key.file;
     let config = format!(
         "[journal]\npath = \"journal.db\"\n[fleet]\nurl = \"tls://127.0.0.1:{port}\"\nca_file = {CA:?}\n\
-         nkey_file = \"nkey\"\n{names}\n"
+         nkey_file = {nkey:?}\n{names}\n"
     );
     Daemon::start_as(&dir, command, &config)
 }
 
 /// Publishes a station's health with ap7's key; gives what the server objects to within two seconds.
-async fn objection(port: u16, key: &KeyPair, station: &str) -> Option<String> {
+async fn objection(port: u16, key: &Key, station: &str) -> Option<String> {
     let (events, mut heard) = mpsc::unbounded_channel();
-    let options = ConnectOptions::with_nkey(key.seed().unwrap())
+    let options = ConnectOptions::with_nkey(key.seed())
         .add_root_certificates(CA.into())
         .event_callback(move |event| {
             if let Event::ServerError(error) = event {
@@ -71,7 +101,7 @@ async fn objection(port: u16, key: &KeyPair, station: &str) -> Option<String> {
 #[test]
 fn with_the_shipped_config_a_station_speaks_for_itself_only() {
     let dir = tempfile::tempdir().unwrap();
-    let (ap7, hub) = (KeyPair::new_user(), KeyPair::new_user());
+    let [ap7, hub] = ["ap7", "hub"].map(|name| Key::new(dir.path().join(format!("{name}.nkey"))));
     let file = dir.path().join("nats-server.conf");
     let Some(server) = Server::start_with(None, |port| {
         std::fs::write(&file, config(dir.path(), port, &ap7, &hub)).unwrap();
