@@ -53,10 +53,11 @@ def seconds_to_ready(program, folder, config, command="run"):
 
 def hub_starts(program, folder):
     """Whether the hub's config as it is shipped is taken, and the hub ready with it although there is no server yet."""
-    shipped = folder / "etc/oapwatch/hub.toml"
-    checked = subprocess.run([program, "check", shipped], check=False, capture_output=True, text=True)
+    config = (folder / "etc/oapwatch/hub.toml").read_text().replace("/var/lib/oapwatch-fleet", str(folder))
+    file = folder / "hub.toml"
+    file.write_text(config)
+    checked = subprocess.run([program, "check", file], check=False, capture_output=True, text=True)
     print(checked.stdout.strip() or checked.stderr.strip())
-    config = shipped.read_text().replace("/var/lib/oapwatch-fleet", str(folder))
     ready, resident = seconds_to_ready(program, folder, config, "fleet")
     print(f"hub: ready after {ready:.3f} s, {resident:.0f} MiB resident then")
     return checked.returncode == 0 and "hub" in checked.stdout
