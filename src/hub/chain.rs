@@ -111,6 +111,11 @@ impl Chain {
         alerts.restore(open);
         let mut conflicts = Conflicts::default();
         let mut stations = Stations::default();
+        // One that has gone silent while no hub ran is missed too.
+        for name in taken.keys().filter_map(|source| station_of(source)) {
+            // More stations than are kept: those are shown when they speak.
+            let _ = stations.take_sign(&name, started_at);
+        }
         for cause in alerts.own_causes() {
             match cause {
                 OwnCause::UserInTwoPlaces(user) => conflicts.restore(std::iter::once(user), started_at),
@@ -182,7 +187,7 @@ impl Chain {
     }
 
     fn take_alert(&mut self, message: AlertMessage, now: Timestamp) -> Outcome {
-        let source = format!("{}/{}", message.name, message.journal);
+        let source = source_of(&message.name, &message.journal);
         if self.taken.get(&source).is_some_and(|&last| message.seq <= last) {
             return Outcome {
                 refused: Some(Refused::Repeated),
@@ -265,6 +270,20 @@ impl Chain {
     }
 }
 
+/// A station's journal among all origins of events.
+fn source_of(name: &StationName, journal: &str) -> String {
+    format!("{name}/{journal}")
+}
+
+fn station_of(source: &str) -> Option<StationName> {
+    let (name, _) = source.split_once('/')?;
+    let (site, station) = name.split_once('.')?;
+    Some(StationName {
+        site: site.to_owned(),
+        station: station.to_owned(),
+    })
+}
+
 fn finding([a, b]: &[Sighting; 2]) -> Finding {
     let place = |s: &Sighting| {
         let StationName { site, station } = &s.name;
@@ -275,5 +294,71 @@ fn finding([a, b]: &[Sighting; 2]) -> Finding {
         place_m: Some([seen.x_m, seen.y_m, seen.z_m]),
         geodetic: seen.geodetic,
         evidence: json!({ "places": [place(a), place(b)], "distance_m": (a.x_m - b.x_m).hypot(a.y_m - b.y_m) }),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::monitor::AlertEventKind;
+
+    const SETTINGS: Settings = Settings {
+        lost_after_s: 10.0,
+        tolerated_m: 5.0,
+    };
+
+    fn at(s: i64) -> Timestamp {
+        Timestamp::from_second(1_000_000 + s).unwrap()
+    }
+
+    fn name(station: &str) -> StationName {
+        StationName {
+            site: "harbour".to_owned(),
+            station: station.to_owned(),
+        }
+    }
+
+    fn health(station: &str, s: i64) -> Heard {
+        Heard::Health(HealthMessage {
+            version: crate::fleet::message::VERSION,
+            name: name(station),
+            time: at(s),
+            status: serde_json::Value::Null,
+            alerts_waiting: 0,
+        })
+    }
+
+    /// A chain that has known two stations before it began, of which one speaks.
+    fn started() -> Chain {
+        let taken = ["a", "b"].map(|station| (source_of(&name(station), "j"), 7));
+        let mut chain = Chain::new(SETTINGS, Vec::new(), taken.into(), at(0));
+        assert!(chain.take(Heard::Tick, at(9)).taken.is_empty());
+        assert!(chain.take(health("a", 9), at(9)).refused.is_none());
+        chain
+    }
+
+    #[test]
+    fn a_station_that_fell_silent_while_no_hub_ran_is_missed() {
+        let told = started().take(Heard::Tick, at(11)).taken;
+        let [lost] = told.as_slice() else { panic!("{told:?}") };
+        assert_eq!(
+            (lost.event.event, lost.event.alert.kind),
+            (AlertEventKind::Raised, AlertKind::StationLost)
+        );
+        assert_eq!(lost.event.alert.station, Some(name("b")));
+    }
+
+    #[test]
+    fn a_chain_that_was_saved_goes_on_as_it_would_have() {
+        let mut chain = started();
+        chain.take(Heard::Tick, at(11));
+        let saved = serde_json::to_string(&chain.saved()).unwrap();
+        let mut again = Chain::resume(SETTINGS, serde_json::from_str(&saved).unwrap());
+        for (s, heard) in [(12, Some("b")), (13, None), (25, None)] {
+            let heard = || heard.map_or(Heard::Tick, |station| health(station, s));
+            let [told, retold] = [&mut chain, &mut again].map(|chain| format!("{:?}", chain.take(heard(), at(s))));
+            assert_eq!(told, retold);
+        }
+        assert_eq!(again.open_by_kind()[&AlertKind::StationLost], 2);
     }
 }

@@ -15,6 +15,7 @@ mod stream;
 
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
+use std::time::Duration;
 
 use anyhow::{Context, Result};
 use jiff::Timestamp;
@@ -119,6 +120,7 @@ impl Hub {
         let run = Run::new(&self.config, self.journal.clone(), feed, notifier, ready, started_at)?;
         let mut working = tokio::spawn(run.run(client, orders, stops()));
         let mut serving = tokio::spawn(self.server.serve(listener, state, stops()));
+        let upkeep = tokio::spawn(maintain(self.journal.clone(), self.metrics.clone()));
         let mut terminate = signal(SignalKind::terminate())?;
         let mut interrupt = signal(SignalKind::interrupt())?;
         let outcome = tokio::select! {
@@ -131,6 +133,7 @@ impl Hub {
             },
         };
         stop.send_replace(true);
+        upkeep.abort();
         if !working.is_finished() {
             working.await?;
         }
@@ -145,5 +148,22 @@ impl Hub {
     }
 }
 
+/// Interval of journal maintenance (age and size limits).
+const MAINTENANCE: Duration = Duration::from_secs(3600);
+/// Interval of aggregating histogram samples: until then each sample is kept, also where no server asks for the metrics.
+const UPKEEP: Duration = Duration::from_secs(5);
+
+#[allow(clippy::disallowed_methods, reason = "the journal's limits are of age")]
+async fn maintain(journal: Journal, metrics: PrometheusHandle) {
+    let mut maintenance = tokio::time::interval(MAINTENANCE);
+    let mut upkeep = tokio::time::interval(UPKEEP);
+    loop {
+        tokio::select! {
+            _ = maintenance.tick() => journal.maintain(Timestamp::now()),
+            _ = upkeep.tick() => metrics.run_upkeep(),
+        }
+    }
+}
+
 /// Time that deliveries under way have when the hub stops.
-const LAST_DELIVERIES: std::time::Duration = std::time::Duration::from_millis(800);
+const LAST_DELIVERIES: Duration = Duration::from_millis(800);
