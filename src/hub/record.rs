@@ -102,6 +102,7 @@ impl Recorder {
             folder: folder.clone(),
             limit,
             file: None,
+            is_told: false,
             link: link.clone(),
         };
         let thread = std::thread::Builder::new()
@@ -216,6 +217,8 @@ struct Writer {
     limit: u64,
     /// `None` from a failed write to the next file.
     file: Option<BufWriter<File>>,
+    /// Nothing has reached the disk since a failure that is in the log.
+    is_told: bool,
     link: Arc<Link>,
 }
 
@@ -225,8 +228,9 @@ impl Writer {
             let order = match orders.try_recv() {
                 Ok(order) => order,
                 Err(TryRecvError::Empty) => {
-                    let flushed = self.file.as_mut().map_or(Ok(()), Write::flush);
-                    self.note(flushed);
+                    let flushed = self.file.as_mut().map(Write::flush);
+                    self.is_told &= !matches!(flushed, Some(Ok(())));
+                    self.note(flushed.unwrap_or(Ok(())));
                     match orders.recv() {
                         Ok(order) => order,
                         Err(_) => break,
@@ -259,7 +263,9 @@ impl Writer {
 
     fn note(&mut self, outcome: io::Result<()>) {
         if let Err(error) = outcome {
-            tracing::warn!(folder = %self.folder.display(), %error, "what the hub hears is not recorded");
+            if !std::mem::replace(&mut self.is_told, true) {
+                tracing::warn!(folder = %self.folder.display(), %error, "what the hub hears is not recorded");
+            }
             metrics::counter!(metric::RECORDER_ERRORS).increment(1);
             self.file = None;
             self.link.is_failing.store(true, Ordering::Relaxed);
@@ -299,4 +305,48 @@ fn trim(folder: &Path, limit: u64) -> io::Result<()> {
         total -= bytes;
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::hub::chain::Settings;
+
+    #[test]
+    fn the_ring_stays_within_its_limit_and_its_files_follow_each_other() {
+        let dir = tempfile::tempdir().unwrap();
+        let config = Config {
+            folder: Some(dir.path().to_owned()),
+            limit_mb: 0.02,
+            segment_s: 3600.0,
+            ..Config::default()
+        };
+        let settings = Settings {
+            lost_after_s: 10.0,
+            tolerated_m: 5.0,
+        };
+        let chain = Chain::new(settings, Vec::new(), Default::default(), Timestamp::UNIX_EPOCH);
+        let mut recorder = Recorder::start(&config).unwrap().unwrap();
+        for k in 0..2000 {
+            recorder.heard(Timestamp::from_second(k).unwrap(), &Heard::Tick, &chain);
+            if k == 1900 {
+                recorder.interrupt();
+            }
+        }
+        drop(recorder);
+        let files = recordings(dir.path()).unwrap();
+        let bytes: u64 = files.iter().map(|path| std::fs::metadata(path).unwrap().len()).sum();
+        assert!((15_000..=25_000).contains(&bytes), "{bytes} bytes in {files:?}");
+        let heads: Vec<Head> = files
+            .iter()
+            .map(|path| serde_json::from_str(std::fs::read_to_string(path).unwrap().lines().next().unwrap()).unwrap())
+            .collect();
+        assert!(heads[0].number > 0 && heads.len() > 4, "{heads:?}");
+        let torn = heads[1..].iter().filter(|head| head.follows != Some(head.number - 1));
+        assert_eq!(
+            torn.map(|head| head.follows).collect::<Vec<_>>(),
+            [None],
+            "at the interruption only"
+        );
+    }
 }
