@@ -70,7 +70,8 @@ test-licences: setup
 PROFILE ?= dist
 deb: setup
 	$(call need,sh -c 'command -v lintian && command -v python3 && command -v systemd-analyze',lintian python3-minimal systemd)
-	@command -v cargo-deb >/dev/null || cargo install --locked cargo-deb
+	@# Earlier than 3.8, it takes the options of one unit for all.
+	@case "$$(cargo deb --version 2>/dev/null)" in 3.[89].*|3.[1-9][0-9]*|[4-9]*) ;; *) cargo install --locked cargo-deb ;; esac
 	cargo build --profile $(PROFILE) --locked
 	rm -rf target/man target/completions && mkdir -p target/completions
 	target/$(PROFILE)/oapwatch man target/man

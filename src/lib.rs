@@ -21,6 +21,7 @@ pub mod metric;
 pub mod optics;
 pub mod pose;
 pub mod stats;
+pub mod supervisor;
 pub mod toml_file;
 pub mod ulog;
 
@@ -53,7 +54,6 @@ pub mod config;
     reason = "it lives in the present and hands the time down"
 )]
 pub mod daemon;
-#[allow(clippy::disallowed_methods, reason = "silence is measured in the hub's own time")]
 pub mod hub;
 #[allow(
     clippy::disallowed_methods,

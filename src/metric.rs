@@ -211,7 +211,7 @@ pub fn describe() {
     g!(SOURCE_CONNECTED, "1 while the camera is open, else 0.");
     c!(
         RECORDER_DROPPED,
-        "Frames and evidence not recorded because the disk could not keep up."
+        "Frames, evidence and messages to a hub not recorded because the disk could not keep up."
     );
     c!(
         RECORDER_ERRORS,

@@ -48,14 +48,14 @@ mod websocket;
 mod zones;
 
 pub use config::{Config, ConfigError};
-pub use feed::Feed;
+pub use feed::{Feed, Published};
 pub use listener::{Listen, ListenError, Listener};
 pub use picture::frame_png;
 pub use pose_status::{PoseNow, PoseStatus};
 pub use server::{Error, Server};
 pub use snapshot::{
-    ClaimsStatus, FrameCounts, JournalStatus, Latency, Snapshot, SourceState, SourceStatus, StationState,
-    StationStatus, Status, ViewStatus,
+    ClaimsStatus, FrameCounts, JournalStatus, Latency, Snapshot, SourceState, SourceStatus, StationPlace, StationPose,
+    StationState, StationStatus, Status, ViewStatus,
 };
 pub use state::{Acknowledged, Command, State, ZonesRefused};
 pub use tokens::TokenError;

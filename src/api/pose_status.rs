@@ -1,13 +1,16 @@
 //! The pose as the outside sees it.
 
+use std::borrow::Cow;
+
 use jiff::Timestamp;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 /// The pose that the latest frame was looked at with.
-#[derive(Clone, Debug, Serialize, utoipa::ToSchema)]
+#[derive(Clone, Debug, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct PoseStatus {
     /// "fixed", "mavlink" or "replay".
-    pub source: &'static str,
+    #[schema(value_type = String)]
+    pub source: Cow<'static, str>,
     /// The frame's time.
     #[schema(value_type = String, format = DateTime)]
     pub time: Timestamp,
@@ -18,7 +21,7 @@ pub struct PoseStatus {
 }
 
 /// A pose, with its uncertainty.
-#[derive(Clone, Debug, Serialize, utoipa::ToSchema)]
+#[derive(Clone, Debug, Serialize, Deserialize, utoipa::ToSchema)]
 pub struct PoseNow {
     /// Seconds from the newest pose before the frame to the frame.
     pub age_s: f64,
@@ -27,12 +30,12 @@ pub struct PoseNow {
     pub y_m: f64,
     pub z_m: f64,
     /// Where an origin is configured.
-    #[serde(skip_serializing_if = "Option::is_none")]
+    #[serde(default, skip_serializing_if = "Option::is_none")]
     pub latitude_deg: Option<f64>,
-    #[serde(skip_serializing_if = "Option::is_none")]
+    #[serde(default, skip_serializing_if = "Option::is_none")]
     pub longitude_deg: Option<f64>,
     /// Above the datum of `[world] origin`.
-    #[serde(skip_serializing_if = "Option::is_none")]
+    #[serde(default, skip_serializing_if = "Option::is_none")]
     pub height_m: Option<f64>,
     /// Body (forward, right, down) to north, east, down: w, x, y, z.
     pub q: [f64; 4],

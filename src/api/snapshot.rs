@@ -98,9 +98,45 @@ pub struct StationStatus {
     pub field_of_view_m: Option<[f64; 2]>,
     /// Outline of what it sees of the ground, east and north, m, counter-clockwise.
     pub footprint_m: Vec<[f64; 2]>,
-    /// The station's own `GET /v1/status`.
+    /// Null for a platform without poses, which is level and over its own origin.
+    pub pose: Option<StationPose>,
+    /// The station's own `GET /v1/status`, without `view`.
     #[schema(value_type = Object)]
     pub status: serde_json::Value,
+}
+
+/// Where the platform of an access point is, by the newest pose that its station used.
+#[derive(Clone, Debug, Serialize, utoipa::ToSchema)]
+pub struct StationPose {
+    /// "mavlink" or "replay".
+    pub source: String,
+    /// Of the frame that was looked at with it.
+    #[schema(value_type = String, format = DateTime)]
+    pub time: Timestamp,
+    /// Whether the station misses its poses.
+    pub is_lost: bool,
+    /// Null as long as no pose has come.
+    pub place: Option<StationPlace>,
+}
+
+#[derive(Clone, Debug, Serialize, utoipa::ToSchema)]
+pub struct StationPlace {
+    /// From the pose to now, s: its age at the station, and the time since the hub heard of it.
+    pub age_s: f64,
+    /// The lens: east, north, up of the world's origin, m.
+    pub x_m: f64,
+    pub y_m: f64,
+    pub z_m: f64,
+    /// Where an origin is configured.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub latitude_deg: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub longitude_deg: Option<f64>,
+    /// Above the datum of `[world] origin`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub height_m: Option<f64>,
+    /// Clockwise from north, 0 to 360.
+    pub heading_deg: f64,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, utoipa::ToSchema)]

@@ -10,7 +10,7 @@ use crate::config::Config;
 use crate::notify::Endpoint;
 use crate::pipeline::Pipeline;
 use crate::scene::{Plan, Scene};
-use crate::{api, export, frames, notify, toml_file};
+use crate::{api, export, frames, hub, notify, toml_file};
 
 /// Keys of a scene that no config has.
 const OF_SCENES: [&str; 7] = [
@@ -139,16 +139,38 @@ fn scene(file: &Path) -> Result<Checked, Failure> {
 
 fn config(file: &Path) -> Result<Checked, Failure> {
     let config = Config::load(file).map_err(Failure::config)?;
-    let camera = config.camera().map_err(Failure::config)?;
-    let pipeline = Pipeline::new(&config, &camera).map_err(Failure::config)?;
-    frames::open(&config.source, &camera).map_err(Failure::config)?;
-    config.platform.telemetry().map_err(Failure::config)?;
     config.log.filter().map_err(Failure::config)?;
     config.journal.validate().map_err(Failure::config)?;
     api::Server::new(config.api.clone()).map_err(Failure::config)?;
     let mut receivers = notify::load(&config.webhook).map_err(Failure::config)?;
     let exports = export::load(&config.export, &receivers, &config.world).map_err(Failure::config)?;
     receivers.extend(exports.into_iter().map(|export| export.endpoint));
+    let is_hub = config.fleet.url.is_some() && config.fleet.station.is_none();
+    match is_hub {
+        true => hub_config(&config, receivers),
+        false => station_config(&config, receivers),
+    }
+}
+
+/// With a server and without a station's name it is for `oapwatch fleet`.
+fn hub_config(config: &Config, receivers: Vec<Endpoint>) -> Result<Checked, Failure> {
+    hub::validate(config).map_err(Failure::config)?;
+    let url = config.fleet.url.as_deref().unwrap_or_default();
+    let sites = config.fleet.site.as_deref().unwrap_or("all sites");
+    Ok(Checked {
+        sentence: format!("a config of a hub (oapwatch fleet); {sites}, over {url}"),
+        facts: json!({ "kind": "hub", "url": url, "site": config.fleet.site }),
+        warnings: Vec::new(),
+        receivers,
+    })
+}
+
+fn station_config(config: &Config, receivers: Vec<Endpoint>) -> Result<Checked, Failure> {
+    config.fleet.station().map_err(Failure::config)?;
+    let camera = config.camera().map_err(Failure::config)?;
+    let pipeline = Pipeline::new(config, &camera).map_err(Failure::config)?;
+    frames::open(&config.source, &camera).map_err(Failure::config)?;
+    config.platform.telemetry().map_err(Failure::config)?;
     let (pixels, source, estimator) = (
         [camera.x.n, camera.y.n],
         config.source.kind.name(),

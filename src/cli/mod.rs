@@ -14,6 +14,7 @@ mod golden;
 mod interrupt;
 mod locate;
 mod man;
+mod nkey;
 mod picture;
 mod progress;
 mod review;
@@ -50,6 +51,8 @@ enum Command {
     Run(run::Args),
     /// Run the hub of a fleet: alerts and positions of many access points, over NATS
     Fleet(fleet::Args),
+    /// Make a key for an access point or a hub, and print what the NATS server is to know of it
+    Nkey(nkey::Args),
     /// Find the emitters in a recording, one JSON object a frame on stdout
     Locate(locate::Args),
     /// Run the whole chain over a replay as fast as possible and print the alert events
@@ -100,6 +103,7 @@ pub fn main() -> ExitCode {
     let outcome = match cli.command {
         Command::Run(args) => run::run(args),
         Command::Fleet(args) => fleet::run(args),
+        Command::Nkey(args) => nkey::run(args),
         Command::Locate(args) => locate::run(args),
         Command::Review(args) => review::run(args),
         Command::Simulate(args) => simulate::run(args),

@@ -14,7 +14,6 @@ use super::posts::Posts;
 use super::publish::Outlet;
 use super::reload::Settings;
 use super::status::State;
-use super::supervisor::Supervisor;
 use crate::api::{ClaimsStatus, Command, FrameCounts, JournalStatus, Snapshot, SourceState, SourceStatus, Status};
 use crate::claims::{Claim, ClaimState, Inbox};
 use crate::frame::Frame;
@@ -26,6 +25,7 @@ use crate::monitor::{AlertEventKind, Report};
 use crate::notify;
 use crate::optics::Camera;
 use crate::pipeline::{Pipeline, Step};
+use crate::supervisor::Supervisor;
 
 /// Longest wait of a command while no frame comes.
 const PATIENCE: Duration = Duration::from_millis(50);

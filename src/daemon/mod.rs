@@ -10,7 +10,6 @@ mod process;
 mod publish;
 mod reload;
 mod status;
-mod supervisor;
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -31,13 +30,13 @@ use crate::optics::Camera;
 use crate::pipeline::Pipeline;
 use crate::platform::mavlink::Link;
 use crate::platform::{self, Telemetry};
+use crate::supervisor::Supervisor;
 use crate::{api, export, fleet, logging, metric, notify};
 use claims_log::ClaimsLog;
 use compute::Compute;
 use publish::Outlet;
 use reload::Reload;
 use status::State;
-use supervisor::Supervisor;
 
 /// Most requests that wait for the compute thread; further ones are answered 503.
 const COMMANDS: usize = 64;

@@ -26,7 +26,7 @@ impl Poses {
             axes,
             view: View::level(camera),
             latest: PoseStatus {
-                source,
+                source: source.into(),
                 time: Timestamp::UNIX_EPOCH,
                 is_lost: false,
                 pose: None,
@@ -70,7 +70,7 @@ impl Poses {
             }
         };
         self.latest = PoseStatus {
-            source: self.source,
+            source: self.source.into(),
             time,
             is_lost,
             pose,

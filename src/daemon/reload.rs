@@ -6,9 +6,9 @@ use anyhow::Result;
 use tokio::signal::unix::{SignalKind, signal};
 use tokio::sync::mpsc;
 
-use super::supervisor::Supervisor;
 use crate::config::Config;
 use crate::pipeline::Places;
+use crate::supervisor::Supervisor;
 use crate::{claims, export, logging, monitor, notify};
 
 /// What the compute thread takes while it runs.

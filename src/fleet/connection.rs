@@ -73,6 +73,8 @@ pub async fn connect(config: &Config, name: String, capacity: usize) -> Result<C
                 async_nats::Event::SlowConsumer(_) => {
                     counter!(metric::FLEET_MESSAGES, "topic" => "heard", "outcome" => "dropped").increment(1);
                 }
+                // Such as a subject that the server's config leaves to another station.
+                async_nats::Event::ServerError(error) => tracing::warn!(%error, "the NATS server refuses"),
                 other => tracing::debug!(%other, "NATS"),
             }
         });

@@ -3,6 +3,7 @@
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 
+use crate::api::PoseStatus;
 use crate::claim::Claim;
 use crate::journal::Recorded;
 use crate::monitor::{AlertEvent, StationName, TrackedPosition};
@@ -45,6 +46,18 @@ pub struct PositionsMessage {
     pub footprint_m: Vec<[f64; 2]>,
 }
 
+/// Of topic `pose`: what the camera's place and attitude were in the frame of the positions before it. Only of a platform that has
+/// poses: a fixed one is level, over its own origin.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub struct PoseMessage {
+    pub version: u32,
+    #[serde(flatten)]
+    pub name: StationName,
+    /// As `GET /v1/pose`.
+    #[serde(flatten)]
+    pub status: PoseStatus,
+}
+
 /// Of topic `health`: once a second.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct HealthMessage {
@@ -53,7 +66,7 @@ pub struct HealthMessage {
     pub name: StationName,
     /// The station's wall clock.
     pub time: Timestamp,
-    /// As `GET /v1/status`; null before the first frame.
+    /// As `GET /v1/status`, without what the other topics hold; null before the first frame.
     pub status: serde_json::Value,
     /// Alert events that wait for the server.
     pub alerts_waiting: u64,

@@ -12,12 +12,13 @@ use tokio::time::MissedTickBehavior;
 use super::claims::{self, Intake};
 use super::config::{Config, ConfigError};
 use super::connection::{self, Error};
-use super::message::{AlertMessage, HealthMessage, PositionsMessage, VERSION};
+use super::message::{AlertMessage, HealthMessage, PoseMessage, PositionsMessage, VERSION};
 use super::subject::{Subject, Topic};
-use crate::api::Feed;
+use crate::api::{Feed, Published};
 use crate::journal::{Attempt, Journal, Outcome, Subscription, Waiting};
 use crate::metric;
 use crate::monitor::StationName;
+use crate::platform::Kind as PlatformKind;
 
 /// The fleet's name in the journal's outbox.
 pub const ENDPOINT: &str = "fleet";
@@ -167,7 +168,7 @@ impl Station {
         stored.await.map(|_| ()).map_err(|e| e.to_string())
     }
 
-    /// The newest positions, at most `positions_hz` times a second.
+    /// The newest positions, at most `positions_hz` times a second, and with them the pose that they were found with.
     async fn positions(&self, client: &Client, feed: &Feed) {
         let mut head = feed.subscribe();
         let mut interval = tokio::time::interval(Duration::from_secs_f64(1.0 / self.config.positions_hz));
@@ -183,21 +184,38 @@ impl Station {
                 }
             };
             last_seq = latest.seq;
-            let report = &latest.snapshot.report;
-            let view = latest.snapshot.status.view.as_ref();
-            let message = PositionsMessage {
-                version: VERSION,
-                name: self.name.clone(),
-                time: report.time,
-                frame: report.frame,
-                emitters: report.emitters.clone(),
-                unseen: report.unseen.clone(),
-                claims: latest.claims_in_view().cloned().collect(),
-                field_of_view_m: latest.snapshot.status.field_of_view_m,
-                footprint_m: view.map(|view| view.footprint_m.clone()).unwrap_or_default(),
-            };
-            self.send(client, Topic::Positions, &message).await;
+            self.send(client, Topic::Positions, &self.positions_of(&latest)).await;
+            if let Some(pose) = self.pose_of(&latest) {
+                self.send(client, Topic::Pose, &pose).await;
+            }
         }
+    }
+
+    fn positions_of(&self, latest: &Published) -> PositionsMessage {
+        let report = &latest.snapshot.report;
+        let view = latest.snapshot.status.view.as_ref();
+        PositionsMessage {
+            version: VERSION,
+            name: self.name.clone(),
+            time: report.time,
+            frame: report.frame,
+            emitters: report.emitters.clone(),
+            unseen: report.unseen.clone(),
+            claims: latest.claims_in_view().cloned().collect(),
+            field_of_view_m: latest.snapshot.status.field_of_view_m,
+            footprint_m: view.map(|view| view.footprint_m.clone()).unwrap_or_default(),
+        }
+    }
+
+    /// Nothing of a fixed platform.
+    fn pose_of(&self, latest: &Published) -> Option<PoseMessage> {
+        let status = latest.snapshot.pose.as_ref();
+        let status = status.filter(|status| status.source != PlatformKind::Fixed.name())?;
+        Some(PoseMessage {
+            version: VERSION,
+            name: self.name.clone(),
+            status: status.clone(),
+        })
     }
 
     async fn health(&self, client: &Client, journal: &Journal, feed: &Feed) {
@@ -211,9 +229,12 @@ impl Station {
             let is_connected = client.connection_state() == State::Connected;
             gauge!(metric::FLEET_CONNECTED).set(f64::from(u8::from(is_connected)));
             gauge!(metric::FLEET_WAITING).set(alerts_waiting as f64);
-            let status = feed
-                .latest()
-                .map(|latest| serde_json::to_value(&latest.snapshot.status));
+            let status = feed.latest().map(|latest| {
+                let mut status = latest.snapshot.status.clone();
+                // The footprint comes with the positions, the place with the pose.
+                status.view = None;
+                serde_json::to_value(status)
+            });
             let message = HealthMessage {
                 version: VERSION,
                 name: self.name.clone(),

@@ -3,6 +3,7 @@
 use std::collections::{BTreeMap, HashMap, HashSet};
 
 use jiff::Timestamp;
+use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
 use crate::geo::Geodetic;
@@ -42,10 +43,17 @@ pub struct HubAlerts {
     withheld: HashSet<Member>,
 }
 
-#[derive(Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 struct Open {
     alert: Alert,
     members: Vec<Member>,
+}
+
+/// The list, in a recording.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub struct SavedAlerts {
+    open: Vec<Open>,
+    withheld: Vec<Member>,
 }
 
 impl HubAlerts {
@@ -53,19 +61,44 @@ impl HubAlerts {
     pub fn restore(&mut self, alerts: Vec<Alert>) {
         for alert in alerts {
             let members: Vec<Member> = serde_json::from_value(alert.evidence[REPORTED].clone()).unwrap_or_default();
-            for member in &members {
-                self.of_member.insert(member.clone(), alert.id.clone());
-            }
-            let cause = match (alert.kind, &alert.station, &alert.user) {
-                (AlertKind::StationLost, Some(name), _) => Some(OwnCause::StationLost(name.clone())),
-                (AlertKind::UserInTwoPlaces, _, Some(user)) => Some(OwnCause::UserInTwoPlaces(user.clone())),
-                _ => None,
-            };
-            if let Some(cause) = cause {
-                self.own.insert(cause, alert.id.clone());
-            }
-            self.open.insert(alert.id.clone(), Open { alert, members });
+            self.insert(Open { alert, members });
         }
+    }
+
+    fn insert(&mut self, open: Open) {
+        let Open { alert, members } = &open;
+        for member in members {
+            self.of_member.insert(member.clone(), alert.id.clone());
+        }
+        let cause = match (alert.kind, &alert.station, &alert.user) {
+            (AlertKind::StationLost, Some(name), _) => Some(OwnCause::StationLost(name.clone())),
+            (AlertKind::UserInTwoPlaces, _, Some(user)) => Some(OwnCause::UserInTwoPlaces(user.clone())),
+            _ => None,
+        };
+        if let Some(cause) = cause {
+            self.own.insert(cause, alert.id.clone());
+        }
+        self.open.insert(alert.id.clone(), open);
+    }
+
+    pub fn saved(&self) -> SavedAlerts {
+        let mut withheld: Vec<Member> = self.withheld.iter().cloned().collect();
+        withheld.sort();
+        SavedAlerts {
+            open: self.open.values().cloned().collect(),
+            withheld,
+        }
+    }
+
+    pub fn resume(saved: SavedAlerts) -> Self {
+        let mut alerts = Self {
+            withheld: saved.withheld.into_iter().collect(),
+            ..Self::default()
+        };
+        for open in saved.open {
+            alerts.insert(open);
+        }
+        alerts
     }
 
     /// Number of alerts that are not cleared, by kind.
@@ -222,19 +255,22 @@ impl HubAlerts {
         self.own.keys().cloned().collect()
     }
 
-    /// `None` for an alert that is not open; the event where it changes anything.
-    pub fn acknowledge(&mut self, id: &str, note: Acknowledgement) -> Option<(Alert, Option<AlertEvent>)> {
-        let open = self.open.get_mut(id)?;
-        let changed = open.alert.acknowledge(note);
-        let told = changed.then(|| event(AlertEventKind::Acknowledged, &open.alert));
-        Some((open.alert.clone(), told))
+    /// An alert that is open.
+    pub fn open(&self, id: &str) -> Option<&Alert> {
+        self.open.get(id).map(|open| &open.alert)
     }
 
-    pub fn withdraw(&mut self, id: &str, withdrawal: Withdrawal) -> Option<(Alert, Option<AlertEvent>)> {
-        let open = self.open.get_mut(id)?;
-        let changed = open.alert.withdraw(withdrawal);
-        let told = changed.then(|| event(AlertEventKind::Unacknowledged, &open.alert));
-        Some((open.alert.clone(), told))
+    /// The event, where it changes anything.
+    pub fn acknowledge(&mut self, id: &str, note: Acknowledgement) -> Option<AlertEvent> {
+        let alert = &mut self.open.get_mut(id)?.alert;
+        let changed = alert.acknowledge(note);
+        changed.then(|| event(AlertEventKind::Acknowledged, alert))
+    }
+
+    pub fn withdraw(&mut self, id: &str, withdrawal: Withdrawal) -> Option<AlertEvent> {
+        let alert = &mut self.open.get_mut(id)?.alert;
+        let changed = alert.withdraw(withdrawal);
+        changed.then(|| event(AlertEventKind::Unacknowledged, alert))
     }
 }
 

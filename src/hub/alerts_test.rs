@@ -94,7 +94,7 @@ fn what_was_acknowledged_at_the_hub_stays_so_when_the_station_updates_it() {
         note: None,
         withdrawn: None,
     };
-    assert!(alerts.acknowledge("harbour.a.1", note).unwrap().1.is_some());
+    assert!(alerts.acknowledge("harbour.a.1", note).is_some());
     let updated = alerts
         .take(&name("a"), stranger(AlertEventKind::Updated, "1", 0.0), NOBODY)
         .unwrap();

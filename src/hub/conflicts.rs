@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 
 use jiff::Timestamp;
+use serde::{Deserialize, Serialize};
 
 use super::stations::{Sighting, seconds};
 
@@ -13,14 +14,14 @@ const INTERRUPTED_S: f64 = 0.5;
 /// And is gone so long before it is cleared, s.
 const CLEARED_AFTER_S: f64 = 5.0;
 
-#[derive(Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 struct Conflict {
     since: Timestamp,
     last: Timestamp,
 }
 
 /// Users who were lately in two places.
-#[derive(Debug, Default)]
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct Conflicts {
     of_user: BTreeMap<String, Conflict>,
 }

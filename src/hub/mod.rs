@@ -1,13 +1,21 @@
 //! `oapwatch fleet`: the alerts and positions of many access points as one, with what only all of them together show.
 
 mod alerts;
+pub mod chain;
 mod conflicts;
 mod intake;
+mod picture;
+mod record;
+mod review;
+#[allow(clippy::disallowed_methods, reason = "silence is measured in the hub's own time")]
 mod run;
+mod snapshot;
 mod stations;
+mod stream;
 
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
+use std::time::Duration;
 
 use anyhow::{Context, Result};
 use jiff::Timestamp;
@@ -18,10 +26,18 @@ use tokio::sync::{mpsc, watch};
 use crate::config::Config;
 use crate::journal::Journal;
 use crate::{api, export, fleet, logging, metric, notify};
+pub use review::{ReviewError, review};
 use run::Run;
 
 /// Requests that wait for the hub; further ones are answered 503.
 const COMMANDS: usize = 64;
+
+/// Checks that a config is a hub's; its files are not opened.
+pub fn validate(config: &Config) -> Result<()> {
+    config.fleet.validate_hub()?;
+    config.journal.validate()?;
+    Ok(())
+}
 
 /// A hub whose config has been checked and whose files have been opened; no port is bound yet.
 pub struct Hub {
@@ -36,8 +52,7 @@ pub struct Hub {
 impl Hub {
     /// Checks and opens everything a config names.
     pub fn new(config: Config) -> Result<Self> {
-        config.fleet.validate_hub()?;
-        config.journal.validate()?;
+        validate(&config)?;
         let recorder = metric::recorder()?;
         let metrics = recorder.handle();
         // A second daemon in one process (a test) counts into the first one's recorder.
@@ -60,6 +75,7 @@ impl Hub {
     }
 
     /// Runs until SIGTERM or SIGINT.
+    #[allow(clippy::disallowed_methods, reason = "the hub's own time begins here")]
     pub async fn run(self, _logging: logging::Handle) -> Result<()> {
         let listen = &self.config.api.listen;
         let listener = api::Listener::bind(listen).with_context(|| format!("api.listen: cannot listen on {listen}"))?;
@@ -104,6 +120,7 @@ impl Hub {
         let run = Run::new(&self.config, self.journal.clone(), feed, notifier, ready, started_at)?;
         let mut working = tokio::spawn(run.run(client, orders, stops()));
         let mut serving = tokio::spawn(self.server.serve(listener, state, stops()));
+        let upkeep = tokio::spawn(maintain(self.journal.clone(), self.metrics.clone()));
         let mut terminate = signal(SignalKind::terminate())?;
         let mut interrupt = signal(SignalKind::interrupt())?;
         let outcome = tokio::select! {
@@ -116,6 +133,7 @@ impl Hub {
             },
         };
         stop.send_replace(true);
+        upkeep.abort();
         if !working.is_finished() {
             working.await?;
         }
@@ -130,5 +148,22 @@ impl Hub {
     }
 }
 
+/// Interval of journal maintenance (age and size limits).
+const MAINTENANCE: Duration = Duration::from_secs(3600);
+/// Interval of aggregating histogram samples: until then each sample is kept, also where no server asks for the metrics.
+const UPKEEP: Duration = Duration::from_secs(5);
+
+#[allow(clippy::disallowed_methods, reason = "the journal's limits are of age")]
+async fn maintain(journal: Journal, metrics: PrometheusHandle) {
+    let mut maintenance = tokio::time::interval(MAINTENANCE);
+    let mut upkeep = tokio::time::interval(UPKEEP);
+    loop {
+        tokio::select! {
+            _ = maintenance.tick() => journal.maintain(Timestamp::now()),
+            _ = upkeep.tick() => metrics.run_upkeep(),
+        }
+    }
+}
+
 /// Time that deliveries under way have when the hub stops.
-const LAST_DELIVERIES: std::time::Duration = std::time::Duration::from_millis(800);
+const LAST_DELIVERIES: Duration = Duration::from_millis(800);

@@ -1,66 +1,47 @@
-//! The hub's loop: takes what stations publish, and publishes alerts and positions of all.
+//! The hub's loop: gives the chain what stations publish and the time, and publishes alerts and positions of all.
 
-use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use async_nats::jetstream::consumer::{AckPolicy, DeliverPolicy, pull};
-use async_nats::{Client, Subscriber, jetstream};
+use async_nats::{Client, Message, jetstream};
 use futures_util::StreamExt;
 use jiff::Timestamp;
-use serde_json::json;
-use tokio::sync::mpsc;
+use tokio::sync::{mpsc, oneshot};
 use tokio::time::MissedTickBehavior;
 
-use super::alerts::{Finding, HubAlerts, OwnCause};
-use super::conflicts::Conflicts;
+use super::chain::{Chain, Heard, Settings, Taken};
 use super::intake;
-use super::stations::Stations;
-use crate::api::{
-    Acknowledged, ClaimsStatus, Command, Feed, FrameCounts, JournalStatus, Latency, Snapshot, SourceState,
-    SourceStatus, Status, ZonesRefused,
-};
+use super::record::Recorder;
+use super::snapshot;
+use super::stream::{BATCH, consume, subscribe};
+use crate::api::{Acknowledged, Command, Feed, ZonesRefused};
 use crate::config::Config;
-use crate::fleet::message::{AlertMessage, HealthMessage, PositionsMessage};
-use crate::fleet::{Subject, Topic, ensure_stream};
-use crate::journal::{Journal, Origin};
+use crate::fleet::Topic;
+use crate::fleet::message::{HealthMessage, PositionsMessage};
+use crate::journal::Journal;
 use crate::monitor::zones::ZoneMap;
-use crate::monitor::{Acknowledgement, AlertEvent, LightError, MaintenanceError, Report, Withdrawal};
+use crate::monitor::{Acknowledgement, LightError, MaintenanceError, Withdrawal};
 use crate::notify::Notifier;
 use crate::optics::Camera;
+use crate::supervisor::Supervisor;
 
 /// Interval of the pictures and of what is judged over all stations.
 const TICK: Duration = Duration::from_millis(100);
-/// Alert events taken at once; they are confirmed to the server when all of them are on disk.
-const BATCH: usize = 256;
-/// The server delivers an event again that is not confirmed within this time.
-const ACK_WAIT: Duration = Duration::from_secs(30);
-/// Wait before the stream is asked for again.
-const RETRY: Duration = Duration::from_secs(1);
 /// Longest time that a hanging disk delays the publication of an event.
 const JOURNAL_TIMEOUT: Duration = Duration::from_secs(2);
-/// Name of the hub's place in the stream.
-const CONSUMER: &str = "hub";
-
-/// An event that is to be recorded, with its place in its station's journal.
-type Taken = (AlertEvent, Timestamp, Option<Origin>);
 
 pub struct Run {
     site: Option<String>,
-    lost_after_s: f64,
-    tolerated_m: f64,
     journal: Journal,
     feed: Arc<Feed>,
     notifier: Notifier,
     ready: Arc<AtomicBool>,
     started_at: Timestamp,
     camera: Arc<Camera>,
-    alerts: HubAlerts,
-    conflicts: Conflicts,
-    stations: Stations,
-    /// The last event taken from each station's journal.
-    taken: BTreeMap<String, u64>,
+    chain: Chain,
+    recorder: Option<Recorder>,
+    supervisor: Supervisor,
 }
 
 impl Run {
@@ -72,31 +53,18 @@ impl Run {
         ready: Arc<AtomicBool>,
         started_at: Timestamp,
     ) -> anyhow::Result<Self> {
-        let mut alerts = HubAlerts::default();
-        alerts.restore(journal.open_alerts()?);
-        let mut conflicts = Conflicts::default();
-        let mut stations = Stations::default();
-        for cause in alerts.own_causes() {
-            match cause {
-                OwnCause::UserInTwoPlaces(user) => conflicts.restore(std::iter::once(user), started_at),
-                // It is lost until it says something.
-                OwnCause::StationLost(name) => drop(stations.take_sign(&name, Timestamp::UNIX_EPOCH)),
-            }
-        }
+        let (open, taken) = (journal.open_alerts()?, journal.origins()?);
         Ok(Self {
             site: config.fleet.site.clone(),
-            lost_after_s: config.fleet.lost_after_s,
-            tolerated_m: config.monitor.tolerated_distance_m,
-            taken: journal.origins()?,
             journal,
             feed,
             notifier,
             ready,
             started_at,
             camera: Arc::new(config.optics.camera()?),
-            alerts,
-            conflicts,
-            stations,
+            chain: Chain::new(Settings::new(config), open, taken, started_at),
+            recorder: Recorder::start(&config.record)?,
+            supervisor: Supervisor::default(),
         })
     }
 
@@ -110,7 +78,11 @@ impl Run {
         let (sender, mut alerts) = mpsc::channel(BATCH);
         let consumer = tokio::spawn(consume(client.clone(), self.site.clone(), sender));
         let subscribe = |topic| subscribe(&client, self.site.as_deref(), topic);
-        let (mut positions, mut health) = (subscribe(Topic::Positions).await, subscribe(Topic::Health).await);
+        let (mut positions, mut poses, mut health) = (
+            subscribe(Topic::Positions).await,
+            subscribe(Topic::Pose).await,
+            subscribe(Topic::Health).await,
+        );
         let mut tick = tokio::time::interval(TICK);
         tick.set_missed_tick_behavior(MissedTickBehavior::Delay);
         let mut shutdown = std::pin::pin!(shutdown);
@@ -127,37 +99,57 @@ impl Run {
                 }
                 Some(command) = commands.recv() => self.obey(command).await,
                 _ = tick.tick() => self.tick().await,
-                Some(message) = health.next() => {
-                    if let Some(read) = intake::read::<HealthMessage>(&message, Topic::Health)
-                        && let Err(refused) = self.stations.take_health(read, Timestamp::now())
-                    {
-                        intake::count(Topic::Health, refused.name());
-                    }
-                }
+                Some(message) = health.next() => self.take_message::<HealthMessage>(&message, Topic::Health, Heard::Health),
+                Some(message) = poses.next() => self.take_message(&message, Topic::Pose, Heard::Pose),
                 Some(message) = positions.next() => {
-                    if let Some(read) = intake::read::<PositionsMessage>(&message, Topic::Positions)
-                        && let Err(refused) = self.stations.take_positions(read, Timestamp::now())
-                    {
-                        intake::count(Topic::Positions, refused.name());
-                    }
+                    self.take_message::<PositionsMessage>(&message, Topic::Positions, Heard::Positions);
                 }
             }
         }
+        self.supervisor.stopping();
         consumer.abort();
         self.journal.settled().await;
+    }
+
+    /// Gives the chain what was heard, and the recording first.
+    fn take(&mut self, heard: Heard, now: Timestamp) -> Vec<Taken> {
+        if let Some(recorder) = &mut self.recorder {
+            recorder.heard(now, &heard, &self.chain);
+        }
+        let topic = heard.topic();
+        let outcome = self.chain.take(heard, now);
+        if let Some((topic, refused)) = topic.zip(outcome.refused) {
+            intake::count(topic, refused.name());
+        }
+        outcome.taken
+    }
+
+    /// Takes a message that raises nothing by itself.
+    fn take_message<T: serde::de::DeserializeOwned>(
+        &mut self,
+        message: &Message,
+        topic: Topic,
+        heard: impl Fn(T) -> Heard,
+    ) {
+        if let Some(read) = intake::read(message, topic) {
+            self.take(heard(read), Timestamp::now());
+        }
     }
 
     async fn take_alerts(&mut self, messages: Vec<jetstream::Message>) {
         let now = Timestamp::now();
         let mut taken = Vec::new();
         for message in &messages {
-            if let Some(read) = intake::read::<AlertMessage>(message, Topic::Alert) {
-                taken.extend(self.take_alert(read, now));
+            if let Some(read) = intake::read(message, Topic::Alert) {
+                taken.extend(self.take(Heard::Alert(read), now));
             }
         }
         if !self.record(taken).await {
             // They are not confirmed, so they come again; what is on disk says from where.
-            self.taken = self.journal.origins().unwrap_or_default();
+            self.chain.take_again_from(self.journal.origins().unwrap_or_default());
+            if let Some(recorder) = &mut self.recorder {
+                recorder.interrupt();
+            }
             return;
         }
         for message in messages {
@@ -167,26 +159,6 @@ impl Run {
         }
     }
 
-    fn take_alert(&mut self, message: AlertMessage, now: Timestamp) -> Option<Taken> {
-        let source = format!("{}/{}", message.name, message.journal);
-        if self.taken.get(&source).is_some_and(|&last| message.seq <= last) {
-            intake::count(Topic::Alert, "repeated");
-            return None;
-        }
-        self.taken.insert(source.clone(), message.seq);
-        if let Err(refused) = self.stations.take_sign(&message.name, now) {
-            intake::count(Topic::Alert, refused.name());
-        }
-        let (stations, name) = (&self.stations, &message.name);
-        let is_seen_elsewhere = |user: &str| stations.is_seen_elsewhere(user, name, now);
-        let event = self.alerts.take(name, message.event, is_seen_elsewhere)?;
-        let origin = Origin {
-            source: source.into(),
-            seq: message.seq,
-        };
-        Some((event, message.at, Some(origin)))
-    }
-
     /// Events to the journal, then to readers. Whether the journal took them.
     async fn record(&self, taken: Vec<Taken>) -> bool {
         if taken.is_empty() {
@@ -194,7 +166,7 @@ impl Run {
         }
         let mut numbered = Vec::with_capacity(taken.len());
         let mut origins = Vec::with_capacity(taken.len());
-        for (event, at, origin) in taken {
+        for Taken { event, at, origin } in taken {
             numbered.extend(self.feed.number(vec![event], at));
             origins.push(origin);
         }
@@ -216,141 +188,63 @@ impl Run {
 
     async fn tick(&mut self) {
         let now = Timestamp::now();
-        let mut events: Vec<Option<AlertEvent>> = Vec::new();
-        let uptime = super::stations::seconds(self.started_at, now);
-        for (name, is_lost, last_seen) in self.stations.lost(now, self.lost_after_s) {
-            let cause = OwnCause::StationLost(name.clone());
-            // Just started, the hub has not had the time to hear of anybody.
-            if is_lost && uptime > self.lost_after_s {
-                let evidence = json!({ "last_seen_at": last_seen, "lost_after_s": self.lost_after_s });
-                let finding = Finding {
-                    evidence,
-                    ..Finding::default()
-                };
-                events.push(self.alerts.raise(cause, finding, now));
-            } else if !is_lost {
-                events.push(self.alerts.clear(&cause, now));
-            }
-        }
-        let found = self.stations.conflicts(now, self.tolerated_m);
-        let (standing, over) = self.conflicts.step(found, now);
-        for (user, [a, b]) in standing {
-            let place = |s: &super::stations::Sighting| {
-                json!({ "site": s.name.site, "station": s.name.station, "x_m": s.x_m, "y_m": s.y_m,
-                        "by": if s.is_seen { "beam" } else { "claim" } })
-            };
-            let seen = if a.is_seen { &a } else { &b };
-            let finding = Finding {
-                place_m: Some([seen.x_m, seen.y_m, seen.z_m]),
-                geodetic: seen.geodetic,
-                evidence: json!({ "places": [place(&a), place(&b)], "distance_m": (a.x_m - b.x_m).hypot(a.y_m - b.y_m) }),
-            };
-            events.push(self.alerts.raise(OwnCause::UserInTwoPlaces(user), finding, now));
-        }
-        for user in over {
-            events.push(self.alerts.clear(&OwnCause::UserInTwoPlaces(user), now));
-        }
-        let taken = events.into_iter().flatten().map(|event| (event, now, None));
-        self.record(taken.collect()).await;
-        self.publish(now);
-    }
-
-    /// The picture of all stations, as one station's would be.
-    fn publish(&mut self, now: Timestamp) {
-        let picture = self.stations.picture(now, self.tolerated_m);
-        let stations = self.stations.statuses(now, self.lost_after_s);
-        let health = self.journal.health();
-        let furthest = picture
-            .emitters
-            .iter()
-            .fold([1.0f64; 2], |[x, y], e| [x.max(e.x_m.abs()), y.max(e.y_m.abs())]);
-        let views = stations.iter().filter_map(|s| s.field_of_view_m);
-        let field_of_view_m = views.fold(furthest, |[x, y], [a, b]| [x.max(a), y.max(b)]);
-        let is_running = !stations.is_empty();
-        let snapshot = Snapshot {
-            frame: None,
+        let taken = self.take(Heard::Tick, now);
+        self.record(taken).await;
+        let facts = snapshot::Facts {
+            started_at: self.started_at,
+            rate_hz: 1.0 / TICK.as_secs_f64(),
             camera: self.camera.clone(),
-            pose: None,
-            status: Status {
-                version: env!("CARGO_PKG_VERSION"),
-                started_at: self.started_at,
-                source: SourceStatus {
-                    kind: "fleet".to_owned(),
-                    state: if is_running {
-                        SourceState::Running
-                    } else {
-                        SourceState::Starting
-                    },
-                    rate_hz: 1.0 / TICK.as_secs_f64(),
-                    last_good_frame_at: is_running.then_some(picture.time),
-                    fault: None,
-                },
-                frames: FrameCounts::default(),
-                latency: Latency::default(),
-                claims: ClaimsStatus {
-                    users: picture.claims.len() as u64,
-                    ..ClaimsStatus::default()
-                },
-                journal: JournalStatus {
-                    healthy: health.writable,
-                    place: health
-                        .path
-                        .as_ref()
-                        .map_or("memory".to_owned(), |p| p.display().to_string()),
-                    fault: if health.writable { None } else { health.last_error },
-                },
-                webhooks: self.notifier.status(),
-                estimator: "fleet".to_owned(),
-                alerts_open: self.alerts.open_by_kind(),
-                field_of_view_m,
-                view: None,
-                stations,
-            },
-            report: Report {
-                time: now,
-                frame: picture.frame,
-                emitters: picture.emitters,
-                unseen: picture.unseen,
-                events: Vec::new(),
-                claims: picture.claims,
-            },
+            journal: self.journal.health(),
+            webhooks: self.notifier.status(),
         };
+        let snapshot = snapshot::of(&mut self.chain, facts, now);
+        let stations = snapshot.status.stations.len();
         self.feed.publish(snapshot);
         self.ready.store(true, Ordering::Relaxed);
+        self.supervisor.alive(&format!("{stations} access points"));
     }
 
     async fn obey(&mut self, command: Command) {
         let now = Timestamp::now();
-        let withdrawn = None;
-        let (outcome, reply) = match command {
+        match command {
             Command::Claims { claims, reply } => {
                 let reason = "a hub takes no claims: send them to the access points".to_owned();
                 let refused = (0..claims.len()).map(|k| (k, reason.clone())).collect();
                 // A client that has gone away needs no answer.
                 let _ = reply.send(refused);
-                return;
             }
             Command::Acknowledge { id, by, note, reply } => {
                 let note = Acknowledgement {
                     at: now,
                     by,
                     note,
-                    withdrawn,
+                    withdrawn: None,
                 };
-                (self.alerts.acknowledge(&id, note).ok_or(id), reply)
+                let heard = Heard::Acknowledge { id: id.clone(), note };
+                self.change(id, heard, now, reply).await;
             }
             Command::Unacknowledge { id, by, reply } => {
-                (self.alerts.withdraw(&id, Withdrawal { at: now, by }).ok_or(id), reply)
+                let withdrawal = Withdrawal { at: now, by };
+                let heard = Heard::Withdraw {
+                    id: id.clone(),
+                    withdrawal,
+                };
+                self.change(id, heard, now, reply).await;
             }
-            other => return refuse_places(other),
-        };
-        let answer = match outcome {
-            Ok((alert, event)) => {
-                self.record(event.map(|event| (event, now, None)).into_iter().collect())
-                    .await;
-                Acknowledged::Done(Box::new(alert))
-            }
-            Err(id) => {
+            other => refuse_places(other),
+        }
+    }
+
+    /// What an operator does to one alert.
+    async fn change(&mut self, id: String, heard: Heard, now: Timestamp, reply: oneshot::Sender<Acknowledged>) {
+        let is_open = self.chain.alert(&id).is_some();
+        if is_open {
+            let taken = self.take(heard, now);
+            self.record(taken).await;
+        }
+        let answer = match self.chain.alert(&id) {
+            Some(alert) => Acknowledged::Done(Box::new(alert.clone())),
+            None => {
                 let journal = self.journal.clone();
                 let known = tokio::task::spawn_blocking(move || journal.alert(&id)).await;
                 match known {
@@ -361,66 +255,6 @@ impl Run {
         };
         let _ = reply.send(answer);
     }
-}
-
-/// The link may be down: the subscription stands once it is up.
-async fn subscribe(client: &Client, site: Option<&str>, topic: Topic) -> Subscriber {
-    loop {
-        match client.subscribe(Subject::of_all(site, topic)).await {
-            Ok(subscriber) => return subscriber,
-            Err(error) => tracing::warn!(%error, "the fleet's messages cannot be subscribed to"),
-        }
-        tokio::time::sleep(RETRY).await;
-    }
-}
-
-/// Reads the stream of alerts from where an earlier run ended, for ever.
-async fn consume(client: Client, site: Option<String>, alerts: mpsc::Sender<jetstream::Message>) {
-    let context = jetstream::new(client);
-    let name = site
-        .as_ref()
-        .map_or(CONSUMER.to_owned(), |site| format!("{CONSUMER}-{site}"));
-    let mut is_told = false;
-    loop {
-        match stream(&context, &name, site.as_deref(), &alerts).await {
-            Ok(()) => return,
-            Err(error) if !std::mem::replace(&mut is_told, true) => {
-                tracing::warn!(error, "the stream of alerts cannot be read; it is tried again");
-            }
-            Err(error) => tracing::debug!(error, "the stream of alerts cannot be read"),
-        }
-        tokio::time::sleep(RETRY).await;
-    }
-}
-
-async fn stream(
-    context: &jetstream::Context,
-    name: &str,
-    site: Option<&str>,
-    alerts: &mpsc::Sender<jetstream::Message>,
-) -> Result<(), String> {
-    let stream = ensure_stream(context).await.map_err(|e| e.to_string())?;
-    let config = pull::Config {
-        durable_name: Some(name.to_owned()),
-        deliver_policy: DeliverPolicy::All,
-        ack_policy: AckPolicy::Explicit,
-        ack_wait: ACK_WAIT,
-        max_ack_pending: BATCH as i64,
-        filter_subject: Subject::of_all(site, Topic::Alert),
-        ..pull::Config::default()
-    };
-    let consumer = stream
-        .get_or_create_consumer(name, config)
-        .await
-        .map_err(|e| e.to_string())?;
-    let mut messages = consumer.messages().await.map_err(|e| e.to_string())?;
-    while let Some(message) = messages.next().await {
-        let message = message.map_err(|e| e.to_string())?;
-        if alerts.send(message).await.is_err() {
-            return Ok(());
-        }
-    }
-    Err("the server ended it".to_owned())
 }
 
 /// Zones, known lights and maintenance are the access points' own.

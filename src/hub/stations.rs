@@ -4,13 +4,15 @@ use std::collections::{BTreeMap, HashMap};
 
 use jiff::Timestamp;
 use nalgebra::{Matrix2, Vector2};
+use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
-use crate::api::{StationState, StationStatus};
+use super::picture::{self, DIFFERENCE_SIGMAS, Picture, Tracks, cov};
+use crate::api::{StationPlace, StationPose, StationState, StationStatus};
 use crate::claim::{Claim, ClaimState};
-use crate::fleet::message::{HealthMessage, PositionsMessage};
-use crate::geo::{Geodetic, LocalAxes};
-use crate::monitor::{PositionStatus, StationName, TrackedPosition};
+use crate::fleet::message::{HealthMessage, PoseMessage, PositionsMessage};
+use crate::geo::Geodetic;
+use crate::monitor::{StationName, TrackedPosition};
 
 /// Stations known at once. Each costs some 50 kB with its positions and status.
 const MOST_STATIONS: usize = 4096;
@@ -18,9 +20,6 @@ const MOST_STATIONS: usize = 4096;
 const FRESH_S: f64 = 2.0;
 /// A station whose frames are dated further from the hub's clock than this is shown, and not compared with others, s.
 const LARGEST_LAG_S: f64 = 5.0;
-/// Standard deviations by which two sightings of one user must differ beyond what is tolerated. At 4, independent errors reach it
-/// once in 3,000 comparisons on a plane; a conflict has to last for [`super::conflicts`] besides.
-const DIFFERENCE_SIGMAS: f64 = 4.0;
 /// Fastest user, m/s: how far one may have come between two frames of different times.
 const FASTEST_M_S: f64 = 40.0;
 
@@ -31,6 +30,8 @@ pub enum Refused {
     TooMany,
     /// Older than what is known.
     Late,
+    /// An alert event that was taken before.
+    Repeated,
 }
 
 impl Refused {
@@ -38,6 +39,7 @@ impl Refused {
         match self {
             Self::TooMany => "too_many_stations",
             Self::Late => "late",
+            Self::Repeated => "repeated",
         }
     }
 }
@@ -46,7 +48,18 @@ impl Refused {
 struct Station {
     last_seen: Timestamp,
     positions: Option<(Timestamp, PositionsMessage)>,
+    pose: Option<(Timestamp, PoseMessage)>,
     health: Option<HealthMessage>,
+}
+
+/// What alerts depend on of a station, in a recording.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub struct SavedStation {
+    #[serde(flatten)]
+    name: StationName,
+    last_seen: Timestamp,
+    /// With the time of their arrival.
+    positions: Option<(Timestamp, PositionsMessage)>,
 }
 
 #[derive(Debug, Default)]
@@ -77,6 +90,7 @@ impl Stations {
         let station = self.known.entry(name.clone()).or_insert_with(|| Station {
             last_seen: now,
             positions: None,
+            pose: None,
             health: None,
         });
         station.last_seen = now;
@@ -95,6 +109,18 @@ impl Stations {
         Ok(())
     }
 
+    pub fn take_pose(&mut self, message: PoseMessage, now: Timestamp) -> Result<(), Refused> {
+        let station = self.station(&message.name, now)?;
+        let is_late = |(at, known): &(Timestamp, PoseMessage)| {
+            message.status.time < known.status.time && seconds(*at, now) < FRESH_S
+        };
+        if station.pose.as_ref().is_some_and(is_late) {
+            return Err(Refused::Late);
+        }
+        station.pose = Some((now, message));
+        Ok(())
+    }
+
     pub fn take_health(&mut self, message: HealthMessage, now: Timestamp) -> Result<(), Refused> {
         let station = self.station(&message.name, now)?;
         station.health = Some(message);
@@ -104,6 +130,31 @@ impl Stations {
     /// A station that is known from its alerts is missed from then on.
     pub fn take_sign(&mut self, name: &StationName, now: Timestamp) -> Result<(), Refused> {
         self.station(name, now).map(|_| ())
+    }
+
+    pub fn saved(&self) -> Vec<SavedStation> {
+        let saved = |(name, station): (&StationName, &Station)| SavedStation {
+            name: name.clone(),
+            last_seen: station.last_seen,
+            positions: station.positions.clone(),
+        };
+        self.known.iter().map(saved).collect()
+    }
+
+    pub fn resume(saved: Vec<SavedStation>) -> Self {
+        let known = |saved: SavedStation| {
+            let station = Station {
+                last_seen: saved.last_seen,
+                positions: saved.positions,
+                pose: None,
+                health: None,
+            };
+            (saved.name, station)
+        };
+        Self {
+            known: saved.into_iter().map(known).collect(),
+            tracks: Tracks::default(),
+        }
     }
 
     /// Stations without a message for `lost_after_s`, and the others.
@@ -164,40 +215,12 @@ impl Stations {
         conflicts
     }
 
-    /// All beams as one picture: a user whom several stations see at one place is one beam, fused; the numbers of the tracks are the
-    /// hub's own and stay with a user from one station to the next.
+    /// All beams as one picture.
     pub fn picture(&mut self, now: Timestamp, tolerated_m: f64) -> Picture {
-        let mut picture = Picture::default();
-        let mut beams: Vec<(TrackedPosition, StationName)> = Vec::new();
-        let known = &self.known;
-        let fresh = known.values().filter_map(|s| s.positions.as_ref());
-        for (_, message) in fresh.filter(|(at, _)| seconds(*at, now) < FRESH_S) {
-            picture.time = picture.time.max(message.time);
-            picture.frame = picture.frame.max(message.frame);
-            picture.claims.extend(message.claims.iter().cloned());
-            for emitter in &message.emitters {
-                let mut beam = emitter.clone();
-                beam.track = self.tracks.number(&message.name, emitter);
-                let same = beams.iter_mut().find(|(other, _)| {
-                    beam.user.is_some() && other.user == beam.user && is_near(other, &beam, tolerated_m)
-                });
-                match same {
-                    Some((other, _)) => fuse(other, &beam, &message.name),
-                    None => {
-                        beam.station = Some(message.name.clone());
-                        beams.push((beam, message.name.clone()));
-                    }
-                }
-            }
-            picture.unseen.extend(message.unseen.iter().cloned());
-        }
-        self.tracks.forget_unused();
-        picture.unseen.sort();
-        picture.unseen.dedup();
-        let is_seen = |user: &String| beams.iter().any(|(b, _)| b.user.as_deref() == Some(user));
-        picture.unseen.retain(|user| !is_seen(user));
-        picture.emitters = beams.into_iter().map(|(beam, _)| beam).collect();
-        picture
+        let Self { known, tracks } = self;
+        let arrived = known.values().filter_map(|s| s.positions.as_ref());
+        let fresh = arrived.filter(|(at, _)| seconds(*at, now) < FRESH_S);
+        picture::draw(fresh.map(|(_, message)| message), tracks, tolerated_m)
     }
 
     pub fn statuses(&self, now: Timestamp, lost_after_s: f64) -> Vec<StationStatus> {
@@ -224,10 +247,31 @@ impl Stations {
                 emitters: positions.map_or(0, |p| p.emitters.len()),
                 field_of_view_m: positions.map(|p| p.field_of_view_m),
                 footprint_m: positions.map(footprint).unwrap_or_default(),
+                pose: station.pose.as_ref().map(|(at, message)| pose_at(message, *at, now)),
                 status,
             }
         };
         self.known.iter().map(status).collect()
+    }
+}
+
+/// Where a platform is, by what its station said of it at `at`.
+fn pose_at(message: &PoseMessage, at: Timestamp, now: Timestamp) -> StationPose {
+    let status = &message.status;
+    StationPose {
+        source: status.source.to_string(),
+        time: status.time,
+        is_lost: status.is_lost,
+        place: status.pose.as_ref().map(|pose| StationPlace {
+            age_s: pose.age_s + seconds(at, now).max(0.0),
+            x_m: pose.x_m,
+            y_m: pose.y_m,
+            z_m: pose.z_m,
+            latitude_deg: pose.latitude_deg,
+            longitude_deg: pose.longitude_deg,
+            height_m: pose.height_m,
+            heading_deg: pose.heading_deg,
+        }),
     }
 }
 
@@ -238,16 +282,6 @@ fn footprint(message: &PositionsMessage) -> Vec<[f64; 2]> {
     let points = &message.footprint_m;
     let is_outline = points.len() <= MOST && points.iter().flatten().all(|v| v.is_finite());
     if is_outline { points.clone() } else { Vec::new() }
-}
-
-/// All fresh positions together.
-#[derive(Debug, Default)]
-pub struct Picture {
-    pub time: Timestamp,
-    pub frame: u64,
-    pub emitters: Vec<TrackedPosition>,
-    pub unseen: Vec<String>,
-    pub claims: Vec<Claim>,
 }
 
 struct Place {
@@ -300,73 +334,6 @@ impl Place {
         let sigma = (self.cov + other.cov).trace().max(0.0).sqrt();
         let gone = FASTEST_M_S * seconds(self.time, other.time).abs();
         self.name != other.name && (self.at - other.at).norm() > tolerated_m + DIFFERENCE_SIGMAS * sigma + gone
-    }
-}
-
-fn cov(emitter: &TrackedPosition) -> Matrix2<f64> {
-    let [[a, b], [c, d]] = emitter.cov_m2;
-    Matrix2::new(a, b, c, d)
-}
-
-fn is_near(a: &TrackedPosition, b: &TrackedPosition, tolerated_m: f64) -> bool {
-    let sigma = (cov(a) + cov(b)).trace().max(0.0).sqrt();
-    (a.x_m - b.x_m).hypot(a.y_m - b.y_m) <= tolerated_m + DIFFERENCE_SIGMAS * sigma
-}
-
-/// Combines two sightings whose errors are independent (each has its own platform) in information form; the one with less
-/// uncertainty names the station.
-fn fuse(into: &mut TrackedPosition, other: &TrackedPosition, name: &StationName) {
-    let (Some(a), Some(b)) = (cov(into).try_inverse(), cov(other).try_inverse()) else {
-        return;
-    };
-    let Some(fused) = (a + b).try_inverse() else { return };
-    let at = fused * (a * Vector2::new(into.x_m, into.y_m) + b * Vector2::new(other.x_m, other.y_m));
-    if cov(other).trace() < cov(into).trace() {
-        into.station = Some(name.clone());
-        into.energy_j = other.energy_j;
-    }
-    if into.status != PositionStatus::Verified {
-        into.status = other.status;
-    }
-    into.track = into.track.min(other.track);
-    let shift = [at.x - into.x_m, at.y - into.y_m, 0.0];
-    into.geodetic = into.geodetic.map(|here| LocalAxes::at(here).to_geodetic(shift));
-    (into.x_m, into.y_m) = (at.x, at.y);
-    into.cov_m2 = [[fused[(0, 0)], fused[(0, 1)]], [fused[(1, 0)], fused[(1, 1)]]];
-}
-
-/// The hub's own track numbers.
-#[derive(Debug, Default)]
-struct Tracks {
-    last: u64,
-    of_station: HashMap<(StationName, u64), (u64, bool)>,
-    of_user: HashMap<String, u64>,
-}
-
-/// Users whose number is kept after they are gone from every view.
-const USERS_KEPT: usize = 100_000;
-
-impl Tracks {
-    fn number(&mut self, name: &StationName, emitter: &TrackedPosition) -> u64 {
-        let key = (name.clone(), emitter.track);
-        let of_user = emitter.user.as_ref().and_then(|user| self.of_user.get(user).copied());
-        let known = of_user.or_else(|| self.of_station.get(&key).map(|(number, _)| *number));
-        let number = known.unwrap_or_else(|| {
-            self.last += 1;
-            self.last
-        });
-        if let Some(user) = &emitter.user {
-            if self.of_user.len() >= USERS_KEPT {
-                self.of_user.clear();
-            }
-            self.of_user.insert(user.clone(), number);
-        }
-        self.of_station.insert(key, (number, true));
-        number
-    }
-
-    fn forget_unused(&mut self) {
-        self.of_station.retain(|_, (_, is_used)| std::mem::take(is_used));
     }
 }
 

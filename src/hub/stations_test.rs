@@ -3,6 +3,7 @@
 use serde_json::json;
 
 use super::*;
+use crate::geo::LocalAxes;
 
 fn at(s: i64) -> Timestamp {
     Timestamp::from_second(1_000_000 + s).unwrap()

@@ -365,7 +365,7 @@ pub fn snapshot(number: u64) -> api::Snapshot {
         report,
         frame: Some(Arc::new(frame)),
         pose: Some(api::PoseStatus {
-            source: "fixed",
+            source: "fixed".into(),
             time,
             is_lost: false,
             pose: None,

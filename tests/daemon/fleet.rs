@@ -1,81 +1,17 @@
 //! Stations, a real NATS server and the hub, killed while alerts flow.
 
 use std::collections::BTreeMap;
-use std::net::{TcpListener, TcpStream};
+use std::net::UdpSocket;
 use std::path::Path;
-use std::process::{Child, Command, Stdio};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use serde_json::Value;
+use futures_util::StreamExt;
+use serde_json::{Value, json};
 
+use crate::nats::{Server, hub, station, station_with};
 use crate::process::{Daemon, alerts};
-
-/// A NATS server with JetStream; killed when dropped.
-struct Server {
-    child: Child,
-    port: u16,
-}
-
-impl Server {
-    /// `None` where there is no nats-server; never in CI.
-    fn start(dir: &Path, port: Option<u16>) -> Option<Self> {
-        let port = port.unwrap_or_else(|| TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port());
-        let child = Command::new("nats-server")
-            .args(["-js", "-a", "127.0.0.1", "-p", &port.to_string(), "-sd"])
-            .arg(dir.join("nats"))
-            .stderr(Stdio::null())
-            .spawn();
-        let child = match child {
-            Ok(child) => child,
-            Err(error) if std::env::var_os("CI").is_none() => {
-                eprintln!("skipped: nats-server cannot be started ({error}); `make setup-test` installs it");
-                return None;
-            }
-            Err(error) => panic!("nats-server: {error}"),
-        };
-        let end = Instant::now() + Duration::from_secs(20);
-        while TcpStream::connect(("127.0.0.1", port)).is_err() {
-            assert!(Instant::now() < end, "nats-server does not listen");
-            std::thread::sleep(Duration::from_millis(20));
-        }
-        Some(Self { child, port })
-    }
-
-    /// Kills it as the kernel would; gives the port for the next one.
-    fn kill(mut self) -> u16 {
-        let _ = self.child.kill();
-        let _ = self.child.wait();
-        self.port
-    }
-}
-
-impl Drop for Server {
-    fn drop(&mut self) {
-        let _ = self.child.kill();
-        let _ = self.child.wait();
-    }
-}
-
-fn station(dir: &Path, name: &str, scene: &str, port: u16) -> Daemon {
-    let dir = dir.join(name);
-    std::fs::create_dir_all(&dir).unwrap();
-    let scene = format!("{}/config/scenes/{scene}.toml", env!("CARGO_MANIFEST_DIR"));
-    let config = format!(
-        "[source]\nkind = \"simulator\"\nscene = {scene:?}\n[journal]\npath = \"journal.db\"\n\
-         [fleet]\nurl = \"nats://127.0.0.1:{port}\"\nsite = \"harbour\"\nstation = {name:?}\n"
-    );
-    Daemon::start(&dir, &config)
-}
-
-fn hub(dir: &Path, port: u16) -> Daemon {
-    let dir = dir.join("hub");
-    std::fs::create_dir_all(&dir).unwrap();
-    let config =
-        format!("[fleet]\nurl = \"nats://127.0.0.1:{port}\"\nlost_after_s = 2.0\n[journal]\npath = \"journal.db\"\n");
-    Daemon::start_as(&dir, "fleet", &config)
-}
 
 /// The events of each alert in a journal, in order; `prefix` is what the hub puts before a station's ids.
 fn histories(journal: &Path, prefix: &str) -> BTreeMap<String, Vec<String>> {
@@ -228,4 +164,103 @@ fn a_silent_station_is_missed_and_a_user_in_two_places_is_told() {
     let _ap7 = station(dir.path(), "ap7", "eavesdropper", server.port);
     let cleared = |v: &Value| alerts(v).first().is_some_and(|a| a["state"] == "cleared");
     hub.wait_for("/v1/alerts?kind=station_lost", "station back", cleared);
+}
+
+/// A heartbeat of system 7 and one pose, again and again.
+fn fly(port: u16, is_over: &AtomicBool) {
+    let bytes = |hex: &str| {
+        let digits: Vec<u8> = hex.trim().chars().map(|c| c.to_digit(16).unwrap() as u8).collect();
+        digits.chunks(2).map(|pair| 16 * pair[0] + pair[1]).collect::<Vec<u8>>()
+    };
+    let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
+    let frames = [
+        include_str!("../platform/heartbeat.hex"),
+        include_str!("../platform/odometry.hex"),
+    ]
+    .map(bytes);
+    while !is_over.load(Ordering::Relaxed) {
+        for frame in &frames {
+            let _ = socket.send_to(frame, ("127.0.0.1", port));
+        }
+        std::thread::sleep(Duration::from_millis(20));
+    }
+}
+
+/// What is published on `subject` within two seconds.
+fn heard(port: u16, subject: &'static str) -> Vec<Value> {
+    let listening = async move {
+        let client = async_nats::connect(format!("127.0.0.1:{port}")).await.unwrap();
+        let mut messages = client.subscribe(subject).await.unwrap();
+        client.flush().await.unwrap();
+        let mut heard = Vec::new();
+        let end = tokio::time::Instant::now() + Duration::from_secs(2);
+        while let Ok(Some(message)) = tokio::time::timeout_at(end, messages.next()).await {
+            heard.push(serde_json::from_slice(&message.payload).unwrap());
+        }
+        heard
+    };
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build()
+        .unwrap();
+    runtime.block_on(listening)
+}
+
+#[test]
+fn the_hub_shows_where_the_platforms_are() {
+    let dir = tempfile::tempdir().unwrap();
+    let Some(server) = Server::start(dir.path(), None) else {
+        return;
+    };
+    let autopilot = UdpSocket::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+    let platform =
+        format!("positions_hz = 4.0\n[platform]\nkind = \"mavlink\"\nendpoint = \"udpin:127.0.0.1:{autopilot}\"\n");
+    let hub = hub(dir.path(), server.port);
+    let _ap7 = station_with(dir.path(), "ap7", "builtin", server.port, &platform);
+    let _ap8 = station(dir.path(), "ap8", "builtin", server.port);
+    let is_over = AtomicBool::new(false);
+    let of = |v: &Value, name: &str| v["stations"].as_array()?.iter().find(|s| s["station"] == name).cloned();
+    let messages = std::thread::scope(|scope| {
+        scope.spawn(|| fly(autopilot, &is_over));
+        let seen = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| {
+            let both = |v: &Value| {
+                of(v, "ap7").is_some_and(|s| s["pose"]["place"].is_object())
+                    && of(v, "ap8").is_some_and(|s| s["emitters"] != 0)
+            };
+            let seen = hub.wait_for("/v1/stations", "a pose of ap7 and beams of ap8", both);
+            let ap7 = of(&seen, "ap7").unwrap();
+            let place = &ap7["pose"]["place"];
+            assert_eq!(
+                [&place["x_m"], &place["y_m"], &place["z_m"], &place["heading_deg"]],
+                [20.0, 10.0, 100.0, 0.0],
+                "{ap7}"
+            );
+            assert_eq!(ap7["pose"]["is_lost"], false);
+            // What the pose and the positions say is not said again.
+            assert!(ap7["status"]["view"].is_null(), "{ap7}");
+            assert!(
+                of(&seen, "ap8").unwrap()["pose"].is_null(),
+                "a fixed platform has no poses"
+            );
+            heard(server.port, "oapwatch.harbour.*.pose")
+        }));
+        is_over.store(true, Ordering::Relaxed);
+        seen.unwrap_or_else(|panic| std::panic::resume_unwind(panic))
+    });
+    assert!((2..=9).contains(&messages.len()), "4 a second at most: {messages:?}");
+    for message in &messages {
+        assert_eq!(
+            [
+                &message["version"],
+                &message["site"],
+                &message["station"],
+                &message["source"]
+            ],
+            [&json!(1), &json!("harbour"), &json!("ap7"), &json!("mavlink")]
+        );
+        assert_eq!(message["pose"]["cov"].as_array().map(Vec::len), Some(6), "{message}");
+    }
+    hub.wait_for("/v1/stations", "that the pose is old", |v| {
+        of(v, "ap7").is_some_and(|s| s["pose"]["is_lost"] == true && s["pose"]["place"]["age_s"].as_f64() > Some(1.0))
+    });
 }

@@ -1,7 +1,10 @@
 //! The daemon as an operator meets it: a process, an address, signals.
 
 mod fleet;
+mod fleet_permissions;
+mod fleet_review;
 mod geojson;
+mod nats;
 mod over_http;
 mod places;
 mod process;

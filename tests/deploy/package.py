@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Lints a package, judges its unit, and measures what it brings: sizes, and the time from start to READY=1.
+"""Lints a package, judges its units, and measures what it brings: sizes, and the time from start to READY=1.
 
 Usage: package.py PACKAGE.deb. Fails on any lintian error or warning, and past the limits below.
 """
@@ -20,7 +20,7 @@ STARTS = 5
 MOST_EXPOSED = 13  # tenths, as systemd-analyze counts
 
 
-def seconds_to_ready(program, folder, config):
+def seconds_to_ready(program, folder, config, command="run"):
     """Starts the daemon as systemd would and waits for READY=1."""
     path = folder / "oapwatch.toml"
     path.write_text(config)
@@ -30,7 +30,7 @@ def seconds_to_ready(program, folder, config):
         manager.settimeout(30)
         began = time.monotonic()
         daemon = subprocess.Popen(
-            [program, "run", "--config", path, "--listen", "127.0.0.1:0"],
+            [program, command, "--config", path, "--listen", "127.0.0.1:0"],
             env={"NOTIFY_SOCKET": address},
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
@@ -51,15 +51,28 @@ def seconds_to_ready(program, folder, config):
             os.unlink(address)
 
 
-def unit_is_good(folder):
+def hub_starts(program, folder):
+    """Whether the hub's config as it is shipped is taken, and the hub ready with it although there is no server yet."""
+    config = (folder / "etc/oapwatch/hub.toml").read_text().replace("/var/lib/oapwatch-fleet", str(folder))
+    file = folder / "hub.toml"
+    file.write_text(config)
+    checked = subprocess.run([program, "check", file], check=False, capture_output=True, text=True)
+    print(checked.stdout.strip() or checked.stderr.strip())
+    ready, resident = seconds_to_ready(program, folder, config, "fleet")
+    print(f"hub: ready after {ready:.3f} s, {resident:.0f} MiB resident then")
+    return checked.returncode == 0 and "hub" in checked.stdout
+
+
+def unit_is_good(folder, name):
     """Whether systemd takes the unit as it is, and how exposed it leaves the service."""
-    unit = folder / "usr/lib/systemd/system/oapwatch.service"
+    unit = folder / "usr/lib/systemd/system" / name
+    print(f"{name}:")
     judge = ["systemd-analyze", "security", "--offline=true", f"--threshold={MOST_EXPOSED}", unit]
     told = subprocess.run(judge, check=False, capture_output=True, text=True)
     print(told.stdout.strip().splitlines()[-1] if told.stdout else told.stderr)
     # The program and its manual stand where the package puts them, below the folder.
     here = folder / "verify" / unit.name
-    here.parent.mkdir()
+    here.parent.mkdir(exist_ok=True)
     here.write_text(unit.read_text().replace("/usr/bin/oapwatch", f"{folder}/usr/bin/oapwatch"))
     verify = ["systemd-analyze", "verify", "--recursive-errors=no", here]
     verified = subprocess.run(verify, check=False, env={**os.environ, "MANPATH": f"{folder}/usr/share/man"})
@@ -80,7 +93,9 @@ def main():
         size = program.stat().st_size / 1e6
         print(f"package {package.stat().st_size / 1e6:.1f} MB, program {size:.1f} MB (at most {LARGEST_MB:.0f})")
         failed |= size > LARGEST_MB
-        failed |= not unit_is_good(folder)
+        for name in ["oapwatch.service", "oapwatch-fleet.service"]:
+            failed |= not unit_is_good(folder, name)
+        failed |= not hub_starts(program, folder)
         journal = f'[journal]\npath = "{folder}/journal.db"\n'
         for name in ["ml", "network", "hybrid"]:
             config = f'{journal}[estimator]\nname = "{name}"\n'

@@ -7,7 +7,7 @@ import { Link } from "./link.js";
 import { GroundMap } from "./map.js";
 import { claimIcon, icon } from "./marks.js";
 import { Places } from "./places.js";
-import { showStations } from "./stations.js";
+import { poseWords, showStations } from "./stations.js";
 import { Timeline } from "./timeline.js";
 import { el, fullStamp, lasting, micros, shown, zone } from "./words.js";
 
@@ -169,13 +169,21 @@ function draw() {
   past(live ? null : time);
 }
 
+// What one access point of a hub sees; where it is and heads, by its pose.
+function viewOf({ site, station, footprint_m: outline, pose }) {
+  const title = `seen by ${shown(site)}.${shown(station)}`;
+  if (!pose?.place) return { outline, title };
+  const { x_m: x, y_m: y, heading_deg: heading } = pose.place;
+  return { outline, nadir: [x, y], heading, title: `${title}, which is above ${Math.round(x)}, ${Math.round(y)} m, ${poseWords(pose)}` };
+}
+
 // What is watched: the outlines on the ground, and the smallest and largest place of them all.
 function ground({ view, stations = [], field_of_view_m: [w, h] }, live) {
   const outlines = [view?.footprint_m, ...stations.map((s) => s.footprint_m)].filter((points) => points?.length > 2);
   const points = outlines.length ? outlines.flat() : [[-w, -h], [w, h]];
   const bounds = [Math.min, Math.max].map((pick) => [0, 1].map((k) => points.reduce((v, p) => pick(v, p[k]), points[0][k])));
   if (!live) return { bounds, views: [] };
-  const views = stations.filter((s) => s.footprint_m?.length > 2).map((s) => ({ outline: s.footprint_m, title: `seen by ${shown(s.site)}.${shown(s.station)}` }));
+  const views = stations.filter((s) => s.footprint_m?.length > 2).map(viewOf);
   if (view?.footprint_m.length > 2) {
     const age = view.pose_age_s > 0.5 ? `; pose ${view.pose_age_s.toFixed(1)} s old` : "";
     views.push({ outline: view.footprint_m, nadir: view.nadir_m, heading: view.heading_deg, title: `the UAV is above ${view.nadir_m.map((v) => Math.round(v)).join(", ")} m, heading ${Math.round(view.heading_deg)}°${age}` });

@@ -6,6 +6,15 @@ const ORDER = { lost: 0, blind: 1, good: 2 };
 const TONE = { lost: "bad", blind: "warn", good: "ok" };
 const $ = (id) => document.getElementById(id);
 
+// The heading of a station's platform, and the age of its pose where it matters.
+export function poseWords(pose) {
+  if (!pose) return "fixed";
+  if (!pose.place) return pose.is_lost ? "lost" : "waiting";
+  const { heading_deg: heading, age_s: age } = pose.place;
+  const old = pose.is_lost ? "lost, " : "";
+  return `${old}heading ${Math.round(heading)}°${pose.is_lost || age > 0.5 ? `, ${lasting(age * 1000)} old` : ""}`;
+}
+
 export function showStations(stations, isHub) {
   $("stations").hidden = !isHub;
   $("sensor").hidden = isHub;
@@ -17,7 +26,7 @@ export function showStations(stations, isHub) {
   $("station-count").textContent = `${stations.length} known${lost ? `, ${lost} lost` : ""}`;
   const behind = (s) => (s.lag_s === null ? "" : `${s.lag_s < 0 ? "−" : ""}${lasting(Math.abs(s.lag_s) * 1000)}`);
   $("station-rows").replaceChildren(...sorted.map((s) => {
-    const texts = [["", shown(name(s))], [TONE[s.state], s.state], ["n", `${s.emitters}`], ["n", behind(s)], ["n", `${s.alerts_waiting}`], ["", clock(Date.parse(s.last_seen_at))]];
+    const texts = [["", shown(name(s))], [TONE[s.state], s.state], ["n", `${s.emitters}`], ["n", behind(s)], ["n", `${s.alerts_waiting}`], [s.pose?.is_lost ? "bad" : "", poseWords(s.pose)], ["", clock(Date.parse(s.last_seen_at))]];
     return el("tr", {}, ...texts.map(([className, text]) => el("td", { className }, text)));
   }));
 }

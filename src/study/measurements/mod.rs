@@ -1,10 +1,12 @@
 //! Measurements over many random stories: how often honest users raise an alert, how often and how soon an attack does, how
-//! much error a calibration leaves, and what zones and known lights hide.
+//! much error a calibration leaves, what zones and known lights hide, and what a fleet makes of users who walk on to the next access
+//! point.
 
 mod alone;
 mod calibration;
 mod flights;
 mod formats;
+mod handover;
 mod lens;
 mod light;
 mod measured;
@@ -34,6 +36,7 @@ pub const ALL: &[Measurement] = &[
     measurement("intruder", 3000, alone::intruders),
     measurement("beyond", 3000, alone::beyond),
     measurement("drift", 300, alone::drifts),
+    measurement("handover", 1000, handover::walks),
     measurement("honest-pixels", 15, pixels::honest_users),
     measurement("honest-crowd", 15, pixels::honest_crowd),
     measurement("stranger", 1500, pixels::strangers),
