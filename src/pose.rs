@@ -266,7 +266,10 @@ mod tests {
     fn a_recorded_pose_is_the_same_to_the_bit_and_a_wrong_one_is_refused() {
         for k in 0..100 {
             let angle = 0.1 * f64::from(k);
-            let mut pose = Pose::level("2026-11-21T08:00:00.1234567Z".parse().unwrap(), [0.1, -2.0 / 3.0, 300.0]);
+            let mut pose = Pose::level(
+                "2026-11-21T08:00:00.1234567Z".parse().unwrap(),
+                [0.1, -2.0 / 3.0, 300.0],
+            );
             pose.attitude = UnitQuaternion::from_euler_angles(angle, 0.3 * angle, 1.0 / 3.0);
             pose.cov = PoseSigmas::default().cov();
             pose.cov[(0, 4)] = 1e-3 * angle;
@@ -281,7 +284,10 @@ mod tests {
             ("\"cov\":[0.0,", "\"cov\":["),
         ] {
             assert!(line.contains(from), "{line}");
-            assert!(serde_json::from_str::<Pose>(&line.replacen(from, to, 1)).is_err(), "{to}");
+            assert!(
+                serde_json::from_str::<Pose>(&line.replacen(from, to, 1)).is_err(),
+                "{to}"
+            );
         }
     }
 

@@ -62,7 +62,9 @@ pub enum ConfigError {
     Missing { key: &'static str },
     #[error("fleet.url: expected the NATS server of the fleet, found nothing")]
     NoUrl,
-    #[error("fleet.claims_subject: expected words of letters, digits, '-', '_' or '*' with dots between them, found {found:?}")]
+    #[error(
+        "fleet.claims_subject: expected words of letters, digits, '-', '_' or '*' with dots between them, found {found:?}"
+    )]
     Subject { found: String },
     #[error("fleet.claims_subject: expected fleet.url beside it, found nothing")]
     SubjectWithoutUrl,

@@ -76,7 +76,6 @@ pub struct Platform {
     unlearned: VecDeque<(Timestamp, Vector6<f64>)>,
 }
 
-
 #[allow(clippy::large_enum_variant, reason = "a platform has one")]
 enum Source {
     /// Level over (0, 0) at the camera's own altitude.

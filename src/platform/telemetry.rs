@@ -1,7 +1,7 @@
 //! An autopilot's poses on their way to the frames.
 
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use jiff::Timestamp;
 use metrics::{counter, gauge};

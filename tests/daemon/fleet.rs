@@ -170,7 +170,10 @@ fn claims_come_over_nats_in_the_format_of_the_log() {
         }
     };
     let publisher = std::thread::spawn(|| {
-        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+        let runtime = tokio::runtime::Builder::new_current_thread()
+            .enable_all()
+            .build()
+            .unwrap();
         runtime.block_on(publishing());
     });
     // No beam comes from there.
@@ -180,12 +183,17 @@ fn claims_come_over_nats_in_the_format_of_the_log() {
     stop.store(true, Ordering::Relaxed);
     publisher.join().unwrap();
     let metrics = daemon.get("/metrics").1;
-    let malformed = metrics.lines().find_map(|l| l.strip_prefix("oapwatch_claims_total{outcome=\"malformed\"} "));
+    let malformed = metrics
+        .lines()
+        .find_map(|l| l.strip_prefix("oapwatch_claims_total{outcome=\"malformed\"} "));
     assert!(malformed.is_some_and(|n| n.parse::<u64>().unwrap() > 0), "{metrics}");
     daemon.signal("-TERM");
     let (code, log) = daemon.end();
     assert_eq!(code, Some(0));
-    let told: Vec<_> = log.iter().filter(|l| l.contains("a claim cannot be taken: line 3: ")).collect();
+    let told: Vec<_> = log
+        .iter()
+        .filter(|l| l.contains("a claim cannot be taken: line 3: "))
+        .collect();
     assert_eq!(told.len(), 1, "{log:?}");
 }
 

@@ -17,9 +17,7 @@ fn geopandas_opens_positions_alerts_and_footprint_without_a_warning() {
     let dir = tempfile::tempdir().unwrap();
     let origin = "latitude_deg = 48.137, longitude_deg = 11.575, height_m = 520.0, datum = \"ellipsoid\"";
     let daemon = Daemon::start(dir.path(), &format!("[world]\norigin = {{ {origin} }}\n"));
-    daemon.wait_for("/v1/alerts?kind=unclaimed_emitter", "alert", |v| {
-        !alerts(v).is_empty()
-    });
+    daemon.wait_for("/v1/alerts?kind=unclaimed_emitter", "alert", |v| !alerts(v).is_empty());
     let opened = Command::new(python)
         .arg(root.join("tests/daemon/geojson.py"))
         .arg(daemon.url())

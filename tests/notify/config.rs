@@ -21,13 +21,20 @@ fn a_host_without_authorities_is_named_and_needs_none_for_plain_http() {
         std::fs::write(&file, format!("[[webhook]]\nurl = {url:?}\nsecret_file = \"secret\"\n")).unwrap();
         let mut program = std::process::Command::new(env!("CARGO_BIN_EXE_oapwatch"));
         let nothing = dir.path().join("nothing");
-        program.arg("check").arg(&file).env("SSL_CERT_FILE", &nothing).env("SSL_CERT_DIR", &nothing);
+        program
+            .arg("check")
+            .arg(&file)
+            .env("SSL_CERT_FILE", &nothing)
+            .env("SSL_CERT_DIR", &nothing);
         let said = program.output().unwrap();
         (said.status.code(), String::from_utf8(said.stderr).unwrap())
     };
     let (code, told) = check("https://hooks.example.org/in");
     assert_eq!(code, Some(2), "{told}");
-    assert!(told.contains("[[webhook]] 1: url: ") && told.contains("ca-certificates") && !told.contains("builder error"), "{told}");
+    assert!(
+        told.contains("[[webhook]] 1: url: ") && told.contains("ca-certificates") && !told.contains("builder error"),
+        "{told}"
+    );
     let (code, told) = check("http://127.0.0.1:9/in");
     assert_eq!(code, Some(0), "{told}");
 }

@@ -44,7 +44,10 @@ impl Standing {
 
     /// Claims oldest first, poses in the order of arrival.
     pub fn arrivals(&self) -> Arrivals {
-        let both = self.users.values().flat_map(|(before, last)| before.iter().chain([last]));
+        let both = self
+            .users
+            .values()
+            .flat_map(|(before, last)| before.iter().chain([last]));
         let mut claims: Vec<Claim> = both.cloned().collect();
         claims.sort_by_key(|claim| claim.time);
         Arrivals {

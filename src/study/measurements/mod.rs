@@ -7,6 +7,7 @@ mod formats;
 mod lens;
 mod measured;
 mod pixels;
+mod sequence;
 mod zones;
 
 pub use measured::Measured;
@@ -14,7 +15,7 @@ pub use measured::Measured;
 /// Something to measure.
 pub struct Measurement {
     pub name: &'static str,
-    /// Stories (devices of a calibration, frames of a format), unless another number is asked for.
+    /// Stories (devices of a calibration, frames of a format, walks of a cell), unless another number is asked for.
     pub stories: u64,
     run: fn(stories: u64, seed: u64) -> Measured,
 }
@@ -40,6 +41,7 @@ pub const ALL: &[Measurement] = &[
     measurement("shadow", 10, pixels::shadows),
     measurement("calibration", 5, calibration::error_left),
     measurement("lens", 40, lens::lenses),
+    measurement("sequence", 3, sequence::frames_together),
     measurement("zones", 40, zones::known_lights_and_zones),
     measurement("formats", 200, formats::cost),
 ];

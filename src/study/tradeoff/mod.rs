@@ -2,22 +2,26 @@
 
 mod condition;
 mod error;
+mod exposure;
 mod networks;
 mod oracle;
 mod picture;
 mod report;
 mod scene;
 mod score;
+mod snapshots;
 
 use std::path::Path;
 
 use crate::estimate::Learned;
 pub(in crate::study) use networks::Candidate;
 pub(in crate::study) use scene::Scene;
-pub(in crate::study) use score::{Answer, CUTOFF_M, bound_ratio};
+pub(in crate::study) use score::{Answer, CUTOFF_M, bound_ratio, is_apart};
+pub(in crate::study) use snapshots::{Snapshots, Walk};
 
 pub use condition::Condition;
 pub use error::{Error, PictureError};
+pub use exposure::{CELLS as EXPOSURE_CELLS, run as run_exposures};
 pub use networks::{Trained, Training};
 pub use oracle::Oracle;
 pub use scene::{Cell, Noise};

@@ -94,7 +94,8 @@ pub fn times_to_alert(daemon: &Daemon, rate_hz: f64, from_frame: u64, to_frame: 
         .filter_map(|alert| {
             let from_s = alert["source"]["frame"].as_u64()? as f64 / rate_hz;
             let raised_at = time(alert, "raised_at")?;
-            let lasts_s = time(alert, "cleared_at").map_or(f64::INFINITY, |t| t.duration_since(raised_at).as_secs_f64());
+            let lasts_s =
+                time(alert, "cleared_at").map_or(f64::INFINITY, |t| t.duration_since(raised_at).as_secs_f64());
             Some((from_s, from_s + lasts_s))
         })
         .collect();
