@@ -41,7 +41,7 @@ pub const ALL: &[Measurement] = &[
     measurement("shadow", 10, pixels::shadows),
     measurement("calibration", 5, calibration::error_left),
     measurement("lens", 40, lens::lenses),
-    measurement("sequence", 3, sequence::frames_together),
+    measurement("sequence", 8, sequence::frames_together),
     measurement("zones", 40, zones::known_lights_and_zones),
     measurement("formats", 200, formats::cost),
 ];
