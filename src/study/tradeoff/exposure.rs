@@ -1,12 +1,10 @@
 //! Accuracy against observation time: one long exposure against many short ones of the same light.
 
 use std::fmt::Write;
-use std::path::Path;
 
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 
-use super::picture::draw_exposures;
 use super::snapshots::{Snapshots, Walk};
 use super::{CUTOFF_M, Cell, Error, Noise};
 use crate::assign::ospa;
@@ -41,17 +39,8 @@ pub(super) struct Outcome {
     pub error_m2: Option<f64>,
 }
 
-/// Measures `scenes` scenes and writes exposure.md and exposure.svg to `out`. `progress` is called after each cell, of which there are
-/// [`CELLS`]. Returns the table.
-///
-/// # Errors
-/// A file cannot be written.
-pub fn run(scenes: usize, seed: u64, out: &Path, progress: &mut dyn FnMut(&Cell)) -> Result<String, Error> {
-    let io = |path: &Path| {
-        let path = path.to_owned();
-        move |source| Error::Io { path, source }
-    };
-    std::fs::create_dir_all(out).map_err(io(out))?;
+/// Measures `scenes` scenes of each cell. `progress` is called after each cell, of which there are [`CELLS`].
+pub(super) fn measure_all(scenes: usize, seed: u64, progress: &mut dyn FnMut(&Cell)) -> Result<Vec<Row>, Error> {
     let mut rows = Vec::new();
     for is_read_noise in [false, true] {
         for sigma_mm in SIGMAS_MM {
@@ -60,14 +49,10 @@ pub fn run(scenes: usize, seed: u64, out: &Path, progress: &mut dyn FnMut(&Cell)
             progress(&cell);
         }
     }
-    let table = markdown(&rows, scenes, seed);
-    let file = out.join("exposure.md");
-    std::fs::write(&file, &table).map_err(io(&file))?;
-    draw_exposures(&rows, &out.join("exposure.svg"))?;
-    Ok(table)
+    Ok(rows)
 }
 
-/// Cells that [`run`] measures.
+/// Cells that [`measure_all`] measures.
 pub const CELLS: usize = 2 * SIGMAS_MM.len();
 
 fn measure(cell: &Cell, is_read_noise: bool, scenes: usize, seed: u64) -> Result<Vec<Row>, Error> {
@@ -188,7 +173,7 @@ fn median(mut values: Vec<f64>) -> Option<f64> {
     values.get(values.len() / 2).copied()
 }
 
-fn markdown(rows: &[Row], scenes: usize, seed: u64) -> String {
+pub(super) fn markdown(rows: &[Row], scenes: usize, seed: u64) -> String {
     let mut text = format!(
         "# Accuracy against observation time\n\n{scenes} scenes a cell, seed {seed}; 5 to 9 users who stand still. Every 10 ms is one draw of a \
          beam's fading (relative std {FADING_STD}). Median Cramér–Rao bound of all frames of the observation together, m², both axes summed; in \
