@@ -180,3 +180,4 @@ native: build
 tradeoff: build
 	rm -f docs/tradeoff/tradeoff.json
 	target/release/oapwatch tradeoff --frames 200 --out docs/tradeoff
+	target/release/oapwatch tradeoff --exposure --out docs/tradeoff

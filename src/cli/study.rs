@@ -11,10 +11,11 @@ use crate::study::measurements::{ALL, Measurement};
     after_help = "Examples:\n  oapwatch study honest intruder beyond drift\n  oapwatch study stranger --stories 12000 --seed 200000"
 )]
 pub struct Args {
-    /// What to measure: the first four of the monitor alone, handover of two monitors and a hub, the last three of the calibration, other lenses and pixel formats, the others through the simulator's pixels
+    /// What to measure: the monitor alone (honest to zones; handover with a hub), the program on the simulator's pixels (honest-pixels to
+    /// flights), or the optics and the estimator (calibration to formats)
     #[arg(required = true, value_parser = clap::builder::PossibleValuesParser::new(ALL.iter().map(|m| m.name)))]
     what: Vec<String>,
-    /// Stories of each, of 8 s to two minutes of frames (devices of the calibration, frames of a lens or a pixel format)
+    /// Stories of each, of 8 s to two minutes of frames (devices of the calibration, frames of a lens or a pixel format, walks of a cell of `sequence`)
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     stories: Option<u64>,
     /// Seed of the first story; the others follow

@@ -7,11 +7,11 @@ use super::progress::Steps;
 use super::{Failure, Outcome};
 use crate::estimate::Rules;
 use crate::study::ablation;
-use crate::study::tradeoff::{Oracle, Plan, Trained, run as study};
+use crate::study::tradeoff::{EXPOSURE_CELLS, Oracle, Plan, Trained, run as study, run_exposures};
 
 #[derive(Debug, clap::Args)]
 #[command(
-    after_help = "Examples:\n  oapwatch tradeoff --quick --out out\n  oapwatch tradeoff --cells P8/60,E1/64 --estimators ml,map --frames 1000 --out out\n  oapwatch tradeoff --without all --frames 40\n  oapwatch tradeoff --oracle --quick"
+    after_help = "Examples:\n  oapwatch tradeoff --quick --out out\n  oapwatch tradeoff --cells P8/60,E1/64 --estimators ml,map --frames 1000 --out out\n  oapwatch tradeoff --without all --frames 40\n  oapwatch tradeoff --oracle --quick\n  oapwatch tradeoff --exposure --out out"
 )]
 pub struct Args {
     /// Folder for tradeoff.md, tradeoff.json and the pictures; measurements already there are kept
@@ -41,7 +41,16 @@ pub struct Args {
     /// Print instead how far `map` is from the most probable hypothesis: its search against one that starts from the truth
     #[arg(long, conflicts_with_all = ["estimators", "networks"])]
     oracle: bool,
+    /// Measure instead accuracy against observation time: one long exposure against many short ones of the same light (exposure.md,
+    /// exposure.svg)
+    #[arg(long, conflicts_with_all = ["oracle", "without", "estimators", "networks", "cells"])]
+    exposure: bool,
 }
+
+/// Scenes of `--exposure`, unless given by `--frames`.
+const EXPOSURE_SCENES: usize = 20;
+const EXPOSURE_QUICK_SCENES: usize = 2;
+const EXPOSURE_SEED: u64 = 1;
 
 /// Frames per cell and seed of `--oracle`, unless given.
 const ORACLE_FRAMES: usize = 1000;
@@ -51,6 +60,9 @@ const ORACLE_SEED: u64 = 2;
 pub fn run(args: Args) -> Outcome {
     if args.oracle {
         return oracle(&args);
+    }
+    if args.exposure {
+        return exposures(&args);
     }
     let mut plan = match (args.quick, args.without.is_empty()) {
         (true, _) => Plan::quick(),
@@ -87,6 +99,23 @@ pub fn run(args: Args) -> Outcome {
     .map_err(Failure::other)?;
     steps.finish();
     let table = std::fs::read_to_string(args.out.join("tradeoff.md")).map_err(Failure::other)?;
+    std::io::stdout().write_all(table.as_bytes()).map_err(Failure::other)?;
+    eprintln!("written to {}", args.out.display());
+    Ok(())
+}
+
+fn exposures(args: &Args) -> Outcome {
+    let usual = match args.quick {
+        true => EXPOSURE_QUICK_SCENES,
+        false => EXPOSURE_SCENES,
+    };
+    let scenes = args.frames.map_or(usual, |n| n.max(1));
+    let mut steps = Steps::new(EXPOSURE_CELLS as u64);
+    let table = run_exposures(scenes, args.seed.unwrap_or(EXPOSURE_SEED), &args.out, &mut |cell| {
+        steps.next(&cell.name());
+    })
+    .map_err(Failure::other)?;
+    steps.finish();
     std::io::stdout().write_all(table.as_bytes()).map_err(Failure::other)?;
     eprintln!("written to {}", args.out.display());
     Ok(())

@@ -11,6 +11,7 @@ mod lens;
 mod light;
 mod measured;
 mod pixels;
+mod sequence;
 mod zones;
 
 pub use measured::Measured;
@@ -18,7 +19,7 @@ pub use measured::Measured;
 /// Something to measure.
 pub struct Measurement {
     pub name: &'static str,
-    /// Stories (devices of a calibration, frames of a format), unless another number is asked for.
+    /// Stories (devices of a calibration, frames of a format, walks of a cell), unless another number is asked for.
     pub stories: u64,
     run: fn(stories: u64, seed: u64) -> Measured,
 }
@@ -30,13 +31,15 @@ impl Measurement {
     }
 }
 
-/// All measurements, the monitor alone before those through pixels.
+/// All measurements: of the monitor alone, through pixels, of the optics and the estimator.
 pub const ALL: &[Measurement] = &[
     measurement("honest", 1000, alone::honest_users),
     measurement("intruder", 3000, alone::intruders),
     measurement("beyond", 3000, alone::beyond),
     measurement("drift", 300, alone::drifts),
     measurement("handover", 1000, handover::walks),
+    measurement("lamp-or-beam", 100, light::lamp_or_beam),
+    measurement("zones", 40, zones::known_lights_and_zones),
     measurement("honest-pixels", 15, pixels::honest_users),
     measurement("honest-crowd", 15, pixels::honest_crowd),
     measurement("stranger", 1500, pixels::strangers),
@@ -46,8 +49,7 @@ pub const ALL: &[Measurement] = &[
     measurement("flights", 10, flights::flights),
     measurement("calibration", 5, calibration::error_left),
     measurement("lens", 40, lens::lenses),
-    measurement("lamp-or-beam", 100, light::lamp_or_beam),
-    measurement("zones", 40, zones::known_lights_and_zones),
+    measurement("sequence", 8, sequence::frames_together),
     measurement("formats", 200, formats::cost),
 ];
 

@@ -2,22 +2,26 @@
 
 mod condition;
 mod error;
+mod exposure;
 mod networks;
 mod oracle;
 mod picture;
 mod report;
 mod scene;
 mod score;
+mod snapshots;
 
 use std::path::Path;
 
 use crate::estimate::Learned;
 pub(in crate::study) use networks::Candidate;
 pub(in crate::study) use scene::Scene;
-pub(in crate::study) use score::{Answer, CUTOFF_M, bound_ratio};
+pub(in crate::study) use score::{Answer, CUTOFF_M, bound_ratio, is_apart};
+pub(in crate::study) use snapshots::{Snapshots, Walk};
 
 pub use condition::Condition;
 pub use error::{Error, PictureError};
+pub use exposure::CELLS as EXPOSURE_CELLS;
 pub use networks::{Trained, Training};
 pub use oracle::Oracle;
 pub use scene::{Cell, Noise};
@@ -178,4 +182,23 @@ pub fn run(plan: &Plan, out: &Path, progress: &mut dyn FnMut(&Row)) -> Result<St
     std::fs::write(&table, report::markdown(&study)).map_err(io(&table))?;
     picture::draw(&study, out)?;
     Ok(study)
+}
+
+/// Measures accuracy against observation time on `scenes` scenes of each cell and writes exposure.md and exposure.svg to `out`.
+/// `progress` is called after each cell, of which there are [`EXPOSURE_CELLS`]. Returns the table.
+///
+/// # Errors
+/// A file cannot be written.
+pub fn run_exposures(scenes: usize, seed: u64, out: &Path, progress: &mut dyn FnMut(&Cell)) -> Result<String, Error> {
+    let io = |path: &Path| {
+        let path = path.to_owned();
+        move |source| Error::Io { path, source }
+    };
+    std::fs::create_dir_all(out).map_err(io(out))?;
+    let rows = exposure::measure_all(scenes, seed, progress)?;
+    let table = exposure::markdown(&rows, scenes, seed);
+    let file = out.join("exposure.md");
+    std::fs::write(&file, &table).map_err(io(&file))?;
+    picture::draw_exposures(&rows, &out.join("exposure.svg"))?;
+    Ok(table)
 }

@@ -5,6 +5,7 @@ use std::path::Path;
 use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, Pos, VPos};
 
+use super::exposure::{self, EXPOSURES_S};
 use super::report::{PAPER, cells, front, is_paper_cell};
 use super::{Error, PictureError, Row, Study, of_single_frames};
 use crate::estimate::ESTIMATORS;
@@ -235,6 +236,74 @@ fn resolvable(study: &Study, path: &Path) -> Drawn {
     chart
         .configure_series_labels()
         .position(SeriesLabelPosition::UpperRight)
+        .border_style(BLACK)
+        .background_style(WHITE)
+        .draw()?;
+    area.present()?;
+    Ok(())
+}
+
+/// Draws the accuracy in the paper's hardest scene against the time of observation to `path`.
+pub(super) fn draw_exposures(rows: &[exposure::Row], path: &Path) -> Result<(), Error> {
+    accuracy_against_observation(rows, path).map_err(|e| Error::Picture {
+        path: path.to_owned(),
+        message: PictureError(e),
+    })
+}
+
+fn accuracy_against_observation(rows: &[exposure::Row], path: &Path) -> Drawn {
+    let hardest = rows.iter().map(|r| r.cell.sigma_mm).fold(0.0, f64::max);
+    let rows: Vec<_> = rows
+        .iter()
+        .filter(|r| r.cell.sigma_mm == hardest && !r.is_read_noise)
+        .collect();
+    let Some(first) = rows.first() else { return Ok(()) };
+    let outcomes = rows.iter().flat_map(|r| r.outcomes.iter().flatten());
+    let errors = outcomes.flat_map(|o| [Some(o.bound_m2), o.error_m2]).flatten();
+    let area = SVGBackend::new(path, SIZE).into_drawing_area();
+    area.fill(&WHITE)?;
+    let mut chart = ChartBuilder::on(&area)
+        .caption(
+            format!(
+                "{}: accuracy against observation time, at equal light",
+                first.cell.name()
+            ),
+            CAPTION,
+        )
+        .margin(12)
+        .x_label_area_size(45)
+        .y_label_area_size(80)
+        .build_cartesian_2d(
+            range(rows.iter().map(|r| r.observed_s)).log_scale(),
+            range(errors).log_scale(),
+        )?;
+    chart
+        .configure_mesh()
+        .x_desc("observation time, s")
+        .y_desc("median squared error, m²")
+        .y_label_formatter(&|v| format!("{v:.0e}"))
+        .label_style(FONT)
+        .draw()?;
+    for (index, exposure_s) in EXPOSURES_S.into_iter().enumerate() {
+        let style = colour(index).stroke_width(2);
+        let of = rows
+            .iter()
+            .filter_map(|r| Some((r.observed_s, r.outcomes[index].as_ref()?)));
+        let bounds = of.clone().map(|(t, o)| (t, o.bound_m2));
+        chart
+            .draw_series(LineSeries::new(bounds, style).point_size(3))?
+            .label(format!("bound, frames of {exposure_s} s"))
+            .legend(move |(x, y)| PathElement::new([(x, y), (x + 18, y)], style));
+        let measured = of.filter_map(|(t, o)| Some((t, o.error_m2?)));
+        chart.draw_series(measured.map(|at| TriangleMarker::new(at, 7, style)))?;
+    }
+    chart
+        .draw_series(std::iter::empty::<Circle<(f64, f64), i32>>())?
+        .label("`sequence`, in the colour of its frames")
+        .legend(|(x, y)| TriangleMarker::new((x + 9, y), 7, BLACK));
+    chart
+        .configure_series_labels()
+        .position(SeriesLabelPosition::LowerLeft)
         .border_style(BLACK)
         .background_style(WHITE)
         .draw()?;

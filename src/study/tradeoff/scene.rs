@@ -43,7 +43,7 @@ pub(in crate::study) struct Scene {
     pub known_bound_m2: Vec<f64>,
 }
 
-const AREA_HALF_M: f64 = 125.0;
+pub(super) const AREA_HALF_M: f64 = 125.0;
 const POWER_W: f64 = 1.0;
 const BEAM_RADIUS_M: f64 = 0.6;
 const POINTING_STD_M: f64 = 0.1;
@@ -194,7 +194,7 @@ impl Cell {
 }
 
 /// Collected energy of one emitter, J: the mean over the coherence times of fading and pointing.
-fn energy(camera: &Camera, [x, y]: [f64; 2], rng: &mut ChaCha8Rng) -> f64 {
+pub(super) fn energy(camera: &Camera, [x, y]: [f64; 2], rng: &mut ChaCha8Rng) -> f64 {
     let h = camera.altitude_m;
     let length = (h * h + x * x + y * y).sqrt();
     let gammas = FADING.map(|shape| Gamma::new(shape, 1.0 / shape).expect("positive shapes"));

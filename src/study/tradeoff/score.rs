@@ -204,12 +204,17 @@ pub(in crate::study) fn bound_ratio(ratios: impl IntoIterator<Item = f64>) -> Op
 }
 
 fn is_resolvable(scene: &Scene, i: usize) -> bool {
-    let p = scene.positions[i];
-    let others = scene.positions.iter().enumerate().filter(|(j, _)| *j != i);
+    is_apart(&scene.positions, &scene.bound_m2, i)
+}
+
+/// Whether an emitter's bound tells it apart from the next.
+pub(in crate::study) fn is_apart(positions: &[[f64; 2]], bound_m2: &[f64], i: usize) -> bool {
+    let p = positions[i];
+    let others = positions.iter().enumerate().filter(|(j, _)| *j != i);
     let nearest = others
         .map(|(_, q)| (p[0] - q[0]).hypot(p[1] - q[1]))
         .fold(f64::INFINITY, f64::min);
-    let error = scene.bound_m2[i].sqrt();
+    let error = bound_m2[i].sqrt();
     error < RESOLVABLE_SHARE * nearest && error < RESOLVABLE_M
 }
 
