@@ -219,7 +219,9 @@ impl Monitor {
         frame.tracker.take(frame.now, &detections, dt);
         frame.light.update(&frame.tracker, &frame.view);
         let hit = frame.tracker.tracks.iter().filter(|t| t.hit);
-        let beams: Vec<Vector2<f64>> = hit.map(|t| t.filter.position()).collect();
+        // Known lights answer no claim; three reflections beside three users would pass for a displaced camera.
+        let beams = hit.map(|t| t.filter.position()).filter(|p| !frame.lights.has_at(*p));
+        let beams: Vec<Vector2<f64>> = beams.collect();
         let period_s = frame.timing.period_s().unwrap_or(ASSUMED_PERIOD_S);
         frame.update_bias(dt, period_s);
         let mut witnesses = witnesses(&frame.claims, &frame.tracker);

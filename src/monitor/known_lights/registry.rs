@@ -126,6 +126,11 @@ impl KnownLights {
         self.lights.iter().find(|s| s.light.id == id)
     }
 
+    /// Whether this is the place of a known light.
+    pub fn has_at(&self, p: Vector2<f64>) -> bool {
+        self.lights.iter().any(|s| (s.expected - p).norm() < s.light.radius_m)
+    }
+
     /// The light that this track is associated with.
     pub fn of_track(&self, track: u64) -> Option<&LightState> {
         self.lights.iter().find(|s| s.is_seen && s.track == Some(track))

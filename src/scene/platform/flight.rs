@@ -152,19 +152,19 @@ impl Flight {
 
 impl Sight {
     /// A place on the ground as the camera sees it: sensor +y, sensor +x, along the optical axis, m.
-    fn from_lens(&self, [x, y]: [f64; 2]) -> Vector3<f64> {
+    fn in_camera_m(&self, [x, y]: [f64; 2]) -> Vector3<f64> {
         self.to_camera * swap_ned_enu(Vector3::new(x, y, 0.0) - self.lens_m)
     }
 
     /// Its distance, and the part of it along the optical axis, m: negative behind the camera.
     pub fn range_m(&self, ground: [f64; 2]) -> [f64; 2] {
-        let seen = self.from_lens(ground);
+        let seen = self.in_camera_m(ground);
         [seen.norm(), seen.z]
     }
 
     /// Its (tan θx, tan θy).
     pub fn tangents(&self, ground: [f64; 2]) -> [f64; 2] {
-        let seen = self.from_lens(ground);
+        let seen = self.in_camera_m(ground);
         [seen.y / seen.z, seen.x / seen.z]
     }
 }

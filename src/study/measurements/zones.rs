@@ -4,11 +4,11 @@ use std::fmt::Write;
 
 use rayon::prelude::*;
 
-use super::measured::Measured;
+use super::measured::{Measured, exceptions};
 use crate::monitor::AlertKind::{KnownLightChanged, UnclaimedEmitter, UserOutOfZone};
 use crate::monitor::zones::{self, Zone, ZoneKind};
 use crate::monitor::{AlertEvent, KnownLight, KnownLightConfig, Monitor, known_lights_of};
-use crate::study::stories::{Actor, Story, crowd, tally, tell_with};
+use crate::study::stories::{Actor, Story, crowd, tell_with};
 
 /// Where the lamp of the stranger's stories is.
 const LAMP: [f64; 2] = [30.0, 5.0];
@@ -94,11 +94,15 @@ fn lamp_story(seed: u64) -> Story {
 fn lamps(stories: u64, seed: u64) -> (String, bool) {
     let raised: Vec<_> = (seed..seed + stories)
         .into_par_iter()
-        .map(|k| (k, tally(&tell_with(&lamp_story(k), false).events)))
+        .map(|k| (k, tell_with(&lamp_story(k), false).raised()))
         .filter(|(_, raised)| !raised.is_empty())
         .collect();
     let frames = stories as f64 * LAMPS_S * 10.0;
-    let text = format!("{frames} frames of twenty known lamps, three known ghosts and six users: {raised:?} raised\n");
+    let text = format!(
+        "{frames} frames of twenty known lamps, three known ghosts and six users: {} stories with alerts\n{}",
+        raised.len(),
+        exceptions(&raised)
+    );
     (text, raised.is_empty())
 }
 

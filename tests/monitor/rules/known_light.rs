@@ -270,3 +270,23 @@ fn what_cannot_be_approved_is_named() {
     let told = tell(&story);
     assert!(tally(&told.events).is_empty() && told.events.iter().all(|e| e.event != AlertEventKind::Raised));
 }
+
+/// Two of three users' beams come a second late, while the reflections of all three are there: no displaced camera.
+#[test]
+fn known_reflections_beside_users_are_no_displacement() {
+    let places = [[-80.0, -70.0], [0.0, -70.0], [80.0, -70.0]];
+    let ghosts = places.map(|[x, y]| [x + 25.0, y - 12.0]);
+    let users = places.iter().enumerate().map(|(k, &place)| {
+        let late = if k == 0 { 0.0 } else { 1.0 };
+        Actor::new(&format!("u-{k}"), move |_| place).beam(move |t| (t >= late).then_some(place))
+    });
+    let reflections = ghosts.map(|ghost| Actor::intruder(move |_| Some(ghost)));
+    let mut story = Story::new(1, users.chain(reflections).collect());
+    story.operator = Box::new(known(&ghosts, 2.0));
+    let told = tell(&story);
+    assert!(
+        told.raised().iter().all(|(kind, ..)| *kind != PoseInconsistent),
+        "{:?}",
+        tally(&told.events)
+    );
+}
