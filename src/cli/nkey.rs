@@ -13,7 +13,7 @@ use super::{Failure, Outcome};
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:\n  oapwatch nkey /etc/oapwatch/credentials/nkey")]
 pub struct Args {
-    /// File for the secret seed, which must not exist: [fleet] nkey_file
+    /// File for the secret seed, which must not exist: `[fleet] nkey_file`
     file: PathBuf,
 }
 
