@@ -124,7 +124,7 @@ pub enum Placement {
 }
 
 impl Platform {
-    /// Opens what a config names; `altitude_m` is a fixed platform's. An autopilot's poses come in through [`Platform::live`].
+    /// Opens what a config names; `altitude_m` is a fixed platform's. An autopilot's poses come in through [`Platform::inbox`].
     pub fn open(config: &Config, world: &geo::Config, altitude_m: f64) -> Result<Self, Error> {
         config.validate()?;
         let terrain = Terrain::of_config(world)?;

@@ -52,7 +52,7 @@ pub(super) fn measure_all(scenes: usize, seed: u64, progress: &mut dyn FnMut(&Ce
     Ok(rows)
 }
 
-/// Cells that [`measure_all`] measures.
+/// Cells that are measured.
 pub const CELLS: usize = 2 * SIGMAS_MM.len();
 
 fn measure(cell: &Cell, is_read_noise: bool, scenes: usize, seed: u64) -> Result<Vec<Row>, Error> {
