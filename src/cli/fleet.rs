@@ -21,7 +21,7 @@ pub struct Args {
     /// Address for the API instead of the one configured
     #[arg(long)]
     listen: Option<Listen>,
-    /// Do not run: print the alert events of what a hub has recorded, a file or a [record] folder, one JSON object each
+    /// Do not run: print the alert events of what a hub has recorded, a file or a `[record]` folder, one JSON object each
     #[arg(long, value_name = "PATH", conflicts_with = "listen")]
     review: Option<PathBuf>,
 }
