@@ -354,7 +354,7 @@ async fn a_lying_sapient_side_costs_its_own_connection_only() {
     let (round, mut stream) = tokio::join!(updates.round(&context), accept(&listener));
     round.unwrap();
     let (mut reading, mut writing) = stream.split();
-    // A hundred thousand acknowledgements of alerts that do not exist, and as many that are no messages.
+    // A million acknowledgements of alerts that do not exist, and as many that are no messages.
     let mut unknown = vec![0x0a, 26];
     unknown.extend_from_slice(b"01ARYZ6S41TSV4RRFFQ69G5FAV");
     unknown.extend_from_slice(&[0x28, 0x01]);
@@ -362,7 +362,7 @@ async fn a_lying_sapient_side_costs_its_own_connection_only() {
     flood.extend([2, 0, 0, 0, 0xff, 0xff]);
     let flood = flood.repeat(1000);
     let flooding = async {
-        for _ in 0..100 {
+        for _ in 0..1000 {
             writing.write_all(&flood).await.unwrap();
         }
     };
