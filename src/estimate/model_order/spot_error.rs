@@ -27,6 +27,9 @@ const HIGH_PEAK: f64 = 0.2;
 /// something in common.
 const LEAST_SPOTS: usize = 3;
 const CHANCE: f64 = 5.0;
+/// Width of a sensor, σ, up to which one or two spots show no shape beside a width: on narrower ones spots are all core. Smaller takes melted
+/// spots of another width for a lens's, larger leaves two spots of a lens on 20 × 20 pixels to invented sources.
+const NARROW: f64 = 8.5;
 /// Share of the variance that the halo of other spots adds to a position: their misfit is smooth across a spot, while the weights must hold
 /// at its worst place. Found from Airy discs at SNR 1000, the kind of spot whose positions others move most.
 const POSITION_SHARE: f64 = 0.1;
@@ -64,6 +67,7 @@ pub(crate) fn inspect_shape(
     budget: &mut WorkBudget,
 ) -> Shape {
     let is_explained = excess < MOST_EXCESS;
+    let is_narrow = space.bases.axes().iter().any(|b| b.edges[b.n] - b.edges[0] < NARROW);
     let has_width = hypothesis.nuisances.width != Width::Known;
     let (merged, separate) = (bright_spots(hypothesis, true), bright_spots(hypothesis, false));
     let mut alternatives = match is_explained {
@@ -91,7 +95,11 @@ pub(crate) fn inspect_shape(
                 return Shape::Simpler(candidate.into_hypothesis());
             }
         }
-        let least = if excess < CHANCE && !has_width { LEAST_SPOTS } else { 1 };
+        let least = if excess < CHANCE && (!has_width || is_narrow) {
+            LEAST_SPOTS
+        } else {
+            1
+        };
         let error = common_misfit(&mut search, &mut candidate, least);
         if error > 0.0 {
             return Shape::Different(error, candidate.into_hypothesis());
