@@ -3,10 +3,13 @@
 mod light;
 mod range;
 mod registry;
+mod state;
 
 pub use light::{Config, KnownLight, LightError, LightSource, MAX_LIGHTS, Request, from_config};
 pub use range::Learned;
-pub use registry::{KnownLightStatus, LightRecord};
+pub use registry::LightRecord;
+pub use state::KnownLightStatus;
 
 pub(super) use range::Change;
-pub(super) use registry::{KnownLights, LightState};
+pub(super) use registry::KnownLights;
+pub(super) use state::LightState;
