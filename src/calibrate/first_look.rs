@@ -2,7 +2,9 @@
 
 use ndarray::{Array2, s};
 
+use super::bad_pixels::bad_pixels;
 use super::photon_transfer::{self, PhotonTransfer, mean_of};
+use crate::stats::median;
 
 /// What frames show of a camera.
 #[derive(Clone, Debug)]
@@ -42,8 +44,11 @@ const WIDTHS: std::ops::RangeInclusive<f64> = 0.3..=40.0;
 /// are rounded to multiples of `step`: 1 for counts, 0 for joules.
 pub fn look(frames: &[Array2<f64>], saturation: f64, dark: &[Array2<f64>], step: f64) -> FirstLook {
     let unlit = if dark.is_empty() { frames } else { dark };
-    let bad = photon_transfer::bad_pixels(unlit, step);
-    let dark_counts = (!dark.is_empty()).then(|| median(mean_of(dark).into_iter()));
+    let bad = bad_pixels(unlit, step);
+    let dark_counts = match dark.is_empty() {
+        true => None,
+        false => median(mean_of(dark).into_iter().collect()),
+    };
     let noise = photon_transfer::measure(frames, saturation, &bad, dark_counts);
     let mut reached = Array2::from_elem(bad.dim(), false);
     for frame in frames {
@@ -73,7 +78,7 @@ pub fn look(frames: &[Array2<f64>], saturation: f64, dark: &[Array2<f64>], step:
 impl FirstLook {
     /// Median width of the spots, pixels.
     pub fn spot_sigma(&self) -> Option<f64> {
-        (!self.spots.is_empty()).then(|| median(self.spots.iter().map(|s| s.sigma)))
+        median(self.spots.iter().map(|s| s.sigma).collect())
     }
 }
 
@@ -81,7 +86,7 @@ impl FirstLook {
 fn spots_of(mean: &Array2<f64>, unusable: &Array2<bool>, noise: f64) -> Vec<FoundSpot> {
     const AROUND: usize = 2;
     let (ny, nx) = mean.dim();
-    let ground = median(mean.iter().copied());
+    let ground = median(mean.iter().copied().collect()).unwrap_or_default();
     let mut peaks: Vec<(usize, usize)> = Vec::new();
     for ((y, x), value) in mean.indexed_iter() {
         if *value < ground + BRIGHT * noise || unusable[[y, x]] {
@@ -133,7 +138,7 @@ fn moments(mean: &Array2<f64>, (row, column): (usize, usize)) -> Option<FoundSpo
             let r2 = ((y0 + i) as f64 - y).powi(2) + ((x0 + j) as f64 - x).powi(2);
             r2 > (0.9 * reach).powi(2)
         });
-        let ground = median(edge.map(|(_, v)| *v));
+        let ground = median(edge.map(|(_, v)| *v).collect()).unwrap_or_default();
         let mut sums = [0.0; 4];
         for ((i, j), value) in window.indexed_iter() {
             let (dy, dx) = ((y0 + i) as f64 - y, (x0 + j) as f64 - x);
@@ -167,12 +172,6 @@ fn moments(mean: &Array2<f64>, (row, column): (usize, usize)) -> Option<FoundSpo
         }
     }
     None
-}
-
-fn median(values: impl Iterator<Item = f64>) -> f64 {
-    let mut values: Vec<f64> = values.collect();
-    values.sort_by(f64::total_cmp);
-    values.get(values.len() / 2).copied().unwrap_or_default()
 }
 
 #[cfg(test)]

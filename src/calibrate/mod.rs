@@ -1,5 +1,6 @@
 //! Layer 2: fits the camera, the spot and the pixel maps to frames with known positions, or without.
 
+mod bad_pixels;
 mod bundle;
 mod cross_validation;
 mod device;

@@ -10,6 +10,7 @@ use super::{CUTOFF_M, Cell, Error, Noise};
 use crate::assign::ospa;
 use crate::estimate;
 use crate::optics::Camera;
+use crate::stats::median;
 
 /// Exposures, s: the paper's, and what a camera of 10, 100 or 1000 frames a second takes.
 pub(super) const EXPOSURES_S: [f64; 4] = [1.0, 0.1, 0.01, 0.001];
@@ -166,11 +167,6 @@ fn errors_m2(
         }
     }
     Ok(errors)
-}
-
-fn median(mut values: Vec<f64>) -> Option<f64> {
-    values.sort_by(f64::total_cmp);
-    values.get(values.len() / 2).copied()
 }
 
 pub(super) fn markdown(rows: &[Row], scenes: usize, seed: u64) -> String {
