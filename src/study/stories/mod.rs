@@ -63,16 +63,7 @@ impl Actor {
             user: None,
             beam: Box::new(path),
             claim: Box::new(|_| None),
-            period_s: 1.0,
-            phase_s: 0.0,
-            sigma_m: 0.3,
-            states_sigma: true,
-            ended_at: None,
-            energy_j: 0.007,
-            glow: Box::new(|_| 1.0),
-            fading: 0.25,
-            reflects: None,
-            reports_w: None,
+            ..Self::new("", |_| [0.0; 2])
         }
     }
 
