@@ -18,8 +18,9 @@ class Stream:
     NaN where a slot is empty.
     """
 
-    def __init__(self, program: Path, scene: Path, samples: int, first: int, seed: int):
-        command = [program.resolve(), "training-data", "--scene", scene, "--samples", samples, "--first", first, "--seed", seed]
+    def __init__(self, program: Path, scene: Path, samples: int, first: int, seed: int, scatter: list[str] = []):
+        """scatter: options of `oapwatch training-data` that spread samples over devices."""
+        command = [program.resolve(), "training-data", "--scene", scene, "--samples", samples, "--first", first, "--seed", seed, *scatter]
         self.process = subprocess.Popen([str(c) for c in command], stdout=subprocess.PIPE)
         line = self.process.stdout.readline()
         if not line:
@@ -57,8 +58,9 @@ class Streams:
     how fast each process is. With one process it is that of one `Stream`.
     """
 
-    def __init__(self, program: Path, scene: Path, first: int, last: int, seed: int, processes: int):
+    def __init__(self, program: Path, scene: Path, first: int, last: int, seed: int, processes: int, scatter: list[str] = []):
         self.source = (program, scene)
+        self.scatter = scatter
         self.range = (first, last)
         self.seed = seed
         self.processes = processes
@@ -70,7 +72,7 @@ class Streams:
             end = min(last, first + LEG)
             cuts = [first + (end - first) * k // self.processes for k in range(self.processes + 1)]
             parts = [(a, b - a) for a, b in zip(cuts, cuts[1:]) if b > a]
-            self.open = [Stream(*self.source, count, start, self.seed) for start, count in parts]
+            self.open = [Stream(*self.source, count, start, self.seed, self.scatter) for start, count in parts]
             waiting = [self._ahead(stream, size) for stream in self.open]
             while waiting:
                 for batches in list(waiting):

@@ -115,6 +115,8 @@ def main() -> None:
     )
     parser.add_argument("--batch", type=int, default=32)
     parser.add_argument("--rate", type=float, default=3e-3, help="largest learning rate; falls as a cosine to nothing")
+    parser.add_argument("--devices", type=int, default=1, help="that samples are spread over, each with gains of its own")
+    parser.add_argument("--width-std", type=float, default=0.0, help="relative scatter of the spot's width from device to device")
     parser.add_argument("--target-sigma-px", type=float, default=0.7)
     parser.add_argument("--from-run", type=Path, help="begin with the weights of another run of the same network")
     parser.add_argument("--precision", choices=("bf16", "f32"), default="bf16", help="of the convolutions while training")
@@ -130,7 +132,8 @@ def main() -> None:
     torch.manual_seed(0)
     args.out.mkdir(parents=True, exist_ok=True)
 
-    held_out = Stream(args.program, args.scene, VALIDATION, 0, VALIDATION_SEED)
+    scatter = ["--devices", str(args.devices), "--width-std", str(args.width_std)]
+    held_out = Stream(args.program, args.scene, VALIDATION, 0, VALIDATION_SEED, scatter)
     layout = held_out.layout
     validation = list(held_out.batches(32))
     held_out.close()
@@ -149,7 +152,7 @@ def main() -> None:
         if args.from_run:
             network.body.load_state_dict(torch.load(args.from_run / "checkpoint.pt", map_location=device)["body"])
         if args.network.endswith("-white"):
-            first = Stream(args.program, args.scene, WHITENING, 0, TRAINING_SEED)
+            first = Stream(args.program, args.scene, WHITENING, 0, TRAINING_SEED, scatter)
             network.front.learn(next(first.batches(WHITENING))[0].to(device))
             first.close()
     about = {"name": args.network, "target_sigma_px": args.target_sigma_px, "layout": layout}
@@ -176,7 +179,7 @@ def main() -> None:
     if progress() >= 1.0:
         print(f"{args.out} is trained: {seen} samples in {spent:.0f} s")
         return
-    stream = Streams(args.program, args.scene, seen, args.samples, TRAINING_SEED, processes)
+    stream = Streams(args.program, args.scene, seen, args.samples, TRAINING_SEED, processes, scatter)
     bar = tqdm(total=args.samples, initial=seen, unit="sample", smoothing=0.05, mininterval=1.0)
     done = kept = progress()
     for frames, emitters, is_leg in stream.batches(args.batch):

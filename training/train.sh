@@ -1,9 +1,15 @@
 #!/usr/bin/env bash
 # Trains, exports and draws every network of the paper's table: ./training/train.sh [MINUTES] [SAMPLES]
+# or one for the lens of a config, by its calibration: ./training/train.sh --config oapwatch.toml [MINUTES] [SAMPLES]
 # MINUTES is the CPU time for each 64 × 64 network; others get their share by the number of pixels (between 1/4 and 2 times).
 # On a GPU where PyTorch finds one (DEVICE=cpu prevents it); MINUTES are then the clock's.
 # Can be stopped at any time and started again. Then: oapwatch tradeoff --networks training/models
 set -euo pipefail
+config=
+if [ "${1:-}" = --config ]; then
+  config=$(realpath "${2:?--config: expected a config file}")
+  shift 2
+fi
 cd "$(dirname "$0")/.."
 minutes=${1:-60}
 samples=${2:-500000}
@@ -19,6 +25,17 @@ if [ ! -x "$python" ]; then
 fi
 if [ ! -x "$program" ]; then cargo build --release --locked; fi
 mkdir -p training/runs training/models
+if [ -n "$config" ]; then
+  scene=training/runs/own-lens.toml
+  read -r width_std sigma_px lens < <("$python" training/device.py --config "$config" --light training/scenes/energy-1mm.toml --out "$scene")
+  # Where a spot is wider than four convolutions see, frames are whitened.
+  network=${NETWORKS:-cnn16}$(awk "BEGIN { if ($sigma_px > 4) print \"-white\" }")
+  run=training/runs/own-lens-$network-$lens
+  "$python" training/train.py --program "$program" --network "$network" --scene "$scene" --out "$run" --samples "$samples" --minutes "$minutes" \
+    --device "$device" --devices 16 --width-std "$width_std"
+  "$python" training/export.py --program "$program" --run "$run" --scene "$scene" --out training/models/own-lens.onnx
+  exit
+fi
 # A U-Net is given fewer samples than it could use: each begins with what the next smaller array's has learned.
 declare -A smaller
 for pixels in $sizes; do

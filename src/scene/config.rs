@@ -162,7 +162,8 @@ impl Scene {
     /// range (the field is named).
     pub fn load(path: &Path) -> Result<Self, Error> {
         let mut scene: Self = toml_file::read(path)?;
-        if let (Some(SpotEffect::Template { file, .. }), Some(folder)) = (&mut scene.effects.spot, path.parent()) {
+        let spot_file = scene.effects.spot.as_mut().and_then(SpotEffect::file_mut);
+        if let (Some(file), Some(folder)) = (spot_file, path.parent()) {
             *file = folder.join(&*file);
         }
         let log = scene.platform.as_mut().and_then(|platform| platform.log.as_mut());
@@ -191,6 +192,22 @@ impl Scene {
             scene.optics.saturation_j = None;
         }
         scene
+    }
+
+    /// The same scene through a device whose spots are wider by `factor`.
+    ///
+    /// # Errors
+    /// The spot is neither the Gaussian of `[optics] spot_sigma_m` nor a calibration's, or the width is out of range.
+    pub fn with_width(&self, factor: f64) -> Result<Self, Error> {
+        let mut scene = self.clone();
+        let key = Key::new("effects.spot");
+        match (&mut scene.effects.spot, &mut scene.optics.spot_sigma_m) {
+            (Some(SpotEffect::Calibration { width, .. }), _) => *width *= factor,
+            (None, Some(sigma)) => *sigma *= factor,
+            (Some(other), _) => return Err(key.refuse("a spot of kind \"calibration\"", other.kind()).into()),
+            (None, None) => return Err(Key::new("optics").at("spot_sigma_m").refuse("a width", "none").into()),
+        }
+        scene.validate().map(|()| scene)
     }
 
     /// Checks every field that the optics do not check themselves.

@@ -13,7 +13,7 @@ use crate::scene::{Plan, SimulatedFrame};
 
 /// Most emitters a sample can name.
 pub const SLOTS: usize = 16;
-/// Samples made at a time.
+/// Samples made at a time, and of a device in a row.
 const BATCH: u64 = 64;
 
 /// The first line of the stream.
@@ -39,9 +39,12 @@ pub enum Error {
     Io(#[from] std::io::Error),
 }
 
-/// Writes samples `first .. first + samples` of a plan. Any part of a stream can be made again from its number.
-pub fn write(plan: &Plan, scene: &str, first: u64, samples: u64, out: &mut impl Write) -> Result<(), Error> {
-    let camera = plan.camera();
+/// Writes samples `first .. first + samples`, [`BATCH`] of each device in turn. Any part of a stream can be made again from its number.
+///
+/// `devices`: at least one, with cameras of one shape; the first is the one that the stream describes.
+pub fn write(devices: &[Plan], scene: &str, first: u64, samples: u64, out: &mut impl Write) -> Result<(), Error> {
+    let device = |k: u64| &devices[(k / BATCH) as usize % devices.len()];
+    let camera = devices[0].camera();
     let pitch = [camera.x.pitch_m, camera.y.pitch_m];
     let layout = Layout {
         nx: camera.x.n,
@@ -62,7 +65,7 @@ pub fn write(plan: &Plan, scene: &str, first: u64, samples: u64, out: &mut impl 
         let stop = end.min(next + BATCH);
         let encoded: Vec<Vec<u8>> = (next..stop)
             .into_par_iter()
-            .map(|k| encode(plan, &plan.frame(k)))
+            .map(|k| encode(device(k), &device(k).frame(k)))
             .collect::<Result<_, _>>()?;
         for bytes in encoded {
             out.write_all(&bytes)?;
@@ -101,7 +104,7 @@ mod tests {
     fn a_sample_holds_its_frame_and_its_truth() {
         let plan = Plan::compile(&Scene::builtin(), 3).unwrap();
         let mut bytes = Vec::new();
-        write(&plan, "builtin", 60, 2, &mut bytes).unwrap();
+        write(std::slice::from_ref(&plan), "builtin", 60, 2, &mut bytes).unwrap();
         let line = bytes.iter().position(|&b| b == b'\n').unwrap();
         let layout: serde_json::Value = serde_json::from_slice(&bytes[..line]).unwrap();
         assert_eq!((layout["nx"].as_u64(), layout["slots"].as_u64()), (Some(64), Some(16)));
@@ -119,5 +122,25 @@ mod tests {
         let noise = plan.camera().noise_std_j;
         assert_eq!(sample[3 * SLOTS + 65], (simulated.frame.pixels[[1, 1]] / noise) as f32);
         assert!(sample[3 * simulated.truth.emitters.len()].is_nan());
+    }
+
+    #[test]
+    fn devices_take_turns_wherever_a_stream_begins() {
+        let plans: Vec<Plan> = [3, 4]
+            .map(|seed| Plan::compile(&Scene::builtin(), seed).unwrap())
+            .into();
+        let stream = |first, samples| {
+            let mut bytes = Vec::new();
+            write(&plans, "builtin", first, samples, &mut bytes).unwrap();
+            let line = bytes.iter().position(|&b| b == b'\n').unwrap();
+            bytes.split_off(line + 1)
+        };
+        let (whole, part) = (stream(0, 130), stream(60, 8));
+        let sample = 4 * (3 * SLOTS + 64 * 64);
+        assert_eq!(whole[60 * sample..68 * sample], part);
+        let of = |plan: &Plan, k: u64| encode(plan, &plan.frame(k)).unwrap();
+        for (k, device) in [(63, 0), (64, 1), (127, 1), (128, 0)] {
+            assert_eq!(whole[k * sample..(k + 1) * sample], of(&plans[device], k as u64), "{k}");
+        }
     }
 }

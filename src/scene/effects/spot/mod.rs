@@ -1,5 +1,6 @@
 //! Spots of real lenses: what `[effects.spot]` puts in the place of the Gaussian.
 
+mod calibrated;
 mod density;
 mod image_table;
 mod pupil;
@@ -35,6 +36,16 @@ pub enum SpotEffect {
     },
     /// Measured: a text file of rows of numbers, `pitch_m` apart, bottom row first, its centroid in the middle.
     Template { file: PathBuf, pitch_m: f64 },
+    /// What `oapwatch calibrate` learned, over the field, all lengths times `width`.
+    Calibration {
+        file: PathBuf,
+        #[serde(default = "as_learned")]
+        width: f64,
+    },
+}
+
+fn as_learned() -> f64 {
+    1.0
 }
 
 /// A compiled [`SpotEffect`].
@@ -56,10 +67,19 @@ impl SpotEffect {
             Self::Zernike { .. } => "zernike",
             Self::Ghost { .. } => "ghost",
             Self::Template { .. } => "template",
+            Self::Calibration { .. } => "calibration",
         }
     }
 
-    /// Computes the images. Only a template's file can fail.
+    /// The file beside the scene that it is read from.
+    pub fn file_mut(&mut self) -> Option<&mut PathBuf> {
+        match self {
+            Self::Template { file, .. } | Self::Calibration { file, .. } => Some(file),
+            _ => None,
+        }
+    }
+
+    /// Computes the images. Only a file can fail.
     pub(in crate::scene) fn images(&self, camera: &Camera, field: &Key) -> Result<SpotImages, OutOfRange> {
         let one = |finest: f64, radius: f64, density: &dyn Fn(f64, f64) -> f64| SpotImages {
             tables: vec![ImageTable::of_density(camera, finest, radius, density)],
@@ -88,15 +108,7 @@ impl SpotEffect {
             }
             Self::Zernike { first_zero_m, term } => {
                 let is_uniform = term.iter().all(|t| t.waves.len() == 1);
-                let node = |k: usize| 2.0 * k as f64 / (NODES - 1) as f64 - 1.0;
-                let places: Vec<[f64; 2]> = match is_uniform {
-                    true => vec![[0.0; 2]],
-                    false => (0..NODES * NODES).map(|k| [node(k % NODES), node(k / NODES)]).collect(),
-                };
-                let tables = places.iter().map(|at| pupil::table(camera, *first_zero_m, term, *at));
-                SpotImages {
-                    tables: tables.collect(),
-                }
+                over_the_field(is_uniform, |at| pupil::table(camera, *first_zero_m, term, at))
             }
             Self::Template { file, pitch_m } => {
                 let samples = density::read_template(file, &field.at("file"))?;
@@ -105,7 +117,31 @@ impl SpotEffect {
                     density::sampled(&samples, *pitch_m, x, y)
                 })
             }
+            Self::Calibration { file, width } => {
+                let shape = calibrated::read(file, &field.at("file"))?;
+                let half = [camera.x.half_width(), camera.y.half_width()];
+                let knot_m = shape.x_profile(0).knot_m();
+                over_the_field(shape.is_uniform(), |[u, v]| {
+                    let place = [u * half[0], v * half[1]];
+                    ImageTable::of_density(camera, 4.0 * width * knot_m, width * shape.radius_m(), &|x, y| {
+                        shape.density(place, [x / width, y / width])
+                    })
+                })
+            }
         })
+    }
+}
+
+/// A table for the whole field, or one for each of its places in units of half the sensor.
+fn over_the_field(is_uniform: bool, table: impl Fn([f64; 2]) -> ImageTable) -> SpotImages {
+    let node = |k: usize| 2.0 * k as f64 / (NODES - 1) as f64 - 1.0;
+    SpotImages {
+        tables: match is_uniform {
+            true => vec![table([0.0; 2])],
+            false => (0..NODES * NODES)
+                .map(|k| table([node(k % NODES), node(k / NODES)]))
+                .collect(),
+        },
     }
 }
 
@@ -172,6 +208,11 @@ impl Table for SpotEffect {
             Self::Template { file, pitch_m } => {
                 length("pitch_m", *pitch_m)?;
                 density::read_template(file, &field.at("file")).map(drop)
+            }
+            Self::Calibration { file, width } => {
+                let reason = "beyond, the spot is another lens's";
+                field.at("width").within(*width, 0.5..=2.0, reason)?;
+                calibrated::read(file, &field.at("file")).map(drop)
             }
         }
     }

@@ -22,8 +22,12 @@ fn image(effect: &SpotEffect, centre: [f64; 2]) -> Vec<f64> {
     pixels
 }
 
-/// Σ over a fine grid within each pixel.
+/// Σ over a fine grid within each pixel, of a density of the radius.
 fn exact(centre: [f64; 2], density: impl Fn(f64) -> f64) -> Vec<f64> {
+    exact_at(centre, |x, y| density(x.hypot(y)))
+}
+
+fn exact_at(centre: [f64; 2], density: impl Fn(f64, f64) -> f64) -> Vec<f64> {
     let camera = camera();
     let m = 8;
     let mut pixels: Vec<f64> = (0..64 * 64)
@@ -37,7 +41,7 @@ fn exact(centre: [f64; 2], density: impl Fn(f64) -> f64) -> Vec<f64> {
                     at(&camera.y, p / 64, s / m) - centre[1],
                 )
             });
-            points.map(|(x, y)| density(x.hypot(y))).sum()
+            points.map(|(x, y)| density(x, y)).sum()
         })
         .collect();
     let total: f64 = pixels.iter().sum();
@@ -111,5 +115,44 @@ fn coma_grows_away_from_the_middle() {
     assert!(
         middle.abs() < 0.05 && right.abs() > 0.2 && (left + right).abs() < 0.05,
         "{left} {middle} {right}"
+    );
+}
+
+#[test]
+fn a_learned_spot_changes_over_the_field_and_scales() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("calibration.toml");
+    // A wide spot that turns into a narrow one along +x; each profile's coefficients add up to one.
+    let wide = "[0.05, 0.1, 0.2, 0.3, 0.2, 0.1, 0.05]";
+    let narrow = "[0.0, 0.05, 0.2, 0.5, 0.2, 0.05, 0.0]";
+    let term =
+        |field: &str, profile: &str| format!("[[spot.shape.term]]\nfield = {field}\nx = {profile}\ny = {profile}\n");
+    let text = format!(
+        "version = 1\n[spot]\nsigma_m = 0.001\ngrowth = 0.0\n[spot.shape]\nknot_m = 0.0008\nhalf_sensor_m = [0.015, 0.015]\n{}{}",
+        term("[0.5, -0.5]", wide),
+        term("[0.5, 0.5]", narrow)
+    );
+    std::fs::write(&file, text).unwrap();
+    let shape = calibrated::read(&file, &Key::new("spot")).unwrap();
+    for (centre, width) in [
+        ([0.0003, -0.00075], 1.0),
+        ([0.0053, 0.0021], 1.0),
+        ([-0.0107, 0.0012], 1.1),
+    ] {
+        let effect = SpotEffect::Calibration {
+            file: file.clone(),
+            width,
+        };
+        let expected = exact_at(centre, |x, y| shape.density(centre, [x / width, y / width]));
+        let error = worst(&image(&effect, centre), &expected);
+        // The fine grid's own error.
+        assert!(error < 2e-3, "{centre:?}: {error}");
+        assert!(effect.validate(&Key::new("spot")).is_ok());
+    }
+    std::fs::write(&file, "version = 1\n[spot]\nsigma_m = 0.001\ngrowth = 0.0\n").unwrap();
+    let message = calibrated::read(&file, &Key::new("spot.file")).unwrap_err().to_string();
+    assert!(
+        message.contains("spot.file") && message.contains("a Gaussian"),
+        "{message}"
     );
 }
