@@ -3,6 +3,7 @@
 
 mod config;
 mod sight;
+mod smear;
 mod terrain;
 mod view;
 mod wgs84;

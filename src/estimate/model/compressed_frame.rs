@@ -7,7 +7,7 @@ use crate::estimate::model::svd_basis::Basis;
 use crate::estimate::preprocess::masked_pixels::{MaskedPixel, MaskedPixels};
 use crate::estimate::preprocess::noise_variance::VarianceFunction;
 use crate::estimate::preprocess::screening::PreprocessedFrame;
-use crate::optics::Camera;
+use crate::optics::{Camera, DisplacedSpots};
 
 /// Largest part of the brightest spot that may be left outside the basis, in units of the noise: less costs columns, more biases
 /// positions by 2 % of their standard deviation and more.
@@ -46,6 +46,7 @@ pub(crate) struct CompressedFrame {
     pub variance: VarianceFunction,
     pub mean_variance: f64,
     pub light_weighted_variance: f64,
+    pub smear: Option<DisplacedSpots>,
     rows: Vec<f64>,
 }
 
@@ -83,6 +84,7 @@ impl CompressedFrame {
             bx.rank(LOSS / (amplitude * norm(by))),
             by.rank(LOSS / (amplitude * norm(bx))),
         ];
+        self.smear.clone_from(&frame.smear);
         self.mx = self.rank[0].next_multiple_of(4).min(bx.stride);
         self.my = self.rank[1].next_multiple_of(4).min(by.stride);
         // Columns up to the multiple of 4 are stored anyway: use them.
