@@ -2,6 +2,7 @@
 //! Jacobians.
 
 mod config;
+mod geoid;
 mod sight;
 mod smear;
 mod terrain;
@@ -9,6 +10,7 @@ mod view;
 mod wgs84;
 
 pub use config::{Config, ConfigError, Datum, Origin};
+pub use geoid::undulation_m;
 pub use sight::{GroundPoint, Sight};
 pub use terrain::{Error as TerrainError, Fault as TerrainFault, Ground, Terrain};
 pub use view::{Placed, View};
