@@ -307,7 +307,7 @@ impl Estimator for AnalyticEstimator {
     }
 
     fn set_smear(&mut self, smear: Option<&Smear>) {
-        self.frame.smear = smear.map(|s| s.displaced(&self.camera));
+        self.frame.smear = smear.map(|s| s.displaced(&self.camera, 1.0));
     }
 
     fn estimate_until(&mut self, frame: &Frame, is_over: &dyn Fn() -> bool) -> Result<Estimate, Error> {

@@ -59,7 +59,7 @@ impl Estimator for NetworkEstimator {
     }
 
     fn set_smear(&mut self, smear: Option<&Smear>) {
-        self.frame.smear = smear.map(|s| s.displaced(&self.camera));
+        self.frame.smear = smear.map(|s| s.displaced(&self.camera, 1.0));
     }
 
     /// The network's time is the same for every frame and the fit's steps are few: `_is_over` is not asked.

@@ -16,7 +16,7 @@ pub(crate) struct PreprocessedFrame {
     pub flagged: Vec<FlaggedPixel>,
     pub is_masked: Vec<bool>,
     pub saturated: usize,
-    /// How spots are smeared by motion; set before a frame is loaded, and for those that follow.
+    /// How spots are smeared by motion, for the frames that are loaded from now on.
     pub smear: Option<DisplacedSpots>,
 }
 
