@@ -36,6 +36,7 @@ fn frame(camera: &optics::Camera) -> (Frame, Vec<[f64; 2]>) {
         time: jiff::Timestamp::UNIX_EPOCH,
         pixels,
         masked: None,
+        exposure_s: None,
     };
     (frame, places)
 }

@@ -234,6 +234,8 @@ impl Config {
             &mut self.api.read_token_file,
             &mut self.api.tls_cert_file,
             &mut self.api.tls_key_file,
+            &mut self.api.background.picture,
+            &mut self.api.background.tiles,
             &mut self.journal.path,
             &mut self.fleet.ca_file,
             &mut self.fleet.credentials_file,

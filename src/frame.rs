@@ -15,6 +15,8 @@ pub struct Frame {
     /// `true` where the pixel carries no usable value (dead, hot, outside the region of interest).
     /// Saturation is not marked here: it follows from the camera's `saturation_j`.
     pub masked: Option<Array2<bool>>,
+    /// How long light was collected, s, where that is known: a camera that moves smears spots by it.
+    pub exposure_s: Option<f64>,
 }
 
 impl Frame {

@@ -43,7 +43,7 @@ pub struct Pipeline {
     estimator: Box<dyn Estimator>,
     /// Time allowed a frame.
     budget: Option<Duration>,
-    saturation_j: f64,
+    camera: Camera,
     platform: Platform,
     pub claims: Store,
     pub monitor: Monitor,
@@ -119,7 +119,7 @@ impl Pipeline {
         Ok(Self {
             estimator: estimate::build(&config.estimator, camera)?,
             budget: config.estimator.budget(),
-            saturation_j: camera.saturation_limit_j(),
+            camera: camera.clone(),
             platform: Platform::open(&config.platform, &config.world, camera.altitude_m)?,
             claims: Store::new(&config.claims),
             monitor,
@@ -162,6 +162,11 @@ impl Pipeline {
     pub fn step(&mut self, frame: &Frame) -> Step {
         let began = Instant::now();
         let digest = frame.digest();
+        let placement = self.platform.at(frame.time);
+        let smear = frame
+            .exposure_s
+            .and_then(|s| self.platform.smear(&placement, &self.camera, frame.time, s));
+        self.estimator.set_smear(smear.as_ref());
         let digested = Instant::now();
         let is_over = || self.budget.is_some_and(|budget| digested.elapsed() >= budget);
         let estimate = match self.blinding_share(frame) {
@@ -169,7 +174,6 @@ impl Pipeline {
             None => self.estimator.estimate_until(frame, &is_over),
         };
         let estimated = Instant::now();
-        let placement = self.platform.at(frame.time);
         let look = match &placement {
             Placement::Level => Look::Level,
             Placement::At { sight, pose, is_lost } => Look::From {
@@ -205,7 +209,8 @@ impl Pipeline {
     /// Share of the frame's pixels that are saturated, where it is too large for the frame to show anything. Whoever dazzles the
     /// sensor must not buy time with frames that take long to make sense of.
     fn blinding_share(&self, frame: &Frame) -> Option<f64> {
-        let saturated = frame.pixels.iter().filter(|p| **p >= self.saturation_j).count();
+        let limit_j = self.camera.saturation_limit_j();
+        let saturated = frame.pixels.iter().filter(|p| **p >= limit_j).count();
         let share = saturated as f64 / frame.pixels.len().max(1) as f64;
         (share >= monitor::BLINDING_SHARE).then_some(share)
     }

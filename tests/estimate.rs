@@ -39,6 +39,7 @@ fn frame(pixels: Array2<f64>) -> Frame {
         time: jiff::Timestamp::UNIX_EPOCH,
         pixels,
         masked: None,
+        exposure_s: None,
     }
 }
 

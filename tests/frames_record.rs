@@ -25,6 +25,7 @@ fn frame(k: u64) -> Frame {
             (k as f64 + 0.1) * 1e-9 + y as f64 / 3.0 - x as f64 * f64::EPSILON
         }),
         masked: (k % 2 == 1).then(|| Array2::from_shape_fn((4, 5), |(y, x)| y == 1 && x as u64 == k % 5)),
+        exposure_s: (k % 3 == 1).then_some(0.02),
     }
 }
 

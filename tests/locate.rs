@@ -227,8 +227,6 @@ fn over_terrain_positions_are_where_rays_meet_it() {
             assert!(message.contains("terrain") && message.contains(expected), "{message}");
         }
     };
-    config("ellipsoid", "terrain = \"dem.tif\"");
-    refused("datum = \"msl\"");
     config("msl", "terrain = \"missing.tif\"");
     refused("missing.tif: expected a readable file");
     std::fs::write(folder.path().join("dem.tif"), plateau(900.0)).unwrap();

@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
+use super::background;
 use super::client::{NoNetwork, TrustedProxies};
 use super::listener::Listen;
 
@@ -36,6 +37,8 @@ pub struct Config {
     pub requests_per_second: u32,
     /// A client that takes longer to send a request, or to take a byte of the answer, is cut off.
     pub client_timeout_s: f64,
+    /// What lies below the page's map.
+    pub background: background::Config,
 }
 
 /// Why the API cannot be served as configured.
@@ -81,6 +84,7 @@ impl Default for Config {
             max_connections: 2048,
             requests_per_second: 200,
             client_timeout_s: 15.0,
+            background: background::Config::default(),
         }
     }
 }

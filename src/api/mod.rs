@@ -8,6 +8,7 @@ mod alerts;
 mod audit;
 mod audit_log;
 mod auth;
+mod background;
 mod claims;
 mod client;
 mod conditional;
@@ -47,6 +48,7 @@ mod webhooks;
 mod websocket;
 mod zones;
 
+pub use background::{Background, Error as BackgroundError};
 pub use config::{Config, ConfigError};
 pub use feed::{Feed, Published};
 pub use listener::{Listen, ListenError, Listener};

@@ -10,8 +10,8 @@ use utoipa_axum::routes;
 
 use super::state::State;
 use super::{
-    acknowledge, alerts, audit_log, claims, evidence, frame, geojson, known_lights, maintenance, pose, positions,
-    probes, sse, webhooks, websocket, zones,
+    acknowledge, alerts, audit_log, background, claims, evidence, frame, geojson, known_lights, maintenance, pose,
+    positions, probes, sse, webhooks, websocket, zones,
 };
 
 #[derive(OpenApi)]
@@ -64,6 +64,9 @@ pub fn router() -> (Router<State>, utoipa::openapi::OpenApi) {
         .routes(routes!(maintenance::list, maintenance::begin))
         .routes(routes!(maintenance::end))
         .routes(routes!(frame::frame_png))
+        .routes(routes!(background::description))
+        .routes(routes!(background::picture))
+        .routes(routes!(background::tile))
         .routes(routes!(websocket::websocket))
         .routes(routes!(sse::events))
         .routes(routes!(webhooks::list))

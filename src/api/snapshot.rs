@@ -58,8 +58,12 @@ pub struct ViewStatus {
     pub footprint_z_m: Vec<f64>,
     /// The place below the lens, east and north, m.
     pub nadir_m: [f64; 2],
+    /// Height of the lens, m.
+    pub z_m: f64,
     /// Of the platform, clockwise from north, 0 to 360.
     pub heading_deg: f64,
+    pub roll_deg: f64,
+    pub pitch_deg: f64,
     pub pose_age_s: f64,
 }
 

@@ -9,6 +9,7 @@ use metrics_exporter_prometheus::PrometheusHandle;
 use tokio::sync::{mpsc, oneshot, watch};
 
 use super::audit::Audit;
+use super::background::Background;
 use super::evidence_fit::Fitter;
 use super::feed::Feed;
 use super::picture_cache::PictureCache;
@@ -43,6 +44,8 @@ pub struct State {
     pub(super) axes: Option<LocalAxes>,
     /// Whether places may be known on the earth: there is an origin, or this is a hub, whose stations have their own.
     pub(super) has_latitudes: bool,
+    /// What lies below the page's map.
+    pub(super) background: Option<Arc<Background>>,
     /// Turns true when the server stops: streams then close.
     pub(super) stopping: watch::Sender<bool>,
 }
@@ -66,6 +69,7 @@ impl State {
             ready,
             axes: None,
             has_latitudes: false,
+            background: None,
             notifier: None,
             pictures: Arc::default(),
             stopping: watch::Sender::new(false),
@@ -94,6 +98,11 @@ impl State {
     pub fn with_axes(mut self, axes: Option<LocalAxes>) -> Self {
         self.axes = axes;
         self.has_latitudes = axes.is_some();
+        self
+    }
+
+    pub fn with_background(mut self, background: Option<Background>) -> Self {
+        self.background = background.map(Arc::new);
         self
     }
 

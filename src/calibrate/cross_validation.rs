@@ -43,6 +43,7 @@ pub fn score(estimator: &mut dyn Estimator, frames: &[(usize, &Array2<f64>)], be
             time: Timestamp::UNIX_EPOCH,
             pixels: (*pixels).clone(),
             masked: None,
+            exposure_s: None,
         };
         // All beacons of an unusable frame count as missed, with either calibration.
         let Ok(estimate) = estimator.estimate(&frame) else {

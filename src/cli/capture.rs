@@ -148,6 +148,7 @@ impl Recording {
             time: self.times[0],
             pixels: self.sum / self.times.len() as f64,
             masked: None,
+            exposure_s: None,
         };
         replace(&out.with_extension("png"), &frame_png(&frame, camera, PICTURE_SIDE)?)
     }

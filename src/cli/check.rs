@@ -142,6 +142,7 @@ fn config(file: &Path) -> Result<Checked, Failure> {
     config.log.filter().map_err(Failure::config)?;
     config.journal.validate().map_err(Failure::config)?;
     api::Server::new(config.api.clone()).map_err(Failure::config)?;
+    api::Background::open(&config.api.background, config.world.axes().as_ref()).map_err(Failure::config)?;
     let mut receivers = notify::load(&config.webhook).map_err(Failure::config)?;
     let exports = export::load(&config.export, &receivers, &config.world).map_err(Failure::config)?;
     receivers.extend(exports.into_iter().map(|export| export.endpoint));

@@ -1,19 +1,22 @@
 //! `oapwatch locate`: finds the emitters of every frame of a recording.
 
 use std::io::Write;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::time::Instant;
 
 use anyhow::{Context, anyhow};
+use jiff::Timestamp;
 use serde::Serialize;
 
+use super::recorded::{Recorded, Shot};
 use super::{Failure, Outcome, progress};
 use crate::config::Config;
 use crate::estimate::{self, Emitter, Flags, Velocity};
 use crate::frame::Frame;
-use crate::frames::{self, npy};
 use crate::geo::{Geodetic, LocalAxes, View};
+use crate::optics::Smear;
 use crate::platform::{Placement, Platform};
+use crate::pose::Pose;
 
 #[derive(Debug, clap::Args)]
 #[command(
@@ -26,9 +29,13 @@ pub struct Args {
     /// Estimator to use instead of the configured one; `oapwatch tradeoff` compares them
     #[arg(long)]
     estimator: Option<String>,
-    /// FRAMES.npy, or - for stdin
+    /// FRAMES.npy, - for stdin, or a recording of [record]: a file or the folder, with its own times and poses
     frames: PathBuf,
 }
+
+/// Why a frame has no positions although its emitters may be seen.
+const NO_POSE: &str =
+    "no pose of the platform is known at this time: expected [platform] poses, or a recording that holds them";
 
 /// One line of the output.
 #[derive(Serialize)]
@@ -72,16 +79,26 @@ struct Locator {
 }
 
 impl Locator {
+    /// Where the camera was at a frame's time, by the poses that came with the frame or are on file.
+    fn placement(&mut self, poses: Vec<Pose>, time: Timestamp) -> Placement {
+        self.platform.receive(poses, time);
+        self.platform.at(time)
+    }
+
+    fn smear(&self, placement: &Placement, frame: &Frame) -> Option<Smear> {
+        let camera = &self.view.camera;
+        self.platform.smear(placement, camera, frame.time, frame.exposure_s?)
+    }
+
     /// Moves emitters from where a level camera would see them to where this one does, with its pose's uncertainty. One whose ray
-    /// does not come down to the ground has no position and is left out.
-    fn locate(&mut self, emitters: &[Emitter], time: jiff::Timestamp) -> Vec<Located> {
-        self.platform.receive(Vec::new(), time);
-        self.view.sight = match self.platform.at(time) {
+    /// does not come down to the ground has no position and is left out. `None` while no pose is known.
+    fn locate(&mut self, emitters: &[Emitter], placement: Placement) -> Option<Vec<Located>> {
+        self.view.sight = match placement {
             Placement::Level => None,
             Placement::At { sight, .. } => Some(sight),
-            Placement::Unknown { .. } => return Vec::new(),
+            Placement::Unknown { .. } => return None,
         };
-        emitters.iter().filter_map(|e| self.place(e)).collect()
+        Some(emitters.iter().filter_map(|e| self.place(e)).collect())
     }
 
     fn place(&self, e: &Emitter) -> Option<Located> {
@@ -120,14 +137,8 @@ pub fn run(args: Args) -> Outcome {
     let mut estimator = estimate::build(&config.estimator, &camera)
         .with_context(in_config)
         .map_err(Failure::Config)?;
-    let path = match args.frames == Path::new("-") {
-        true => Path::new("/dev/stdin"),
-        false => &args.frames,
-    };
-    let recording = npy::Reader::open(path, camera.joules_per_count).map_err(Failure::input)?;
+    let recorded = Recorded::open(&args.frames, &config, &camera)?;
     let budget = config.estimator.budget();
-    let start = config.source.start.unwrap_or(jiff::Timestamp::UNIX_EPOCH);
-    let rate_hz = config.source.rate_hz.unwrap_or(frames::Config::DEFAULT_RATE_HZ);
     let platform = Platform::open(&config.platform, &config.world, camera.altitude_m);
     let platform = platform.map_err(Failure::config)?;
     for warning in platform.warnings() {
@@ -138,27 +149,36 @@ pub fn run(args: Args) -> Outcome {
         view: View::level(&camera),
         axes: config.world.axes(),
     };
+    let path = recorded.path().to_owned();
     let mut out = std::io::BufWriter::new(std::io::stdout().lock());
     let bar = progress::count("frames");
     let (mut usable, mut misshapen, mut first_error) = (0_u64, 0_u64, None);
-    for (index, pixels) in recording.enumerate() {
-        let pixels = match pixels {
-            Ok(pixels) => pixels,
+    for shot in recorded {
+        let Shot {
+            index,
+            time,
+            frame,
+            poses,
+        } = match shot {
+            Ok(shot) => shot,
             Err(e) => {
                 out.flush().map_err(Failure::other)?;
                 return Err(Failure::input(e));
             }
         };
-        let frame = Frame {
-            index: index as u64,
-            time: frames::frame_time(start, rate_hz, index as u64),
-            pixels,
-            masked: None,
-        };
         let clock = Instant::now();
         let is_over = || budget.is_some_and(|budget| clock.elapsed() >= budget);
-        let estimate = estimator.estimate_until(&frame, &is_over);
-        let located = estimate.as_ref().map(|e| locator.locate(&e.emitters, frame.time));
+        let placement = locator.placement(poses, time);
+        let estimate = frame.and_then(|frame| {
+            estimator.set_smear(locator.smear(&placement, &frame).as_ref());
+            estimator.estimate_until(&frame, &is_over).map_err(|e| e.to_string())
+        });
+        let located = match &estimate {
+            Ok(estimate) => locator
+                .locate(&estimate.emitters, placement)
+                .ok_or_else(|| NO_POSE.to_owned()),
+            Err(e) => Err(e.clone()),
+        };
         let latency_us = clock.elapsed().as_micros() as u64;
         let (emitters, error) = match located {
             Ok(emitters) => {
@@ -166,12 +186,12 @@ pub fn run(args: Args) -> Outcome {
                 (Some(emitters), None)
             }
             Err(e) => {
-                first_error.get_or_insert_with(|| e.to_string());
-                (None, Some(e.to_string()))
+                first_error.get_or_insert_with(|| e.clone());
+                (None, Some(e))
             }
         };
         let line = Line {
-            frame: frame.index,
+            frame: index,
             emitters,
             error,
             latency_us,

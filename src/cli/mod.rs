@@ -17,6 +17,7 @@ mod man;
 mod nkey;
 mod picture;
 mod progress;
+mod recorded;
 mod review;
 mod run;
 mod setup;

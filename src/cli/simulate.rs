@@ -102,9 +102,13 @@ fn write_config(path: &Path, scene: &Scene, start: Timestamp) -> anyhow::Result<
         }
         None => String::new(),
     };
+    let exposure = match scene.effects.motion_blur {
+        Some(_) => format!("exposure_s = {:?}\n", scene.link.integration_time_s),
+        None => String::new(),
+    };
     // A table below [optics] would take in the keys after it, so it comes last.
     let text = format!(
-        "{CONFIG_HEAD}\n\n[source]\nkind = \"replay\"\nframes = \"frames.npy\"\nstart = \"{start}\"\nrate_hz = {:?}\n\n\
+        "{CONFIG_HEAD}\n\n[source]\nkind = \"replay\"\nframes = \"frames.npy\"\nstart = \"{start}\"\nrate_hz = {:?}\n{exposure}\n\
          [claims]\nlog = \"claims.ndjson\"\n\n{platform}[optics]\n{}",
         scene.rate_hz,
         optics.replace("[blur]", "[optics.blur]"),

@@ -57,6 +57,7 @@ pub struct Daemon {
     telemetry: Option<Link>,
     recorder: Option<Recorder>,
     server: api::Server,
+    background: Option<api::Background>,
     endpoints: Vec<notify::Endpoint>,
     exports: Vec<export::Export>,
     station: Option<fleet::Station>,
@@ -80,6 +81,7 @@ impl Daemon {
             tracing::warn!("{warning}");
         }
         let server = api::Server::new(config.api.clone())?;
+        let background = api::Background::open(&config.api.background, config.world.axes().as_ref())?;
         let endpoints = notify::load(&config.webhook)?;
         let exports = export::load(&config.export, &endpoints, &config.world)?;
         let source = frames::open(&config.source, &camera)?;
@@ -101,6 +103,7 @@ impl Daemon {
             telemetry,
             recorder,
             server,
+            background,
             endpoints,
             exports,
             station,
@@ -162,6 +165,7 @@ impl Daemon {
         let ready = Arc::new(AtomicBool::new(false));
         let state = api::State::new(feed, commands, self.journal.clone(), metrics.clone(), ready.clone());
         let mut state = state.with_webhooks(notifier.clone()).with_axes(self.config.claims.axes);
+        state = state.with_background(self.background);
         if let Some(folder) = &self.config.record.folder {
             state = state.with_evidence(folder, &self.config.estimator);
         }

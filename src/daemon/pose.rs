@@ -46,7 +46,10 @@ impl Poses {
             footprint_m: outline.iter().map(|[x, y, _]| [*x, *y]).collect(),
             footprint_z_m: outline.iter().map(|[_, _, z]| *z).collect(),
             nadir_m: [pose.x_m, pose.y_m],
+            z_m: pose.z_m,
             heading_deg: pose.heading_deg,
+            roll_deg: pose.roll_deg,
+            pitch_deg: pose.pitch_deg,
             pose_age_s: pose.age_s,
         })
     }

@@ -3,6 +3,7 @@
 use crate::estimate::emitter::Estimate;
 use crate::estimate::error::Error;
 use crate::frame::Frame;
+use crate::optics::Smear;
 
 /// Turns a frame into emitters. Holds its scratch memory, so that a frame allocates nothing on the hot path. Deterministic: the
 /// same frame gives the same bits.
@@ -13,6 +14,9 @@ pub trait Estimator: Send {
     /// Emitters of one frame; a frame that holds nothing gives an empty list. Once `is_over` says that the frame's time is up, the best
     /// hypothesis so far is returned: it is asked between fits, and no clock is read here.
     fn estimate_until(&mut self, frame: &Frame, is_over: &dyn Fn() -> bool) -> Result<Estimate, Error>;
+
+    /// How spots move during the exposures of the frames from now on; `None`: as good as not at all.
+    fn set_smear(&mut self, smear: Option<&Smear>);
 
     /// [`Estimator::estimate_until`] without a limit of time.
     fn estimate(&mut self, frame: &Frame) -> Result<Estimate, Error> {

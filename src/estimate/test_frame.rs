@@ -74,6 +74,7 @@ impl Shown<'_> {
             time: jiff::Timestamp::UNIX_EPOCH,
             pixels,
             masked: None,
+            exposure_s: None,
         };
         let mut preprocessed = PreprocessedFrame::default();
         preprocessed.load(&frame, &camera).expect("a usable frame");

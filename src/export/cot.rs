@@ -92,7 +92,7 @@ impl Cot {
             },
             time: now,
             stale: SignedDuration::from_secs_f64((STALE_UPDATES * self.interval.as_secs_f64()).max(SHORTEST_STALE_S)),
-            place: self.world.emitter(emitter),
+            place: self.world.on_ellipsoid(self.world.emitter(emitter)),
             callsign: user.map_or(format!("beam {}", track(emitter)), |user| user.into_owned()),
             remarks: format!("{verdict}, {:.3e} J a frame", emitter.energy_j),
             detail: String::new(),
@@ -105,7 +105,7 @@ impl Cot {
     }
 
     fn of_alert(&self, alert: &Alert, now: Timestamp) -> String {
-        let place = self.world.alert(alert);
+        let place = self.world.on_ellipsoid(self.world.alert(alert));
         Event {
             uid: self.alert_uid(alert),
             kind: if alert.x_m.is_some() { SUSPECT } else { MARKER },
@@ -127,7 +127,7 @@ impl Cot {
             kind: REMOVAL,
             time: now,
             stale: SignedDuration::from_secs(60),
-            place: self.world.alert(alert),
+            place: self.world.on_ellipsoid(self.world.alert(alert)),
             callsign: title(alert),
             remarks: format!("{}: cleared", sentence(alert)),
             detail: format!(
@@ -144,7 +144,7 @@ impl Cot {
             kind: MARKER,
             time: now,
             stale: SignedDuration::from_secs(60),
-            place: self.world.origin(),
+            place: self.world.on_ellipsoid(self.world.origin()),
             callsign: "oapwatch test".to_owned(),
             remarks: "a test event; no alert stands behind it".to_owned(),
             detail: String::new(),

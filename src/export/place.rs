@@ -1,7 +1,7 @@
 //! Where emitters and alerts are on the earth.
 
 use super::words::sigma_m;
-use crate::geo::{Datum, LocalAxes, Origin};
+use crate::geo::{Datum, LocalAxes, Origin, undulation_m};
 use crate::monitor::{Alert, TrackedPosition};
 
 /// The local axes on the earth, for systems that know latitudes only.
@@ -34,6 +34,14 @@ impl World {
 
     pub(super) fn is_above_sea_level(&self) -> bool {
         self.origin.datum == Datum::Msl
+    }
+
+    /// A place with its height above the ellipsoid.
+    pub(super) fn on_ellipsoid(&self, mut place: Place) -> Place {
+        if self.is_above_sea_level() {
+            place.height_m += undulation_m(place.latitude_deg, place.longitude_deg);
+        }
+        place
     }
 
     /// A place in local metres.

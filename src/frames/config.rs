@@ -30,6 +30,9 @@ pub struct Config {
     /// runs at its scene's rate, and another one given here is refused.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub rate_hz: Option<f64>,
+    /// Replay of a .npy file: how long each frame collected light, s; left out, spots are taken not to smear.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub exposure_s: Option<f64>,
     /// Replay: 1 = as recorded, 0 = as fast as possible.
     pub speed: f64,
     /// Replay: start again at the end.
@@ -66,6 +69,7 @@ impl Default for Config {
             frames: None,
             start: None,
             rate_hz: None,
+            exposure_s: None,
             speed: 1.0,
             r#loop: false,
         }
@@ -85,6 +89,10 @@ impl Config {
                 1e-3..=1e5,
                 "frames per second: from one in a quarter of an hour to faster than any camera",
             )?;
+        }
+        if let Some(exposure_s) = self.exposure_s {
+            let reason = "seconds of exposure: from a microsecond to a quarter of an hour";
+            key.at("exposure_s").within(exposure_s, 1e-6..=1e3, reason)?;
         }
         if self.speed != 0.0 {
             let reason = "times the original speed, or 0: as fast as possible";
@@ -112,7 +120,7 @@ impl Config {
         let used: &[&str] = match self.kind {
             SourceKind::Simulator => &["scene", "seed", "start"],
             SourceKind::V4l2 => &["device", "v4l2", "rate_hz"],
-            SourceKind::Replay => &["frames", "start", "rate_hz", "speed", "loop"],
+            SourceKind::Replay => &["frames", "start", "rate_hz", "exposure_s", "speed", "loop"],
         };
         given.filter(|key| *key != "kind" && !used.contains(key)).collect()
     }

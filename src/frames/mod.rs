@@ -24,7 +24,7 @@ pub mod v4l2;
 pub use capture::Capture;
 pub use config::{Config, SourceKind};
 pub use error::Error;
-pub use replay::frame_time;
+pub use replay::{frame_time, holds_times};
 pub use simulator::Simulator;
 pub use slot::Captured;
 pub use source::{Arrivals, FrameSource, Next};

@@ -18,15 +18,16 @@ pub(super) fn open(config: &Config, joules_per_count: Option<f64>) -> Result<Box
         field: "frames",
         kind: "replay",
     })?;
+    if !holds_times(path, config) {
+        return Ok(Box::new(Replay::open(path, config, joules_per_count)?));
+    }
     let files = if path.is_dir() {
         record::recordings(path).map_err(|source| Error::Recording {
             path: path.clone(),
             source,
         })?
-    } else if config.start.is_none() && record::index_of(path).exists() {
-        vec![path.clone()]
     } else {
-        return Ok(Box::new(Replay::open(path, config, joules_per_count)?));
+        vec![path.clone()]
     };
     if config.r#loop {
         return Err(Error::LoopWithTimes);
@@ -39,6 +40,12 @@ pub(super) fn open(config: &Config, joules_per_count: Option<f64>) -> Result<Box
         ended: false,
         last: (0, Timestamp::UNIX_EPOCH),
     }))
+}
+
+/// Whether frames come with their own times, claims and poses: a folder of recordings of `[record]`, or one of them where
+/// `source.start` says nothing else.
+pub fn holds_times(path: &Path, config: &Config) -> bool {
+    path.is_dir() || config.start.is_none() && record::index_of(path).exists()
 }
 
 /// A recording of `[record]`: frames, gaps and claims as the monitor received them.
@@ -100,6 +107,7 @@ struct Replay {
     reader: Reader,
     start: Timestamp,
     rate_hz: f64,
+    exposure_s: Option<f64>,
     looped: bool,
     pace: Pace,
     next: u64,
@@ -119,6 +127,7 @@ impl Replay {
             reader: Reader::open(path, joules_per_count)?,
             start,
             rate_hz,
+            exposure_s: config.exposure_s,
             looped: config.r#loop,
             pace: Pace::new(config.speed)?,
             next: 0,
@@ -160,6 +169,7 @@ impl FrameSource for Replay {
                     time,
                     pixels,
                     masked: None,
+                    exposure_s: self.exposure_s,
                 };
                 Next::Frame(frame, Arrivals::default())
             }

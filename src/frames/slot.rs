@@ -164,6 +164,7 @@ mod tests {
             time: Timestamp::UNIX_EPOCH,
             pixels: Array2::zeros((1, 1)),
             masked: None,
+            exposure_s: None,
         };
         Captured::new(Next::Frame(frame, vec![claim].into()), None)
     }

@@ -2,12 +2,15 @@
 //! Jacobians.
 
 mod config;
+mod geoid;
 mod sight;
+mod smear;
 mod terrain;
 mod view;
 mod wgs84;
 
 pub use config::{Config, ConfigError, Datum, Origin};
+pub use geoid::undulation_m;
 pub use sight::{GroundPoint, Sight};
 pub use terrain::{Error as TerrainError, Fault as TerrainFault, Ground, Terrain};
 pub use view::{Placed, View};

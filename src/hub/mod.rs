@@ -43,6 +43,7 @@ pub fn validate(config: &Config) -> Result<()> {
 pub struct Hub {
     config: Config,
     server: api::Server,
+    background: Option<api::Background>,
     endpoints: Vec<notify::Endpoint>,
     exports: Vec<export::Export>,
     journal: Journal,
@@ -59,6 +60,7 @@ impl Hub {
         let _ = metrics::set_global_recorder(recorder);
         metric::describe();
         let server = api::Server::new(config.api.clone())?;
+        let background = api::Background::open(&config.api.background, config.world.axes().as_ref())?;
         let endpoints = notify::load(&config.webhook)?;
         let exports = export::load(&config.export, &endpoints, &config.world)?;
         let receivers = endpoints.iter().chain(exports.iter().map(|export| &export.endpoint));
@@ -67,6 +69,7 @@ impl Hub {
         Ok(Self {
             config,
             server,
+            background,
             endpoints,
             exports,
             journal,
@@ -111,6 +114,7 @@ impl Hub {
             ready.clone(),
         );
         let state = state.with_webhooks(notifier.clone()).of_hub();
+        let state = state.with_background(self.background);
         tracing::info!(
             site = self.config.fleet.site.as_deref().unwrap_or("all"),
             url = self.config.fleet.url.as_deref().unwrap_or_default(),

@@ -11,6 +11,7 @@ pub mod geometry;
 mod pixel_maps;
 pub mod psf;
 pub mod radiometry;
+mod smear;
 pub mod spot;
 mod spot_pixels;
 
@@ -20,5 +21,6 @@ pub use config::{BlurConfig, Config};
 pub use distortion::Distortion;
 pub use error::{CalibrationError, Error};
 pub use pixel_maps::PixelMaps;
+pub use smear::{DisplacedSpots, LEAST_SMEAR, Smear};
 pub use spot::SpotShape;
 pub use spot_pixels::add_spot;

@@ -95,6 +95,7 @@ mod tests {
             time: jiff::Timestamp::UNIX_EPOCH,
             pixels,
             masked: None,
+            exposure_s: None,
         }
     }
 

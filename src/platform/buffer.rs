@@ -152,6 +152,16 @@ impl PoseBuffer {
         Some(rates(&self.at(before)?.pose, &self.at(after)?.pose, 2.0 * half_s))
     }
 
+    /// Rates about `time` from the poses up to `half_s` before and after, as far as they reach; `None` where they span less than `half_s`.
+    pub fn mean_rates(&self, time: Timestamp, half_s: f64) -> Option<Vector6<f64>> {
+        let half = SignedDuration::from_secs_f64(half_s);
+        let from = time.saturating_sub(half).ok()?.max(self.poses.front()?.time);
+        let to = time.saturating_add(half).ok()?.min(self.poses.back()?.time);
+        let span_s = seconds(from, to);
+        (span_s >= half_s).then_some(())?;
+        Some(rates(&self.at(from)?.pose, &self.at(to)?.pose, span_s))
+    }
+
     /// The pose at `time`: between two by slerp; beyond the ends at the nearest rates for a tenth of a second, then held. Its
     /// covariance says how far the platform may have moved from there. `None` while no pose is known.
     pub fn at(&self, time: Timestamp) -> Option<PoseAt> {
@@ -291,6 +301,19 @@ mod tests {
         let found = buffer.at(at(60.0)).expect("known");
         assert!((found.age_s - 59.9).abs() < 1e-9);
         assert!((found.pose.cov[(3, 3)].sqrt() - 3.0 * 59.9).abs() < 1e-6);
+    }
+
+    #[test]
+    fn mean_rates_use_what_poses_there_are() {
+        let buffer = filled(&[0.0, 0.1, 0.2]);
+        for s in [0.1, 0.15, 0.2] {
+            let rates = buffer.mean_rates(at(s), 0.1).expect("poses on one side");
+            assert!(
+                (rates[0] - 0.1).abs() < 1e-9 && (rates[3] - 2.0).abs() < 1e-9,
+                "{s}: {rates}"
+            );
+        }
+        assert!(buffer.mean_rates(at(0.25), 0.1).is_none());
     }
 
     #[test]

@@ -41,10 +41,6 @@ pub enum Unplaced {
         "[world] origin is set, but the autopilot has not said where its own origin lies (GPS_GLOBAL_ORIGIN or GLOBAL_POSITION_INT)"
     )]
     NoOrigin,
-    #[error(
-        "heights of [world] origin are above the ellipsoid, the autopilot's above sea level, and its GNSS receiver states no difference: set datum = \"msl\""
-    )]
-    NoUndulation,
 }
 
 impl Place {
@@ -62,7 +58,10 @@ impl Place {
         };
         let undulation_m = match origin.datum {
             Datum::Msl => 0.0,
-            Datum::Ellipsoid => self.undulation_m.ok_or(Unplaced::NoUndulation)?,
+            // The receiver's own, which the autopilot's heights were made with.
+            Datum::Ellipsoid => self
+                .undulation_m
+                .unwrap_or_else(|| geo::undulation_m(at.latitude_deg, at.longitude_deg)),
         };
         let at = geo::Geodetic {
             latitude_deg: at.latitude_deg,
@@ -120,10 +119,9 @@ mod tests {
             undulation_m: None,
             ..place(Origin::Start(START))
         };
-        assert_eq!(
-            silent.local_m(&world(Some(Datum::Ellipsoid))),
-            Err(Unplaced::NoUndulation)
-        );
+        // EGM96 has 45.5 m there.
+        let found = silent.local_m(&world(Some(Datum::Ellipsoid))).unwrap()[2];
+        assert!((found - 165.5).abs() < 0.5, "{found}");
         assert!(silent.local_m(&world(Some(Datum::Msl))).is_ok());
     }
 }

@@ -222,6 +222,11 @@ impl Light {
     }
 
     /// The platform's true motion, where it moves.
+    /// Duration of an exposure, s, where spots move within it.
+    pub fn smears_over_s(&self) -> Option<f64> {
+        self.exposure.motion_blur.then_some(self.exposure.time_s)
+    }
+
     pub fn flight(&self) -> Option<&Flight> {
         self.flight.as_ref()
     }

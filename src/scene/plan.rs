@@ -268,6 +268,7 @@ impl Maker<'_> {
                 time,
                 pixels,
                 masked: plan.detector.mask().cloned(),
+                exposure_s: plan.light.smears_over_s(),
             },
             truth: Truth {
                 frame: k,

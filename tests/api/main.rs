@@ -1,5 +1,6 @@
 //! The API from outside, over real connections.
 
+mod background;
 mod bodies;
 mod connections;
 mod evidence;

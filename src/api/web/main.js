@@ -1,13 +1,14 @@
 // Puts the page together: messages of the stream go to the map, the tables and the list of alerts.
 
 import { Alerts } from "./alerts.js";
+import { Background } from "./background.js";
 import { Beams } from "./beams.js";
 import { Bell } from "./bell.js";
 import { Link } from "./link.js";
 import { GroundMap } from "./map.js";
 import { claimIcon, icon } from "./marks.js";
 import { Places } from "./places.js";
-import { poseWords, showStations } from "./stations.js";
+import { poseWords, showStations, viewWords } from "./stations.js";
 import { Timeline } from "./timeline.js";
 import { el, fullStamp, lasting, micros, shown, zone } from "./words.js";
 
@@ -43,6 +44,7 @@ const alerts = new Alerts(link, {
 });
 
 const places = new Places(link, map);
+const background = new Background(link, map);
 
 legend();
 for (const [id, act] of [["zoom-in", () => map.zoomBy(1.5)], ["zoom-out", () => map.zoomBy(1 / 1.5)], ["zoom-all", () => map.all()]]) {
@@ -80,7 +82,10 @@ function onState(state) {
   // While a connection is tried again it is still lost.
   if (state === "connecting" && before === "lost") return;
   linkState = state;
-  if (state === "live" && before !== "live") history();
+  if (state === "live" && before !== "live") {
+    history();
+    background.load();
+  }
   banner();
 }
 
@@ -163,6 +168,9 @@ function draw() {
   const time = Date.parse(moment.time);
   $("clock").textContent = `${fullStamp(time)}${live ? "" : " · the past"}`;
   $("clock").title = zone(time);
+  const { view } = latest.status;
+  $("platform").textContent = live && view ? viewWords(view) : "";
+  $("platform").className = view?.pose_age_s > 0.5 ? "warn" : "quiet";
   places.tick(Date.parse(latest.time), latest.status.field_of_view_m);
   timeline.render(alerts.known.values());
   beams.show(scene);
@@ -185,8 +193,7 @@ function ground({ view, stations = [], field_of_view_m: [w, h] }, live) {
   if (!live) return { bounds, views: [] };
   const views = stations.filter((s) => s.footprint_m?.length > 2).map(viewOf);
   if (view?.footprint_m.length > 2) {
-    const age = view.pose_age_s > 0.5 ? `; pose ${view.pose_age_s.toFixed(1)} s old` : "";
-    views.push({ outline: view.footprint_m, nadir: view.nadir_m, heading: view.heading_deg, title: `the UAV is above ${view.nadir_m.map((v) => Math.round(v)).join(", ")} m, heading ${Math.round(view.heading_deg)}°${age}` });
+    views.push({ outline: view.footprint_m, nadir: view.nadir_m, heading: view.heading_deg, title: viewWords(view) });
   }
   if (!views.length) views.push({ outline: [[-w, -h], [w, -h], [w, h], [-w, h]], title: "the field of view" });
   return { bounds, views };

@@ -23,6 +23,8 @@ export class GroundMap {
     this.beams = new Map();
     this.scene = null;
     this.picked = null;
+    this.background = null; // what lies below everything
+    this.below = svg("g");
     this.back = svg("g");
     this.places = svg("g");
     this.handles = svg("g");
@@ -33,7 +35,7 @@ export class GroundMap {
     this.claims = svg("g");
     this.marks = svg("g");
     this.names = svg("g");
-    node.append(this.back, this.places, this.trails, this.claims, this.marks, this.names, this.handles);
+    node.append(this.below, this.back, this.places, this.trails, this.claims, this.marks, this.names, this.handles);
     new ResizeObserver(() => this.redraw()).observe(node);
     this.listen();
   }
@@ -242,6 +244,7 @@ export class GroundMap {
     this.height = height;
     const room = Math.min(width / (2.16 * this.half[0]), height / (2.16 * this.half[1]));
     this.scale = room * this.zoom;
+    this.below.replaceChildren(...(this.background?.draw(this) ?? []));
     this.drawBack();
     this.drawPlaces();
     this.drawTrails();
@@ -279,6 +282,8 @@ export class GroundMap {
     const long = step * this.scale;
     nodes.push(
       svg("path", { class: "scale-bar", d: `M${this.width - 14 - long} ${this.height - 16}v6h${long}v-6` }),
+      svg("path", { class: "north", d: `M${this.width - 22} 44v-30m-5 9l5 -9l5 9` }, svg("title", {}, "north")),
+      svg("text", { class: "scale", x: this.width - 22, y: 58, "text-anchor": "middle" }, "N"),
       svg("text", { class: "scale", x: this.width - 14 - long / 2, y: this.height - 18, "text-anchor": "middle" }, `${step} m`),
     );
     this.back.replaceChildren(...nodes);

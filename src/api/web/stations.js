@@ -15,6 +15,13 @@ export function poseWords(pose) {
   return `${old}heading ${Math.round(heading)}°${pose.is_lost || age > 0.5 ? `, ${lasting(age * 1000)} old` : ""}`;
 }
 
+// Where the platform is, how it is turned, and the age of its pose where it matters.
+export function viewWords({ nadir_m: nadir, z_m: z, heading_deg: heading, roll_deg: roll, pitch_deg: pitch, pose_age_s: age }) {
+  const whole = (v) => `${Math.round(v) + 0}`.replace("-", "−");
+  const tilt = Math.max(Math.abs(roll), Math.abs(pitch)) >= 0.5 ? `, roll ${whole(roll)}°, pitch ${whole(pitch)}°` : "";
+  return `UAV above ${nadir.map(whole).join(", ")} m, at ${whole(z)} m, heading ${whole(heading)}°${tilt}${age > 0.5 ? `, pose ${lasting(age * 1000)} old` : ""}`;
+}
+
 export function showStations(stations, isHub) {
   $("stations").hidden = !isHub;
   $("sensor").hidden = isHub;

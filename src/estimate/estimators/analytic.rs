@@ -27,7 +27,7 @@ use crate::estimate::rules::Rules;
 use crate::estimate::uncertainty::localise::localise;
 use crate::estimate::uncertainty::posterior_mean::posterior_moments;
 use crate::frame::Frame;
-use crate::optics::Camera;
+use crate::optics::{Camera, Smear};
 
 /// Reach of a spot, σ, and its share outside the basis, by which the kind of basis is chosen.
 const REACH: f64 = 5.3;
@@ -304,6 +304,10 @@ impl AnalyticEstimator {
 impl Estimator for AnalyticEstimator {
     fn name(&self) -> &'static str {
         self.spec.name
+    }
+
+    fn set_smear(&mut self, smear: Option<&Smear>) {
+        self.frame.smear = smear.map(|s| s.displaced(&self.camera, 1.0));
     }
 
     fn estimate_until(&mut self, frame: &Frame, is_over: &dyn Fn() -> bool) -> Result<Estimate, Error> {

@@ -18,7 +18,7 @@ use crate::estimate::preprocess::screening::PreprocessedFrame;
 use crate::estimate::rules::Rules;
 use crate::estimate::uncertainty::localise::localise;
 use crate::frame::Frame;
-use crate::optics::{Camera, psf};
+use crate::optics::{Camera, Smear, psf};
 
 /// Steps of the joint fit from the network's peaks.
 const STEPS: usize = 60;
@@ -56,6 +56,10 @@ impl NetworkEstimator {
 impl Estimator for NetworkEstimator {
     fn name(&self) -> &'static str {
         self.spec.name()
+    }
+
+    fn set_smear(&mut self, smear: Option<&Smear>) {
+        self.frame.smear = smear.map(|s| s.displaced(&self.camera, 1.0));
     }
 
     /// The network's time is the same for every frame and the fit's steps are few: `_is_over` is not asked.

@@ -6,7 +6,7 @@ use crate::estimate::emitter::Estimate;
 use crate::estimate::error::Error;
 use crate::estimate::estimator::Estimator;
 use crate::frame::Frame;
-use crate::optics::PixelMaps;
+use crate::optics::{PixelMaps, Smear};
 
 /// An estimator that is given corrected frames.
 pub(crate) struct PixelCorrected {
@@ -32,6 +32,10 @@ impl Estimator for PixelCorrected {
         self.inner.name()
     }
 
+    fn set_smear(&mut self, smear: Option<&Smear>) {
+        self.inner.set_smear(smear);
+    }
+
     fn estimate_until(&mut self, frame: &Frame, is_over: &dyn Fn() -> bool) -> Result<Estimate, Error> {
         let own = match &mut self.frame {
             Some(own) if own.pixels.dim() == frame.pixels.dim() => {
@@ -39,6 +43,7 @@ impl Estimator for PixelCorrected {
                 own.time = frame.time;
                 own.pixels.assign(&frame.pixels);
                 own.masked.clone_from(&frame.masked);
+                own.exposure_s = frame.exposure_s;
                 own
             }
             own => own.insert(frame.clone()),

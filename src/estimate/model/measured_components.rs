@@ -55,9 +55,9 @@ impl MeasuredShape {
         self.shape.terms()
     }
 
-    /// Pixels that a spot at `u` reaches.
-    fn span(&self, basis: &Basis, u: f64) -> [usize; 2] {
-        let radius = self.shape.radius_m() / self.sigma_m;
+    /// Pixels that a spot at `u` reaches, moved by as much as `beyond` to either side.
+    fn span(&self, basis: &Basis, u: f64, beyond: f64) -> [usize; 2] {
+        let radius = self.shape.radius_m() / self.sigma_m + beyond;
         let pixel = |edge: f64| ((edge - basis.edges[0]) / basis.pitch()).clamp(0.0, basis.n as f64);
         let [first, last] = [pixel(u - radius).floor() as usize, pixel(u + radius).ceil() as usize];
         [first, last.max(first)]
@@ -93,40 +93,50 @@ impl MeasuredComponents {
         self.values.clear();
     }
 
-    /// A spot of unit energy at `u`, σ.
-    pub fn push(&mut self, shape: &MeasuredShape, axes: [&Basis; 2], u: [f64; 2]) {
-        let spans = [0, 1].map(|k| shape.span(axes[k], u[k]));
+    /// A spot of unit energy at `u`, σ, smeared over `displacement`, σ: by its parts and the shares of the light.
+    pub fn push(
+        &mut self,
+        shape: &MeasuredShape,
+        axes: [&Basis; 2],
+        u: [f64; 2],
+        displacement: [f64; 2],
+        parts: &[(f64, f64)],
+    ) {
+        let spans = [0, 1].map(|k| shape.span(axes[k], u[k], 0.5 * displacement[k].abs()));
         let [columns, rows] = spans.map(|[low, high]| high - low);
         let (start, area) = (self.values.len(), columns * rows);
         self.spans.push(spans);
         self.starts.push(start);
         self.values.resize(start + ARRAYS * area, 0.0);
-        let [sx, sy] = u.map(|v| v * shape.sigma_m);
         let mut profiles = std::mem::take(&mut self.profiles);
-        for (k, (w, du, dv)) in shape.shape.weights_at(sx, sy).enumerate() {
-            let (du, dv) = (du * shape.sigma_m, dv * shape.sigma_m);
-            let [along_x, along_y] = &mut profiles;
-            shape.collect(shape.shape.x_profile(k), axes[0], u[0], spans[0], along_x);
-            shape.collect(shape.shape.y_profile(k), axes[1], u[1], spans[1], along_y);
-            let [a, a1, a2] = &*along_x;
-            for row in 0..rows {
-                let [b, b1, b2] = [along_y[0][row], along_y[1][row], along_y[2][row]];
-                let mut add = |array: usize, factors: [f64; 3]| {
-                    let at = start + array * area + row * columns;
-                    let out = &mut self.values[at..at + columns];
-                    for (factor, profile) in factors.into_iter().zip([a, a1, a2]) {
-                        if factor != 0.0 {
-                            axpy(factor, profile, out);
+        for (part, of) in parts {
+            let u = [0, 1].map(|k| u[k] + part * displacement[k]);
+            let [sx, sy] = u.map(|v| v * shape.sigma_m);
+            for (k, (w, du, dv)) in shape.shape.weights_at(sx, sy).enumerate() {
+                let (w, du, dv) = (of * w, of * du * shape.sigma_m, of * dv * shape.sigma_m);
+                let [along_x, along_y] = &mut profiles;
+                shape.collect(shape.shape.x_profile(k), axes[0], u[0], spans[0], along_x);
+                shape.collect(shape.shape.y_profile(k), axes[1], u[1], spans[1], along_y);
+                let [a, a1, a2] = &*along_x;
+                for row in 0..rows {
+                    let [b, b1, b2] = [along_y[0][row], along_y[1][row], along_y[2][row]];
+                    let mut add = |array: usize, factors: [f64; 3]| {
+                        let at = start + array * area + row * columns;
+                        let out = &mut self.values[at..at + columns];
+                        for (factor, profile) in factors.into_iter().zip([a, a1, a2]) {
+                            if factor != 0.0 {
+                                axpy(factor, profile, out);
+                            }
                         }
-                    }
-                };
-                add(0, [w * b, 0.0, 0.0]);
-                add(1, [du * b, w * b, 0.0]);
-                add(2, [w * b1 + dv * b, 0.0, 0.0]);
-                // The weights' second derivatives are those of the field: far below the spot's.
-                add(3, [0.0, 2.0 * du * b, w * b]);
-                add(4, [du * b1, w * b1 + dv * b, 0.0]);
-                add(5, [w * b2 + 2.0 * dv * b1, 0.0, 0.0]);
+                    };
+                    add(0, [w * b, 0.0, 0.0]);
+                    add(1, [du * b, w * b, 0.0]);
+                    add(2, [w * b1 + dv * b, 0.0, 0.0]);
+                    // The weights' second derivatives are those of the field: far below the spot's.
+                    add(3, [0.0, 2.0 * du * b, w * b]);
+                    add(4, [du * b1, w * b1 + dv * b, 0.0]);
+                    add(5, [w * b2 + 2.0 * dv * b1, 0.0, 0.0]);
+                }
             }
         }
         self.profiles = profiles;

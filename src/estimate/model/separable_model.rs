@@ -1,8 +1,8 @@
 //! The predicted frame of a hypothesis: components (sources, then background terms), each a sum of separable terms.
 //!
 //! A source whose PSF is aligned with the axes is one term. A rotated ellipse is no product of profiles: it is an aligned PSF smeared
-//! along a diagonal, which Gauss–Hermite quadrature (Abramowitz and Stegun, 1964, 25.4.46) turns into a sum of five. A measured PSF is a sum
-//! of terms whose weights vary over the field, kept as one patch of pixels per source.
+//! along a diagonal, which Gauss–Hermite quadrature (Abramowitz and Stegun, 1964, 25.4.46) turns into a sum of five. One that motion smears is
+//! a sum of displaced PSFs, of either kind. A measured PSF is a sum of terms whose weights vary over the field, kept as one patch of pixels per source.
 
 use crate::estimate::model::bases::Bases;
 use crate::estimate::model::compressed_frame::CompressedFrame;
@@ -20,6 +20,8 @@ const QUADRATURE: [(f64, f64); 5] = [
     (-2.856_970_013_872_805_7, 0.011_257_411_327_720_691),
 ];
 const WHOLE: [(f64, f64); 1] = [(0.0, 1.0)];
+/// Shares of a component that is one term.
+const ONE: [f64; 1] = [1.0];
 
 /// Orders of the derivatives along x and y that go with a source's energy, x and y.
 pub(crate) const SLOPES: [[usize; 2]; 3] = [[0, 0], [1, 0], [0, 1]];
@@ -30,7 +32,7 @@ macro_rules! sum_terms {
     ($model:ident, $i:expr, |$k:ident| $f:expr) => {{
         let (first, shares) = $model.terms($i);
         let mut sum = Default::default();
-        for ($k, (_, share)) in (first..).zip(shares) {
+        for ($k, share) in (first..).zip(shares) {
             add(&mut sum, *share, $f);
         }
         sum
@@ -42,8 +44,8 @@ macro_rules! sum_pairs {
     ($model:ident, $i:expr, $j:expr, |$k:ident, $l:ident| $f:expr) => {{
         let ((first, shares), (other, others)) = ($model.terms($i), $model.terms($j));
         let mut sum = Default::default();
-        for ($k, (_, share)) in (first..).zip(shares) {
-            for ($l, (_, of)) in (other..).zip(others) {
+        for ($k, share) in (first..).zip(shares) {
+            for ($l, of) in (other..).zip(others) {
                 add(&mut sum, share * of, $f);
             }
         }
@@ -63,6 +65,8 @@ pub(crate) struct SeparableModel {
     /// Whether the sources' amplitudes may be negative.
     pub has_signed_energies: bool,
     components: usize,
+    /// Shares of a source's separable terms.
+    shares: Vec<f64>,
     terms: SeparableTerms,
     /// Takes the place of `terms` where the PSF is measured.
     measured: Option<MeasuredComponents>,
@@ -84,7 +88,12 @@ impl SeparableModel {
 
     /// Separable terms of a source.
     pub fn terms_per_source(&self) -> f64 {
-        self.quadrature(0).len() as f64
+        self.shares.len() as f64
+    }
+
+    /// Whether a source is one separable term.
+    pub fn is_upright(&self) -> bool {
+        self.measured.is_none() && self.shares.len() == 1
     }
 
     /// Amplitude of a component.
@@ -104,14 +113,21 @@ impl SeparableModel {
         let axes = bases.axes();
         scratch.resize(scratch.len().max(3 * bases.x.n.max(bases.y.n)), 0.0);
         let n = self.sources.len();
-        let quadrature = self.quadrature(0);
+        let motion = compressed.smear.as_ref().map_or(WHOLE.as_slice(), |smear| &smear.nodes);
+        let displacement = |u: [f64; 2]| {
+            compressed
+                .smear
+                .as_ref()
+                .map_or([0.0; 2], |smear| smear.displacement(u))
+        };
         self.components = n + nuisances.background_terms();
+        self.shares.clear();
         if let Some(shape) = &bases.shape {
             self.terms_per_source = shape.terms();
             let measured = self.measured.get_or_insert_default();
             measured.clear(compressed.mx);
             for s in &self.sources {
-                measured.push(shape, axes, s.u);
+                measured.push(shape, axes, s.u, displacement(s.u), motion);
             }
             for b in 0..nuisances.background_terms() {
                 let kinds = [usize::from(b == 1), usize::from(b == 2)];
@@ -120,14 +136,25 @@ impl SeparableModel {
             return;
         }
         self.measured = None;
-        let count = n * quadrature.len() + nuisances.background_terms();
+        let ellipse = match self.covariance_xy {
+            0.0 => WHOLE.as_slice(),
+            _ => &QUADRATURE,
+        };
+        for (_, of) in motion {
+            self.shares.extend(ellipse.iter().map(|(_, share)| of * share));
+        }
+        let count = n * self.shares.len() + nuisances.background_terms();
         self.terms.clear(count, compressed.mx, compressed.my);
         let along = self.covariance_xy.abs().sqrt();
         let width = self.width.map(|w| (w * w - self.covariance_xy.abs()).max(0.0).sqrt());
         for s in &self.sources {
-            for (t, _) in quadrature {
-                let u = [s.u[0] + t * along, s.u[1] + t * along * self.covariance_xy.signum()];
-                self.terms.push(axes, u, width, compressed.reach, scratch);
+            let [dx, dy] = displacement(s.u);
+            for (m, _) in motion {
+                for (t, _) in ellipse {
+                    let (x, y) = (t * along, t * along * self.covariance_xy.signum());
+                    let u = [s.u[0] + m * dx + x, s.u[1] + m * dy + y];
+                    self.terms.push(axes, u, width, compressed.reach, scratch);
+                }
             }
         }
         for b in 0..nuisances.background_terms() {
@@ -138,22 +165,15 @@ impl SeparableModel {
         self.terms.evaluate_lines(axes, &compressed.masked.lines);
     }
 
-    /// Nodes and weights of a component's terms.
+    /// A component's first term, and the shares of all of its terms.
     #[inline(always)]
-    fn quadrature(&self, i: usize) -> &'static [(f64, f64)] {
-        if self.covariance_xy != 0.0 && i < self.sources.len() {
-            &QUADRATURE
+    fn terms(&self, i: usize) -> (usize, &[f64]) {
+        let (n, each) = (self.sources.len(), self.shares.len());
+        if i < n {
+            (i * each, &self.shares)
         } else {
-            &WHOLE
+            (n * each + i - n, &ONE)
         }
-    }
-
-    /// A component's first term, and the nodes and weights of all of its terms.
-    #[inline(always)]
-    fn terms(&self, i: usize) -> (usize, &'static [(f64, f64)]) {
-        let n = self.sources.len();
-        let each = self.quadrature(0).len();
-        (if i < n { i * each } else { n * each + i - n }, self.quadrature(i))
     }
 
     /// Derivatives of component `i` at a masked pixel, of the given orders along x and y.
@@ -161,7 +181,7 @@ impl SeparableModel {
     pub fn derivatives_at(&self, i: usize, [x, y]: [usize; 2], derivatives: [[usize; 2]; 3]) -> [f64; 3] {
         let (first, shares) = self.terms(i);
         let mut sum = [0.0; 3];
-        for (k, (_, share)) in shares.iter().enumerate() {
+        for (k, share) in shares.iter().enumerate() {
             let [fx, fy] = self.terms.at(first + k, x, y);
             for (s, [a, b]) in sum.iter_mut().zip(derivatives) {
                 *s += share * fx[a] * fy[b];
@@ -183,7 +203,7 @@ impl SeparableModel {
             return m.accumulate(i, a, b, scale, matrix);
         }
         let (first, shares) = self.terms(i);
-        for (k, (_, share)) in shares.iter().enumerate() {
+        for (k, share) in shares.iter().enumerate() {
             self.terms.accumulate(first + k, a, b, share * scale, matrix);
         }
     }
@@ -208,7 +228,7 @@ impl SeparableModel {
             return;
         }
         let (first, shares) = self.terms(i);
-        for (k, (_, share)) in shares.iter().enumerate() {
+        for (k, share) in shares.iter().enumerate() {
             let (q0, q1) = ([share * q0[0], share * q0[1]], [share * q1[0], share * q1[1]]);
             self.terms
                 .accumulate_second_derivative(first + k, q0, q1, share * q2, scratch, matrix);

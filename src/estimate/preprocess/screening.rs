@@ -2,7 +2,7 @@
 
 use crate::estimate::error::Error;
 use crate::frame::Frame;
-use crate::optics::Camera;
+use crate::optics::{Camera, DisplacedSpots};
 
 /// Values of this many standard deviations or more count as non-finite: their squares approach the range of f64.
 const OVERFLOWS: f64 = 1e100;
@@ -16,6 +16,8 @@ pub(crate) struct PreprocessedFrame {
     pub flagged: Vec<FlaggedPixel>,
     pub is_masked: Vec<bool>,
     pub saturated: usize,
+    /// How spots are smeared by motion, for the frames that are loaded from now on.
+    pub smear: Option<DisplacedSpots>,
 }
 
 /// A pixel that must not be used, and why.

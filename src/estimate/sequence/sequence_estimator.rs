@@ -21,7 +21,7 @@ use crate::estimate::sequence::snapshot::{Engine, LocalQuadratic, Snapshot, hypo
 use crate::estimate::sequence::window::{SPEED_STD_M_S, Target, Window};
 use crate::estimate::uncertainty::localise::localise;
 use crate::frame::Frame;
-use crate::optics::Camera;
+use crate::optics::{Camera, Smear};
 
 /// Evidence, ln, that a target has gone dark before it is dropped: false once in a million.
 const DARK: f64 = 14.0;
@@ -98,6 +98,9 @@ impl Estimator for SequenceEstimator {
     fn name(&self) -> &'static str {
         self.spec.name
     }
+
+    /// The camera of frames together stands still.
+    fn set_smear(&mut self, _smear: Option<&Smear>) {}
 
     fn estimate_until(&mut self, frame: &Frame, is_over: &dyn Fn() -> bool) -> Result<Estimate, Error> {
         let scale = self.single.load(frame)?;

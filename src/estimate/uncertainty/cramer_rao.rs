@@ -3,7 +3,7 @@
 use faer::{Mat, Side};
 
 use crate::optics::psf::PixelResponse;
-use crate::optics::{Camera, add_spot, psf};
+use crate::optics::{Camera, DisplacedSpots, add_spot, psf};
 
 /// What the bound assumes beside unknown positions and energies: further parameters, masked pixels, prior knowledge.
 #[derive(Clone, Copy, Debug, Default)]
@@ -16,6 +16,8 @@ pub struct BoundAssumptions<'a> {
     /// Standard deviation of each emitter's energy, J, where it is known beforehand as well as that; every emitter is then
     /// known to be in view too. Good while errors are small: an estimator may go below where a position is hardly known.
     pub known: Option<&'a [f64]>,
+    /// How motion smears the spots, where they are Gaussian.
+    pub smear: Option<&'a DisplacedSpots>,
 }
 
 /// Which parameters of the common PSF are unknown.
@@ -104,26 +106,32 @@ fn jacobian(camera: &Camera, positions: &[[f64; 2]], energies: &[f64], assumptio
     };
     for (i, &p) in of_gaussian.iter().enumerate() {
         let [x, y] = camera.to_sensor(p);
-        psf::profile_response(&camera.x, x, sigma, &mut row);
-        psf::profile_response(&camera.y, y, sigma, &mut column);
-        let signal = energies[i] / camera.noise_std_j;
-        for (b, fy) in column.iter().enumerate() {
-            for (a, fx) in row.iter().enumerate() {
-                let pixel = b * camera.x.n + a;
-                if !is_usable(pixel) {
-                    continue;
-                }
-                jacobian[(pixel, 3 * i)] = signal * sigma * fx.d_centre * fy.fraction;
-                jacobian[(pixel, 3 * i + 1)] = signal * sigma * fx.fraction * fy.d_centre;
-                jacobian[(pixel, 3 * i + 2)] = fx.fraction * fy.fraction;
-                let along = [fx.d_sigma * fy.fraction, fx.fraction * fy.d_sigma];
-                match assumptions.shape {
-                    PsfShape::Known => {}
-                    PsfShape::Width => jacobian[(pixel, 3 * n)] += signal * sigma * (along[0] + along[1]),
-                    PsfShape::Ellipse => {
-                        jacobian[(pixel, 3 * n)] += signal * sigma * along[0];
-                        jacobian[(pixel, 3 * n + 1)] += signal * sigma * along[1];
-                        jacobian[(pixel, 3 * n + 2)] += signal * sigma * sigma * fx.d_centre * fy.d_centre;
+        let parts = assumptions.smear.map_or(&[(0.0, 1.0)][..], |smear| &smear.nodes);
+        let [dx, dy] = assumptions
+            .smear
+            .map_or([0.0; 2], |smear| smear.displacement([x / sigma, y / sigma]));
+        for (part, share) in parts {
+            psf::profile_response(&camera.x, x + part * dx * sigma, sigma, &mut row);
+            psf::profile_response(&camera.y, y + part * dy * sigma, sigma, &mut column);
+            let signal = share * energies[i] / camera.noise_std_j;
+            for (b, fy) in column.iter().enumerate() {
+                for (a, fx) in row.iter().enumerate() {
+                    let pixel = b * camera.x.n + a;
+                    if !is_usable(pixel) {
+                        continue;
+                    }
+                    jacobian[(pixel, 3 * i)] += signal * sigma * fx.d_centre * fy.fraction;
+                    jacobian[(pixel, 3 * i + 1)] += signal * sigma * fx.fraction * fy.d_centre;
+                    jacobian[(pixel, 3 * i + 2)] += share * fx.fraction * fy.fraction;
+                    let along = [fx.d_sigma * fy.fraction, fx.fraction * fy.d_sigma];
+                    match assumptions.shape {
+                        PsfShape::Known => {}
+                        PsfShape::Width => jacobian[(pixel, 3 * n)] += signal * sigma * (along[0] + along[1]),
+                        PsfShape::Ellipse => {
+                            jacobian[(pixel, 3 * n)] += signal * sigma * along[0];
+                            jacobian[(pixel, 3 * n + 1)] += signal * sigma * along[1];
+                            jacobian[(pixel, 3 * n + 2)] += signal * sigma * sigma * fx.d_centre * fy.d_centre;
+                        }
                     }
                 }
             }

@@ -110,11 +110,7 @@ fn unprojected_score(
     let own = SECOND.map(|(_, f)| f * model.amplitude(i));
     let strip = &mut at.scratch.strip;
     let mut information = [[0.0; 3]; 3];
-    if compressed.weights.is_empty()
-        && compressed.masked.runs().is_empty()
-        && widths.is_empty()
-        && model.covariance_xy == 0.0
-    {
+    if compressed.weights.is_empty() && compressed.masked.runs().is_empty() && widths.is_empty() && model.is_upright() {
         for (r, (second, _)) in SECOND.into_iter().enumerate() {
             for (c, (other, _)) in SECOND.into_iter().enumerate() {
                 information[r][c] = own[r] * own[c] * model.inner_product(i, second, i, other, &[], strip);

@@ -152,6 +152,7 @@ impl Recorder {
             time,
             unusable: Some(reason.to_owned()),
             masked: None,
+            exposure_s: None,
             arrivals: arrivals.clone(),
         };
         self.write(None, 0, Seen { entry, pixels: None })

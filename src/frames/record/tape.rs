@@ -34,6 +34,8 @@ pub(in crate::frames) struct Entry {
     /// Masked pixels, row and column.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub masked: Option<Vec<[usize; 2]>>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub exposure_s: Option<f64>,
     #[serde(flatten)]
     pub arrivals: Arrivals,
 }
@@ -56,6 +58,7 @@ impl Seen {
             time: frame.time,
             unusable: None,
             masked,
+            exposure_s: frame.exposure_s,
             arrivals: arrivals.clone(),
         };
         Self {
@@ -70,6 +73,7 @@ impl Seen {
             time,
             unusable,
             masked,
+            exposure_s,
             arrivals,
         } = self.entry;
         let Some(pixels) = self.pixels else {
@@ -95,6 +99,7 @@ impl Seen {
             time,
             pixels,
             masked,
+            exposure_s,
         };
         Next::Frame(frame, arrivals)
     }

@@ -283,6 +283,7 @@ impl V4l2 {
             time,
             pixels,
             masked,
+            exposure_s: Some(exposure.as_secs_f64()).filter(|s| *s > 0.0),
         };
         Next::Frame(frame, Arrivals::default())
     }

@@ -25,14 +25,6 @@ pub enum Fault {
     )]
     Projection { found: String },
     #[error(
-        "its heights are above {file}, those of world.origin above {world} (datum): the program holds no geoid to convert them; give the origin's height above {file} with datum = \"{datum}\", or convert the file"
-    )]
-    Datum {
-        file: &'static str,
-        world: &'static str,
-        datum: &'static str,
-    },
-    #[error(
         "expected heights at world.origin ({latitude_deg}°, {longitude_deg}°), found a file that does not reach there"
     )]
     NotCovered { latitude_deg: f64, longitude_deg: f64 },

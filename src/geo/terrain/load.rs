@@ -10,6 +10,7 @@ use super::hgt::Hgt;
 use super::raster::{Raster, Vertical, Window};
 use super::surface::Terrain;
 use crate::geo::config::{Config, Datum, Origin};
+use crate::geo::geoid::undulation_m;
 use crate::geo::wgs84::LocalAxes;
 
 /// How far from the origin ground is kept, m.
@@ -80,7 +81,7 @@ impl Terrain {
     }
 }
 
-/// Where a node of the grid lies in the file: the pixel at z = 0 and its change per metre up, and the height above the datum.
+/// Where a node of the grid lies in the file: the pixel at z = 0 and its change per metre up, and the height above the file's datum.
 #[derive(Clone, Copy, Default)]
 struct Anchor {
     pixel: [f64; 2],
@@ -90,13 +91,20 @@ struct Anchor {
 }
 
 impl Anchor {
-    fn of(raster: &dyn Raster, axes: &LocalAxes, x: f64, y: f64) -> Self {
+    fn of(raster: &dyn Raster, axes: &LocalAxes, datum: Datum, x: f64, y: f64) -> Self {
         let [low, high] = [0.0, UP_M].map(|z| axes.to_geodetic([x, y, z]));
         let [pixel, above] = [low, high].map(|place| raster.georeference().pixel(place));
+        let undulation_m = || undulation_m(low.latitude_deg, low.longitude_deg);
+        // Elevation models that say nothing are above the sea.
+        let file_above_world_m = match (raster.georeference().vertical, datum) {
+            (Vertical::Ellipsoid, Datum::Msl) => undulation_m(),
+            (Vertical::SeaLevel | Vertical::Unstated, Datum::Ellipsoid) => -undulation_m(),
+            _ => 0.0,
+        };
         Self {
             pixel,
             by_up: [0, 1].map(|k| (above[k] - pixel[k]) / UP_M),
-            height_m: low.height_m,
+            height_m: low.height_m + file_above_world_m,
             height_by_up: (high.height_m - low.height_m) / UP_M,
         }
     }
@@ -140,7 +148,6 @@ impl Heights {
 
 /// The terrain of a file about an origin.
 fn sampled(raster: &mut dyn Raster, origin: &Origin) -> Result<Terrain, Fault> {
-    check_datum(raster.georeference().vertical, origin.datum)?;
     let axes = LocalAxes::at(origin.geodetic());
     let [width, rows] = raster.size();
     let pixel = |x: f64, y: f64| raster.georeference().pixel(axes.to_geodetic([x, y, 0.0]));
@@ -167,7 +174,7 @@ fn sampled(raster: &mut dyn Raster, origin: &Origin) -> Result<Terrain, Fault> {
     let side = 2 * intervals + 1;
     let at = |k: usize| (k as f64 - intervals as f64) * step as f64 * spacing_m;
     let anchors: Vec<_> = (0..side * side)
-        .map(|k| Anchor::of(raster, &axes, at(k % side), at(k / side)))
+        .map(|k| Anchor::of(raster, &axes, origin.datum, at(k % side), at(k / side)))
         .collect();
     let heights = read_around(raster, &anchors, spacing_m)?;
     let n = 2 * half + 1;
@@ -229,22 +236,4 @@ fn read_around(raster: &mut dyn Raster, anchors: &[Anchor], spacing_m: f64) -> R
     }
     let values = raster.read(window)?;
     Ok(Heights { window, values })
-}
-
-fn check_datum(file: Vertical, world: Datum) -> Result<(), Fault> {
-    const SEA: &str = "mean sea level";
-    const ELLIPSOID: &str = "the ellipsoid";
-    match (file, world) {
-        (Vertical::Ellipsoid, Datum::Msl) => Err(Fault::Datum {
-            file: ELLIPSOID,
-            world: SEA,
-            datum: "ellipsoid",
-        }),
-        (Vertical::SeaLevel | Vertical::Unstated, Datum::Ellipsoid) => Err(Fault::Datum {
-            file: SEA,
-            world: ELLIPSOID,
-            datum: "msl",
-        }),
-        _ => Ok(()),
-    }
 }

@@ -168,6 +168,7 @@ fn measure(
             time: jiff::Timestamp::UNIX_EPOCH,
             pixels: frame,
             masked: None,
+            exposure_s: None,
         };
         let clock = Instant::now();
         let estimate = estimator.estimate(&frame).expect("a frame that can be used");

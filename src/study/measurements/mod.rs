@@ -12,6 +12,7 @@ mod light;
 mod measured;
 mod pixels;
 mod sequence;
+mod smear;
 mod zones;
 
 pub use measured::Measured;
@@ -50,6 +51,7 @@ pub const ALL: &[Measurement] = &[
     measurement("calibration", 5, calibration::error_left),
     measurement("lens", 40, lens::lenses),
     measurement("sequence", 8, sequence::frames_together),
+    measurement("smear", 100, smear::smears),
     measurement("formats", 200, formats::cost),
 ];
 

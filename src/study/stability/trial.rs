@@ -99,6 +99,7 @@ pub fn frame(pixels: Array2<f64>) -> Frame {
         time: Timestamp::UNIX_EPOCH,
         pixels,
         masked: None,
+        exposure_s: None,
     }
 }
 

@@ -83,10 +83,10 @@ impl Condition {
         truth
     }
 
-    /// The Gaussians that a spot consists of: offsets, the same in x and in y, and shares.
-    pub(super) fn parts(condition: Option<Self>, camera: &Camera) -> Vec<(f64, f64)> {
+    /// The Gaussians that a spot consists of: offsets in x and y, and shares.
+    pub(super) fn parts(condition: Option<Self>, camera: &Camera) -> Vec<([f64; 2], f64)> {
         if condition != Some(Self::Ellipse) {
-            return vec![(0.0, 1.0)];
+            return vec![([0.0; 2], 1.0)];
         }
         // A round spot smeared by a Gaussian along the diagonal; sums of Gaussians half their σ apart are exact to rounding.
         let smear = camera.spot_sigma_m * (ELLIPSE[0].powi(2) - ELLIPSE[1].powi(2)).sqrt();
@@ -94,7 +94,7 @@ impl Condition {
             .map(|k| 0.5 * f64::from(k))
             .map(|t| {
                 let share = 0.5 * (-0.5 * t * t).exp() / std::f64::consts::TAU.sqrt();
-                (t * smear * std::f64::consts::FRAC_1_SQRT_2, share)
+                ([t * smear * std::f64::consts::FRAC_1_SQRT_2; 2], share)
             })
             .collect()
     }

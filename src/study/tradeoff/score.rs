@@ -203,6 +203,13 @@ pub(in crate::study) fn bound_ratio(ratios: impl IntoIterator<Item = f64>) -> Op
     trimmed(&ratios).map(|r| r / TRIMMED_EXPONENTIAL)
 }
 
+impl Scene {
+    /// Whether all emitters can be resolved.
+    pub fn is_clear(&self) -> bool {
+        (0..self.positions.len()).all(|i| is_resolvable(self, i))
+    }
+}
+
 fn is_resolvable(scene: &Scene, i: usize) -> bool {
     is_apart(&scene.positions, &scene.bound_m2, i)
 }

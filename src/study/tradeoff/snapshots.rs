@@ -84,6 +84,7 @@ impl Snapshots {
             time: jiff::Timestamp::from_nanosecond(nanoseconds).expect("minutes after 1970"),
             pixels,
             masked: None,
+            exposure_s: None,
         }
     }
 
