@@ -7,10 +7,12 @@
 
 mod joint_information;
 mod motion;
+mod residual_map;
 mod search;
 mod sequence_estimator;
 mod snapshot;
 mod subspace;
+mod target;
 mod window;
 
 pub(crate) use sequence_estimator::SequenceEstimator;

@@ -1,13 +1,13 @@
 //! The number of emitters of a window: births where the residuals of all frames together peak, deaths and merges where the light of a
 //! target is no more than noise, and a start from the subspace where frames suffice.
 
-use nalgebra::DMatrix;
-
 use crate::estimate::detect::matched_filter::MatchedFilter;
 use crate::estimate::model::hypothesis::{Nuisances, OVERLAPPING};
-use crate::estimate::sequence::snapshot::{Engine, LocalQuadratic, Snapshot, residual};
+use crate::estimate::sequence::residual_map::residual_peaks;
+use crate::estimate::sequence::snapshot::{Engine, LocalQuadratic, Snapshot};
 use crate::estimate::sequence::subspace::Subspace;
-use crate::estimate::sequence::window::{Target, Window};
+use crate::estimate::sequence::target::Target;
+use crate::estimate::sequence::window::Window;
 
 /// Steps of a fit before a hypothesis is compared, and before it is kept.
 const TRIAL_STEPS: usize = 40;
@@ -20,8 +20,6 @@ const PEAKS: usize = 3;
 const ROUNDS: usize = 12;
 /// Targets that are moved to the residual's peaks, the weakest first.
 const RELOCATED: usize = 3;
-/// Least share of a spot that lies outside the emitters' span for a birth there: nearer, it is the same emitter.
-const LEAST_OUTSIDE: f64 = 1e-6;
 
 /// Least decrease of the deviance that a source must bring when its energy is free in each of `frames` frames: the bound of χ² with that
 /// many degrees of freedom (Laurent and Massart, 2000, eq. 4.3) that one frame exceeds as rarely as `single`, the penalty in a lone frame.
@@ -49,67 +47,6 @@ impl WindowSearch<'_, '_, '_> {
         score(window, self.penalty)
     }
 
-    /// Maxima of the light that the residuals of all frames leave for one more emitter, Σ (fᵀr)²/‖P⊥f‖², the highest first.
-    pub fn residual_peaks(&mut self, window: &Window) -> Vec<(f64, [f64; 2])> {
-        let Some(last) = window.snapshots.last() else {
-            return Vec::new();
-        };
-        let filter = &mut *self.matched_filter;
-        let mut sum: Vec<f64> = Vec::new();
-        for s in &window.snapshots {
-            let positions = window.positions(&window.state, s.time_s);
-            let (left, _) = residual(self.engine, &s.compressed, s.nuisances, &positions);
-            filter.respond(left, s.compressed.mx, s.compressed.my);
-            sum.resize(filter.map().len(), 0.0);
-            for (total, v) in sum.iter_mut().zip(filter.map()) {
-                *total += v * v;
-            }
-        }
-        // The share of a spot that lies outside the emitters' span: one minus cᵀG⁻¹c, from the emitters' own responses.
-        let positions = window.positions(&window.state, last.time_s);
-        let n = positions.len() / 2;
-        let (mx, my) = (last.compressed.mx, last.compressed.my);
-        let mut responses = DMatrix::zeros(n, sum.len());
-        let mut spots = Vec::new();
-        for i in 0..n {
-            let spot = unit_spot(self.engine, last, [positions[2 * i], positions[2 * i + 1]]);
-            filter.respond(&spot, mx, my);
-            for (k, v) in filter.map().iter().enumerate() {
-                responses[(i, k)] = *v;
-            }
-            spots.push(spot);
-        }
-        let inner = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(x, y)| x * y).sum::<f64>();
-        let mut gram = DMatrix::from_fn(n, n, |i, j| inner(&spots[i], &spots[j]));
-        for i in 0..n {
-            gram[(i, i)] *= 1.0 + 1e-12;
-        }
-        if n > 0 {
-            let Some(factor) = gram.cholesky() else {
-                return Vec::new();
-            };
-            for (k, total) in sum.iter_mut().enumerate() {
-                let c = responses.column(k).into_owned();
-                let outside = 1.0 - c.dot(&factor.solve(&c));
-                *total = if outside > LEAST_OUTSIDE { *total / outside } else { 0.0 };
-            }
-        }
-        let width = filter.width();
-        let height = sum.len() / width;
-        let mut found = Vec::new();
-        for (k, &value) in sum.iter().enumerate() {
-            let (i, j) = (k % width, k / width);
-            let mut around = (j.saturating_sub(1)..(j + 2).min(height))
-                .flat_map(|b| (i.saturating_sub(1)..(i + 2).min(width)).map(move |a| b * width + a))
-                .filter(|o| *o != k);
-            if around.all(|o| sum[o] < value) {
-                found.push((value, filter.position(k)));
-            }
-        }
-        found.sort_by(|a, b| b.0.total_cmp(&a.0));
-        found
-    }
-
     /// Adds targets at residual peaks while the score improves. Returns whether any was added.
     pub fn grow(&mut self, window: &mut Window, born_s: f64) -> bool {
         let mut has_grown = false;
@@ -119,13 +56,10 @@ impl WindowSearch<'_, '_, '_> {
             }
             let frames = window.snapshots.iter().filter(|s| s.time_s >= born_s).count() as f64;
             let least = frames + TRIED * (penalty(self.penalty, frames) - frames);
-            let peaks = self.residual_peaks(window);
+            let peaks = residual_peaks(self.engine, self.matched_filter, window, least);
             let before = self.score(window);
             let mut best: Option<Window> = None;
-            for (value, at) in peaks.into_iter().take(PEAKS) {
-                if value < least {
-                    break;
-                }
+            for (_, at) in peaks.into_iter().take(PEAKS) {
                 let mut next = window.clone();
                 next.insert(Target::born(born_s), at, [0.0; 2]);
                 next.fit(self.engine, TRIAL_STEPS);
@@ -196,7 +130,10 @@ impl WindowSearch<'_, '_, '_> {
             let mut without = window.clone();
             without.remove(e);
             without.fit(self.engine, TRIAL_STEPS);
-            for (_, at) in self.residual_peaks(&without).into_iter().take(2) {
+            for (_, at) in residual_peaks(self.engine, self.matched_filter, &without, 0.0)
+                .into_iter()
+                .take(2)
+            {
                 let mut next = without.clone();
                 next.insert(target, at, [0.0; 2]);
                 next.fit(self.engine, TRIAL_STEPS);
@@ -295,20 +232,14 @@ pub(crate) fn light(window: &Window) -> Vec<f64> {
     evidence
 }
 
-/// A spot of unit norm at `u`, in the coefficients of a snapshot.
-fn unit_spot(engine: &mut Engine, snapshot: &Snapshot, u: [f64; 2]) -> Vec<f64> {
-    let axes = engine.bases.axes();
-    let sizes = [snapshot.compressed.mx, snapshot.compressed.my];
-    let profiles: [Vec<f64>; 2] = [0, 1].map(|k| {
-        let (m, mut scratch) = (sizes[k], vec![0.0; 3 * axes[k].n]);
-        let mut out = vec![0.0; 3 * m];
-        axes[k].profile(u[k], 1.0, snapshot.compressed.reach, m, &mut scratch, &mut out);
-        out.truncate(m);
-        let norm = out.iter().map(|v| v * v).sum::<f64>().sqrt().max(1e-12);
-        out.iter().map(|v| v / norm).collect()
-    });
-    profiles[1]
-        .iter()
-        .flat_map(|y| profiles[0].iter().map(move |x| x * y))
-        .collect()
+/// Targets, the last first, whose light over all frames that held them is less than their penalty: noise that was born as an emitter. Those with
+/// frames that have left the window are not among them.
+pub(crate) fn unconfirmed(window: &Window, single: f64) -> Vec<usize> {
+    let Some(first) = window.snapshots.first() else {
+        return Vec::new();
+    };
+    let (evidence, counts) = (light(window), window.counts());
+    let is_young = |e: &usize| window.targets[*e].born_s >= first.time_s && window.targets[*e].is_in(window.time_s);
+    let targets = (0..window.len()).rev().filter(is_young);
+    targets.filter(|&e| evidence[e] < penalty(single, counts[e])).collect()
 }

@@ -16,9 +16,10 @@ use crate::estimate::model::hypothesis::Nuisances;
 use crate::estimate::rules::Rules;
 use crate::estimate::sequence::joint_information::{JointInformation, STATE};
 use crate::estimate::sequence::motion::{Posterior, posterior, velocity_on_ground};
-use crate::estimate::sequence::search::WindowSearch;
+use crate::estimate::sequence::search::{WindowSearch, unconfirmed};
 use crate::estimate::sequence::snapshot::{Engine, LocalQuadratic, Snapshot, hypothesis};
-use crate::estimate::sequence::window::{SPEED_STD_M_S, Target, Window};
+use crate::estimate::sequence::target::Target;
+use crate::estimate::sequence::window::{SPEED_STD_M_S, Window};
 use crate::estimate::uncertainty::localise::localise;
 use crate::frame::Frame;
 use crate::optics::Camera;
@@ -35,6 +36,8 @@ const MAX_NUMBERS: usize = 1 << 20;
 /// Steps of a fit to a new frame, and of the whole window.
 const FRAME_STEPS: usize = 12;
 const WINDOW_STEPS: usize = 30;
+/// Snapshots that are linearised anew with a frame: more follow a change sooner, each costs as much as a step of the frame's own fit.
+const REFRESHED: usize = 8;
 /// The window is searched when it has grown by this factor since, and at the latest after this many frames.
 const SEARCH_GROWTH: f64 = 1.4;
 const SEARCH_AFTER: usize = 32;
@@ -113,6 +116,7 @@ impl Estimator for SequenceEstimator {
             return Ok(alone);
         }
         self.bury(elapsed, is_over);
+        self.drop_unconfirmed(is_over);
         self.tend(is_over);
         Ok(self.report(scale, is_over))
     }
@@ -305,6 +309,20 @@ impl SequenceEstimator {
         }
     }
 
+    /// Forgets newcomers that the frames since have not confirmed.
+    fn drop_unconfirmed(&mut self, is_over: &dyn Fn() -> bool) {
+        let mut budget = WorkBudget::new(is_over);
+        let (space, _, _) = self.single.loaded();
+        let targets = unconfirmed(&self.window, space.source_penalty);
+        let mut engine = Engine {
+            bases: &space.bases,
+            rules: self.rules,
+            budget: &mut budget,
+            workspace: &mut space.workspace,
+        };
+        self.window.discard(&mut engine, &targets);
+    }
+
     /// Keeps the window within its bounds, linearised and searched.
     fn tend(&mut self, is_over: &dyn Fn() -> bool) {
         let rules = self.rules;
@@ -323,7 +341,7 @@ impl SequenceEstimator {
             window.fold(window.snapshots.len() - most);
         }
         window.forget_dead();
-        if window.has_moved() {
+        if window.refresh(&mut engine, REFRESHED) && window.snapshots.len() <= REFRESHED {
             window.fit(&mut engine, WINDOW_STEPS);
         }
         self.since_search += 1;
