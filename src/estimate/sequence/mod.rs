@@ -7,7 +7,9 @@
 
 mod joint_information;
 mod motion;
+mod report;
 mod residual_map;
+mod revision;
 mod search;
 mod sequence_estimator;
 mod snapshot;

@@ -42,17 +42,8 @@ impl UnitSpot {
     }
 }
 
-/// Maxima of at least `least` of the light that the residuals of all frames leave for one more emitter, Σ (fᵀr)²/‖P⊥f‖², the highest
-/// first, with their positions, σ.
-pub(crate) fn residual_peaks(
-    engine: &mut Engine,
-    filter: &mut MatchedFilter,
-    window: &Window,
-    least: f64,
-) -> Vec<(f64, [f64; 2])> {
-    let Some(last) = window.snapshots.last() else {
-        return Vec::new();
-    };
+/// What the residuals of all frames leave for one more emitter at each point of the matched filter's grid, Σ (fᵀr)²/‖P⊥f‖².
+pub(crate) fn residual_map(engine: &mut Engine, filter: &mut MatchedFilter, window: &Window) -> Vec<f64> {
     let mut sum: Vec<f64> = Vec::new();
     for s in &window.snapshots {
         let positions = window.positions(&window.state, s.time_s);
@@ -63,11 +54,37 @@ pub(crate) fn residual_peaks(
             *total += v * v;
         }
     }
-    let positions = window.positions(&window.state, last.time_s);
-    let spots = positions.as_slice().chunks_exact(2);
-    let spots: Vec<UnitSpot> = spots.map(|u| UnitSpot::new(engine.bases, last, [u[0], u[1]])).collect();
-    divide_by_outside(filter, &spots, &mut sum);
-    peaks(filter, &sum, least)
+    if let Some(last) = window.snapshots.last() {
+        let positions = window.positions(&window.state, last.time_s);
+        let spots = positions.as_slice().chunks_exact(2);
+        let spots: Vec<UnitSpot> = spots.map(|u| UnitSpot::new(engine.bases, last, [u[0], u[1]])).collect();
+        divide_by_outside(filter, &spots, &mut sum);
+    }
+    sum
+}
+
+/// The residual maps of single frames added up, as long as they are of the same emitters: light that no frame shows alone.
+#[derive(Default)]
+pub(crate) struct ResidualSum {
+    pub sum: Vec<f64>,
+    pub frames: f64,
+}
+
+impl ResidualSum {
+    /// Adds a frame's map; older ones fade, so that about `most` count.
+    pub fn add(&mut self, map: &[f64], most: f64) {
+        let kept = 1.0 - 1.0 / most;
+        self.frames = kept * self.frames + 1.0;
+        self.sum.resize(map.len(), 0.0);
+        for (sum, v) in self.sum.iter_mut().zip(map) {
+            *sum = kept * *sum + v;
+        }
+    }
+
+    pub fn clear(&mut self) {
+        self.sum.clear();
+        self.frames = 0.0;
+    }
 }
 
 /// Divides by the share of a spot that lies outside the emitters' span: one minus cᵀG⁻¹c with c its overlaps with them and G theirs.
@@ -104,8 +121,8 @@ fn divide_by_outside(filter: &MatchedFilter, spots: &[UnitSpot], sum: &mut [f64]
     }
 }
 
-/// Points that are above all their neighbours, the highest first.
-fn peaks(filter: &MatchedFilter, sum: &[f64], least: f64) -> Vec<(f64, [f64; 2])> {
+/// Points of at least `least` that are above all their neighbours, the highest first, with their positions, σ.
+pub(crate) fn peaks(filter: &MatchedFilter, sum: &[f64], least: f64) -> Vec<(f64, [f64; 2])> {
     let width = filter.width();
     let height = sum.len() / width;
     let mut found = Vec::new();

@@ -3,23 +3,26 @@
 
 use crate::estimate::detect::matched_filter::MatchedFilter;
 use crate::estimate::model::hypothesis::{Nuisances, OVERLAPPING};
-use crate::estimate::sequence::residual_map::residual_peaks;
+use crate::estimate::sequence::joint_information::STATE;
+use crate::estimate::sequence::residual_map::{ResidualSum, peaks, residual_map};
 use crate::estimate::sequence::snapshot::{Engine, LocalQuadratic, Snapshot};
 use crate::estimate::sequence::subspace::Subspace;
 use crate::estimate::sequence::target::Target;
 use crate::estimate::sequence::window::Window;
 
 /// Steps of a fit before a hypothesis is compared, and before it is kept.
-const TRIAL_STEPS: usize = 40;
-const CONVERGE_STEPS: usize = 100;
+pub(crate) const TRIAL_STEPS: usize = 40;
+pub(crate) const CONVERGE_STEPS: usize = 100;
 /// A residual peak is tried from this share of the penalty beyond the noise on: what other emitters have absorbed comes back in the joint fit.
 const TRIED: f64 = 0.6;
+/// The same where no other emitter is near: what the grid of the matched filter loses.
+const TRIED_ALONE: f64 = 0.9;
 /// Residual peaks tried in a round.
 const PEAKS: usize = 3;
 /// Rounds of births and deaths.
 const ROUNDS: usize = 12;
 /// Targets that are moved to the residual's peaks, the weakest first.
-const RELOCATED: usize = 3;
+pub(crate) const RELOCATED: usize = 3;
 
 /// Least decrease of the deviance that a source must bring when its energy is free in each of `frames` frames: the bound of χ² with that
 /// many degrees of freedom (Laurent and Massart, 2000, eq. 4.3) that one frame exceeds as rarely as `single`, the penalty in a lone frame.
@@ -40,11 +43,35 @@ pub(crate) struct WindowSearch<'s, 'a, 'b> {
     pub matched_filter: &'s mut MatchedFilter,
     /// The penalty of a source in a lone frame.
     pub penalty: f64,
+    /// What the emitters found last leave; see `residual_map`.
+    pub left: Vec<f64>,
 }
 
 impl WindowSearch<'_, '_, '_> {
     pub fn score(&self, window: &Window) -> f64 {
         score(window, self.penalty)
+    }
+
+    /// Maxima of at least `least` of the residual map, the highest first.
+    pub fn residual_peaks(&mut self, window: &Window, least: f64) -> Vec<(f64, [f64; 2])> {
+        self.left = residual_map(self.engine, self.matched_filter, window);
+        peaks(self.matched_filter, &self.left, least)
+    }
+
+    /// Where the frames together show light that none shows alone.
+    pub fn births(&self, window: &Window, left: &ResidualSum) -> Vec<[f64; 2]> {
+        let beyond = |share: f64| left.frames + share * (penalty(self.penalty, left.frames) - left.frames);
+        let positions = window.positions(&window.state, window.time_s);
+        let is_near = |at: [f64; 2]| {
+            let mut others = positions.as_slice().chunks_exact(2);
+            others.any(|u| (u[0] - at[0]).hypot(u[1] - at[1]) < OVERLAPPING)
+        };
+        peaks(self.matched_filter, &left.sum, beyond(TRIED))
+            .into_iter()
+            .filter(|(value, at)| is_near(*at) || *value > beyond(TRIED_ALONE))
+            .map(|(_, at)| at)
+            .take(PEAKS)
+            .collect()
     }
 
     /// Adds targets at residual peaks while the score improves. Returns whether any was added.
@@ -56,7 +83,7 @@ impl WindowSearch<'_, '_, '_> {
             }
             let frames = window.snapshots.iter().filter(|s| s.time_s >= born_s).count() as f64;
             let least = frames + TRIED * (penalty(self.penalty, frames) - frames);
-            let peaks = residual_peaks(self.engine, self.matched_filter, window, least);
+            let peaks = self.residual_peaks(window, least);
             let before = self.score(window);
             let mut best: Option<Window> = None;
             for (_, at) in peaks.into_iter().take(PEAKS) {
@@ -116,13 +143,21 @@ impl WindowSearch<'_, '_, '_> {
         doubtful
     }
 
+    /// Targets whose removal is tried: doubtful ones, and those of least light.
+    pub fn weakest(&self, window: &Window) -> Vec<usize> {
+        let mut weakest = self.doubtful(window);
+        for e in by_light(window).into_iter().take(RELOCATED) {
+            if !weakest.contains(&e) {
+                weakest.push(e);
+            }
+        }
+        weakest
+    }
+
     /// Moves weak targets to where the residual peaks without them.
     fn relocate(&mut self, window: &mut Window) -> bool {
-        let evidence = light(window);
-        let mut order: Vec<usize> = (0..window.len()).collect();
-        order.sort_by(|&a, &b| evidence[a].total_cmp(&evidence[b]));
         let before = self.score(window);
-        for e in order.into_iter().take(RELOCATED) {
+        for e in by_light(window).into_iter().take(RELOCATED) {
             if self.engine.budget.is_exhausted() {
                 break;
             }
@@ -130,10 +165,7 @@ impl WindowSearch<'_, '_, '_> {
             let mut without = window.clone();
             without.remove(e);
             without.fit(self.engine, TRIAL_STEPS);
-            for (_, at) in residual_peaks(self.engine, self.matched_filter, &without, 0.0)
-                .into_iter()
-                .take(2)
-            {
+            for (_, at) in self.residual_peaks(&without, 0.0).into_iter().take(2) {
                 let mut next = without.clone();
                 next.insert(target, at, [0.0; 2]);
                 next.fit(self.engine, TRIAL_STEPS);
@@ -157,12 +189,10 @@ impl WindowSearch<'_, '_, '_> {
         }
     }
 
-    /// A window from the subspace of the frames alone, if it explains them better than `window` does.
-    pub fn restart(&mut self, window: &mut Window) -> bool {
+    /// The window with emitters from the subspace of its frames alone, not fitted; `None` where they have too many coefficients for that.
+    pub fn restarted(&mut self, window: &Window) -> Option<Window> {
         let frames: Vec<_> = window.snapshots.iter().map(|s| &*s.compressed).collect();
-        let Some(subspace) = Subspace::new(&frames) else {
-            return false;
-        };
+        let subspace = Subspace::new(&frames)?;
         let first = window.snapshots.first().map_or(0.0, |s| s.time_s);
         let middle = 0.5 * (first + window.time_s);
         let still = Window {
@@ -200,24 +230,15 @@ impl WindowSearch<'_, '_, '_> {
                 best = Some(next);
             }
         }
-        let Some(best) = best else { return false };
+        let best = best?;
         let mut next = window.clone();
         while next.len() > 0 {
             next.remove(next.len() - 1);
         }
-        for e in 0..best.len() {
-            next.insert(
-                Target::born(first),
-                [best.state[4 * e], best.state[4 * e + 1]],
-                [0.0; 2],
-            );
+        for at in best.state.as_slice().chunks_exact(STATE) {
+            next.insert(Target::born(first), [at[0], at[1]], [0.0; 2]);
         }
-        next.fit(self.engine, CONVERGE_STEPS);
-        let is_better = self.score(&next) < self.score(window) - 1.0;
-        if is_better {
-            *window = next;
-        }
-        is_better
+        Some(next)
     }
 }
 
@@ -230,6 +251,14 @@ pub(crate) fn light(window: &Window) -> Vec<f64> {
         }
     }
     evidence
+}
+
+/// Targets, those of least light first.
+fn by_light(window: &Window) -> Vec<usize> {
+    let evidence = light(window);
+    let mut order: Vec<usize> = (0..window.len()).collect();
+    order.sort_by(|&a, &b| evidence[a].total_cmp(&evidence[b]));
+    order
 }
 
 /// Targets, the last first, whose light over all frames that held them is less than their penalty: noise that was born as an emitter. Those with

@@ -5,22 +5,22 @@ use std::sync::Arc;
 use jiff::Timestamp;
 use nalgebra::{DMatrix, DVector};
 
-use crate::estimate::emitter::{Estimate, Flags};
+use crate::estimate::emitter::Estimate;
 use crate::estimate::error::Error;
 use crate::estimate::estimator::Estimator;
 use crate::estimate::estimators::analytic::AnalyticEstimator;
 use crate::estimate::estimators::list::EstimatorSpec;
-use crate::estimate::fit::context::FitContext;
 use crate::estimate::fit::work_budget::WorkBudget;
 use crate::estimate::model::hypothesis::Nuisances;
 use crate::estimate::rules::Rules;
 use crate::estimate::sequence::joint_information::{JointInformation, STATE};
-use crate::estimate::sequence::motion::{Posterior, posterior, velocity_on_ground};
+use crate::estimate::sequence::report::report;
+use crate::estimate::sequence::residual_map::ResidualSum;
+use crate::estimate::sequence::revision::{Revised, Revision};
 use crate::estimate::sequence::search::{WindowSearch, unconfirmed};
-use crate::estimate::sequence::snapshot::{Engine, LocalQuadratic, Snapshot, hypothesis};
+use crate::estimate::sequence::snapshot::{Engine, LocalQuadratic, Snapshot};
 use crate::estimate::sequence::target::Target;
 use crate::estimate::sequence::window::{SPEED_STD_M_S, Window};
-use crate::estimate::uncertainty::localise::localise;
 use crate::frame::Frame;
 use crate::optics::Camera;
 
@@ -38,11 +38,13 @@ const FRAME_STEPS: usize = 12;
 const WINDOW_STEPS: usize = 30;
 /// Snapshots that are linearised anew with a frame: more follow a change sooner, each costs as much as a step of the frame's own fit.
 const REFRESHED: usize = 8;
-/// The window is searched when it has grown by this factor since, and at the latest after this many frames.
+/// A search of the window begins when it has grown by this factor since the last, and at the latest after this many frames.
 const SEARCH_GROWTH: f64 = 1.4;
 const SEARCH_AFTER: usize = 32;
-/// Work of a search of the window, in frames' searches: it comes with one frame in `SEARCH_AFTER`.
-const SEARCH_WORK: f64 = 4.0;
+/// Work of a search that has to end with its frame, in frames' searches: where what is remembered explains nothing.
+const SEARCH_WORK: f64 = 0.5;
+/// Work of a search that goes on from frame to frame, a frame: less finds emitters later, more makes frames slower.
+const REVISION_WORK: f64 = 0.04;
 
 /// An estimator that remembers.
 pub(crate) struct SequenceEstimator {
@@ -53,7 +55,10 @@ pub(crate) struct SequenceEstimator {
     /// Times are seconds since this.
     epoch: Option<Timestamp>,
     window: Window,
-    /// Frames since the last search, and the window's length then.
+    /// What frames have left unexplained since the number of emitters changed.
+    left: ResidualSum,
+    /// The search in progress; frames since it began, and the window's length then.
+    revision: Option<Revision>,
     since_search: usize,
     searched: usize,
     /// Gap after which nothing is remembered, s.
@@ -75,6 +80,8 @@ impl SequenceEstimator {
             rules,
             epoch: None,
             window: Window::default(),
+            left: ResidualSum::default(),
+            revision: None,
             since_search: 0,
             searched: 0,
             memory_s,
@@ -92,6 +99,8 @@ impl SequenceEstimator {
             unknown: [extent * extent / 12.0, (SPEED_STD_M_S / self.ground_m()).powi(2)],
             ..Window::default()
         };
+        self.left.clear();
+        self.revision = None;
         self.since_search = 0;
         self.searched = 0;
     }
@@ -118,7 +127,17 @@ impl Estimator for SequenceEstimator {
         self.bury(elapsed, is_over);
         self.drop_unconfirmed(is_over);
         self.tend(is_over);
-        Ok(self.report(scale, is_over))
+        self.revise(is_over);
+        let name = self.spec.name;
+        Ok(report(
+            &mut self.single,
+            &self.window,
+            &self.camera,
+            self.rules,
+            name,
+            scale,
+            is_over,
+        ))
     }
 }
 
@@ -199,6 +218,7 @@ impl SequenceEstimator {
             engine: &mut engine,
             matched_filter: &mut space.matched_filter,
             penalty: space.source_penalty,
+            left: Vec::new(),
         };
         search.refine(&mut next, born_s);
         let is_explained = next.is_last_explained();
@@ -277,9 +297,17 @@ impl SequenceEstimator {
             engine: &mut engine,
             matched_filter: &mut space.matched_filter,
             penalty: space.source_penalty,
+            left: Vec::new(),
         };
-        search.grow(&mut fresh, time_s);
-        fresh.is_last_explained().then_some(fresh)
+        let has_grown = search.grow(&mut fresh, time_s);
+        let left = search.left;
+        let is_explained = fresh.is_last_explained();
+        if has_grown {
+            self.left.clear();
+        } else if is_explained {
+            self.left.add(&left, MAX_SNAPSHOTS as f64);
+        }
+        is_explained.then_some(fresh)
     }
 
     /// Ends targets that have gone dark: frames before hold them still.
@@ -344,90 +372,52 @@ impl SequenceEstimator {
         if window.refresh(&mut engine, REFRESHED) && window.snapshots.len() <= REFRESHED {
             window.fit(&mut engine, WINDOW_STEPS);
         }
-        self.since_search += 1;
-        let length = window.snapshots.len();
-        if length < 2 || self.since_search < SEARCH_AFTER && (length as f64) < SEARCH_GROWTH * self.searched as f64 {
-            return;
-        }
-        (self.since_search, self.searched) = (0, length);
-        let mut search = WindowSearch {
-            engine: &mut engine,
-            matched_filter: &mut space.matched_filter,
-            penalty: space.source_penalty,
-        };
-        let is_ambiguous = window.is_ambiguous();
-        let born_s = window.snapshots[0].time_s;
-        let has_grown = search.grow(window, born_s);
-        if is_ambiguous || has_grown {
-            search.refine(window, born_s);
-            search.restart(window);
-        }
     }
 
-    /// The emitters at the newest frame's time.
-    fn report(&mut self, scale: f64, is_over: &dyn Fn() -> bool) -> Estimate {
-        let sigma = self.camera.spot_sigma_m;
-        let window = &self.window;
-        let present = window.present(window.time_s);
-        let n = present.len();
-        let posterior = posterior(&window.total, 1.0 / (self.camera.ground_scale() * sigma));
-        let mut known = DMatrix::zeros(2 * n, 2 * n);
-        let mut positions = window.positions(&window.state, window.time_s);
-        let mut budget = WorkBudget::new(is_over);
-        let (space, compressed, frame) = self.single.loaded();
-        if let Some(Posterior { state, covariance }) = &posterior {
-            positions = window.positions(state, window.time_s);
-            let place = |k: usize| STATE * present[k / 2] + k % 2;
-            let own = DMatrix::from_fn(2 * n, 2 * n, |r, c| covariance[(place(r), place(c))]);
-            let mut engine = Engine {
-                bases: &space.bases,
-                rules: self.rules,
-                budget: &mut budget,
-                workspace: &mut space.workspace,
-            };
-            let local = LocalQuadratic::new(&mut engine, compressed, Nuisances::default(), positions.clone());
-            if let Some(information) = own.cholesky().map(|c| c.inverse()) {
-                known = information - local.information;
-            }
-        }
-        let mut hypothesis = hypothesis(&positions, Nuisances::default());
-        hypothesis.converged = true;
-        let mut context = FitContext {
+    /// Searches the window for another number of emitters: begins when it has grown, and goes on with each frame for a share of its time.
+    fn revise(&mut self, is_over: &dyn Fn() -> bool) {
+        let mut budget = WorkBudget::of_frames(REVISION_WORK, is_over);
+        let (space, _, _) = self.single.loaded();
+        let mut engine = Engine {
             bases: &space.bases,
-            compressed,
             rules: self.rules,
             budget: &mut budget,
             workspace: &mut space.workspace,
         };
-        let noise_j = scale * self.camera.noise_std_j;
-        let mut found = localise(
-            &mut context,
-            &mut hypothesis,
-            frame,
-            &self.camera,
-            noise_j,
-            None,
-            Some(&known),
-        );
-        for (e, emitter) in found.emitters.iter_mut().enumerate() {
-            emitter.energy_j = emitter.energy_j.max(0.0);
-            if let Some(Posterior { state, .. }) = &posterior {
-                let velocity = [2, 3].map(|k| state[STATE * present[e] + k] * sigma);
-                emitter.velocity = Some(velocity_on_ground(&self.camera, emitter.sensor_m, velocity));
+        let mut search = WindowSearch {
+            engine: &mut engine,
+            matched_filter: &mut space.matched_filter,
+            penalty: space.source_penalty,
+            left: Vec::new(),
+        };
+        let window = &mut self.window;
+        let length = window.snapshots.len();
+        self.since_search += 1;
+        let mut revision = self.revision.take().filter(|r| r.is_of(window));
+        if revision.is_none() {
+            let is_due = self.since_search >= SEARCH_AFTER || length as f64 >= SEARCH_GROWTH * self.searched as f64;
+            if length < 2 || !is_due {
+                return;
             }
-            if is_over() {
-                emitter.flags |= Flags::OUT_OF_TIME;
+            (self.since_search, self.searched) = (0, length);
+            let births = search.births(window, &self.left);
+            let is_ambiguous = window.is_ambiguous();
+            if is_ambiguous || !births.is_empty() {
+                revision = Some(Revision::new(window, &search, births, is_ambiguous));
             }
         }
-        Estimate {
-            emitters: found.emitters,
-            estimator: self.spec.name,
-            is_cut_short: is_over(),
-            reduced_chi2: found.reduced_chi2,
-            spot_error: 0.0,
-            saturated_share: frame.saturated_share(),
-            condition: found.condition,
-            steps: budget.steps,
+        let Some(mut revision) = revision else { return };
+        match revision.advance(&mut search) {
+            Revised::Finished => {}
+            Revised::Unfinished => self.revision = Some(revision),
+            Revised::Better(mut better) => {
+                let newer = window.snapshots.iter().filter(|s| s.time_s > revision.time_s());
+                let newer: Vec<Snapshot> = newer.cloned().collect();
+                better.catch_up(search.engine, &newer, self.memory_s);
+                *window = better;
+                self.left.clear();
+                self.searched = 0;
+            }
         }
     }
 }

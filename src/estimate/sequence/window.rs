@@ -29,6 +29,19 @@ const MOVED_OVERLAPPING: f64 = 0.002;
 /// Pairs nearer than this many standard deviations of their difference are ambiguous: the window is searched again.
 const AMBIGUOUS: f64 = 4.0;
 
+/// Times the predicted decrease that must suffice to reach the cost asked for; see `fit::levenberg_marquardt`.
+const ABORT_FACTOR: f64 = 5.0;
+
+/// How a fit ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Progress {
+    Converged,
+    /// The cost asked for is out of reach.
+    Hopeless,
+    /// Steps or work are spent.
+    Unfinished,
+}
+
 /// All that is remembered.
 #[derive(Clone, Default)]
 pub(crate) struct Window {
@@ -44,8 +57,9 @@ pub(crate) struct Window {
     pub total: JointInformation,
     /// Snapshots of noise alone that were left out; see `subspace`.
     pub dropped: f64,
-    /// −2 ln L of the last fit.
+    /// −2 ln L of the last fit, and the damping λ it ended with; 0 to begin with `LAMBDA_START`.
     pub cost: f64,
+    pub damping: f64,
     /// Variances of position, σ², and velocity, σ²/s², of an emitter of which nothing is known.
     pub unknown: [f64; 2],
 }
@@ -180,20 +194,32 @@ impl Window {
         total
     }
 
-    /// Fits all snapshots and the prior together by Levenberg–Marquardt, at most `steps` steps from `state` on. Sets `total` and `cost`, and
-    /// returns whether it has converged.
-    pub fn fit(&mut self, engine: &mut Engine, steps: usize) -> bool {
+    /// Fits all snapshots and the prior together by Levenberg–Marquardt, at most `steps` steps from `state` on. Sets `total` and `cost`.
+    pub fn fit(&mut self, engine: &mut Engine, steps: usize) {
+        self.damping = 0.0;
+        self.fit_below(engine, &mut { steps }, f64::INFINITY);
+    }
+
+    /// [`Window::fit`] of the `steps` that are left, given up as soon as a cost below `highest` is out of reach. Called again, it goes on.
+    pub fn fit_below(&mut self, engine: &mut Engine, steps: &mut usize, highest: f64) -> Progress {
         let mut locals = Vec::new();
         let mut trial = Vec::new();
-        let mut cost = self.linearise(engine, &self.state.clone(), &mut locals);
+        let is_linear = self.damping > 0.0;
+        let mut cost = if is_linear {
+            locals.extend(self.snapshots.iter_mut().map(|s| std::mem::take(&mut s.local)));
+            self.cost
+        } else {
+            self.linearise(engine, &self.state.clone(), &mut locals)
+        };
         let mut total = self.sum(&self.state, &locals);
-        let mut lambda = LAMBDA_START;
-        let mut has_converged = self.len() == 0;
+        let mut lambda = if is_linear { self.damping } else { LAMBDA_START };
+        let mut progress = Progress::Unfinished;
+        if self.len() == 0 {
+            progress = Progress::Converged;
+        }
         let span = self.snapshots.first().map_or(0.0, |s| (self.time_s - s.time_s).abs());
-        for _ in 0..if has_converged { 0 } else { steps } {
-            if engine.budget.is_exhausted() {
-                break;
-            }
+        while progress == Progress::Unfinished && *steps > 0 && !engine.budget.is_exhausted() {
+            *steps -= 1;
             let Some(factor) = total.factor(lambda) else {
                 lambda *= 4.0;
                 if lambda > LAMBDA_CEILING {
@@ -202,8 +228,13 @@ impl Window {
                 continue;
             };
             let mut step = factor.solve(&total.gradient);
-            if step.dot(&total.gradient) < NEGLIGIBLE_DECREASE && lambda <= LAMBDA_START {
-                has_converged = true;
+            let predicted = step.dot(&total.gradient);
+            if predicted < NEGLIGIBLE_DECREASE && lambda <= LAMBDA_START {
+                progress = Progress::Converged;
+                break;
+            }
+            if lambda <= LAMBDA_START && cost - ABORT_FACTOR * predicted > highest {
+                progress = Progress::Hopeless;
                 break;
             }
             shorten(&mut step, span);
@@ -218,7 +249,7 @@ impl Window {
             } else {
                 lambda *= 4.0;
                 if lambda > LAMBDA_CEILING {
-                    has_converged = true;
+                    progress = Progress::Converged;
                     break;
                 }
             }
@@ -227,8 +258,8 @@ impl Window {
             s.local = local;
         }
         self.total = total;
-        self.cost = cost;
-        has_converged
+        (self.cost, self.damping) = (cost, lambda);
+        progress
     }
 
     /// Covariance of the state given all that is known; `None` where it is singular.
@@ -318,6 +349,16 @@ impl Window {
             total.recentre(&self.state);
         }
         self.total = total;
+    }
+
+    /// Goes on with frames that came while this window was searched.
+    pub fn catch_up(&mut self, engine: &mut Engine, newer: &[Snapshot], memory_s: f64) {
+        for s in newer {
+            self.advance(s.time_s, memory_s);
+            self.snapshots.push(s.clone());
+            self.relinearise(engine, self.snapshots.len() - 1);
+            self.step();
+        }
     }
 
     /// Forgets targets, highest index first, and that any snapshot held them.
