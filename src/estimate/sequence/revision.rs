@@ -3,7 +3,7 @@
 
 use std::collections::VecDeque;
 
-use crate::estimate::sequence::search::{CONVERGE_STEPS, RELOCATED, TRIAL_STEPS, WindowSearch};
+use crate::estimate::sequence::search::{CONVERGE_STEPS, RELOCATED, TRIAL_STEPS, WindowSearch, is_ambiguous};
 use crate::estimate::sequence::target::Target;
 use crate::estimate::sequence::window::{Progress, Window};
 
@@ -53,21 +53,21 @@ pub(crate) struct Revision {
 
 impl Revision {
     /// Of a window, with an emitter more at one of `births`, and, where emitters are not told apart for certain, with one fewer, one
-    /// elsewhere, or all anew.
-    pub fn new(window: &Window, search: &WindowSearch, births: Vec<[f64; 2]>, is_ambiguous: bool) -> Self {
+    /// elsewhere, or all anew; `None` where there is nothing to try.
+    pub fn begin(window: &Window, search: &WindowSearch, births: Vec<[f64; 2]>) -> Option<Self> {
         let mut proposals = VecDeque::from([Proposal::Same]);
         proposals.extend(births.into_iter().map(Proposal::Birth));
-        if is_ambiguous {
+        if is_ambiguous(window) {
             proposals.push_back(Proposal::Restart);
             proposals.extend(search.weakest(window).into_iter().map(Proposal::Death));
         }
-        Self {
+        (proposals.len() > 1).then(|| Self {
             base: window.clone(),
             score: f64::INFINITY,
             is_fitted: false,
             proposals,
             trial: None,
-        }
+        })
     }
 
     /// The time as of which the window is searched.
@@ -88,7 +88,7 @@ impl Revision {
                 let Some(proposal) = self.proposals.pop_front() else {
                     return Revised::Finished;
                 };
-                self.trial = self.begin(search, proposal);
+                self.trial = self.start(search, proposal);
                 continue;
             };
             let highest = self.score - LEAST_GAIN - search.score(&trial.window) + trial.window.cost;
@@ -104,7 +104,7 @@ impl Revision {
         Revised::Unfinished
     }
 
-    fn begin(&self, search: &mut WindowSearch, proposal: Proposal) -> Option<Trial> {
+    fn start(&self, search: &mut WindowSearch, proposal: Proposal) -> Option<Trial> {
         let born_s = self.base.snapshots.first().map_or(self.base.time_s, |s| s.time_s);
         let mut window = self.base.clone();
         let mut steps = TRIAL_STEPS;

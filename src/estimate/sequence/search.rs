@@ -19,6 +19,8 @@ const TRIED: f64 = 0.6;
 const TRIED_ALONE: f64 = 0.9;
 /// Residual peaks tried in a round.
 const PEAKS: usize = 3;
+/// Pairs nearer than this many standard deviations of their difference are ambiguous: the window is searched again.
+const AMBIGUOUS: f64 = 4.0;
 /// Rounds of births and deaths.
 const ROUNDS: usize = 12;
 /// Targets that are moved to the residual's peaks, the weakest first.
@@ -271,4 +273,28 @@ pub(crate) fn unconfirmed(window: &Window, single: f64) -> Vec<usize> {
     let is_young = |e: &usize| window.targets[*e].born_s >= first.time_s && window.targets[*e].is_in(window.time_s);
     let targets = (0..window.len()).rev().filter(is_young);
     targets.filter(|&e| evidence[e] < penalty(single, counts[e])).collect()
+}
+
+/// Whether a pair of emitters is not told apart for certain.
+pub(crate) fn is_ambiguous(window: &Window) -> bool {
+    let Some(covariance) = window.covariance() else {
+        return true;
+    };
+    let present = window.present(window.time_s);
+    present.iter().any(|&e| {
+        present.iter().take_while(|f| **f < e).any(|&f| {
+            let d = [0, 1].map(|k| window.state[STATE * e + k] - window.state[STATE * f + k]);
+            let of = |a: usize, b: usize| covariance[(a, b)];
+            let mut along = 0.0;
+            for r in 0..2 {
+                for c in 0..2 {
+                    let (a, b) = (STATE * e, STATE * f);
+                    let s = of(a + r, a + c) + of(b + r, b + c) - of(a + r, b + c) - of(b + r, a + c);
+                    along += d[r] * s * d[c];
+                }
+            }
+            let square = d[0] * d[0] + d[1] * d[1];
+            square * square < AMBIGUOUS * AMBIGUOUS * along
+        })
+    })
 }

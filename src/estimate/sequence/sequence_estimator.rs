@@ -14,6 +14,7 @@ use crate::estimate::fit::work_budget::WorkBudget;
 use crate::estimate::model::hypothesis::Nuisances;
 use crate::estimate::rules::Rules;
 use crate::estimate::sequence::joint_information::{JointInformation, STATE};
+use crate::estimate::sequence::motion::open;
 use crate::estimate::sequence::report::report;
 use crate::estimate::sequence::residual_map::ResidualSum;
 use crate::estimate::sequence::revision::{Revised, Revision};
@@ -28,8 +29,6 @@ use crate::optics::Camera;
 const DARK: f64 = 14.0;
 /// Frames nearer in time than this count as one draw of the fading, s: the coherence time of a turbulent atmosphere.
 const COHERENCE_S: f64 = 0.01;
-/// Standard deviation of a change of velocity, m/s: a walker who turns round; a car changes its by as much within two seconds.
-const MANOEUVRE_M_S: f64 = 3.0;
 /// Frames of the window, and the numbers that all of them may hold: bounds memory, and the time of a fit of the whole window.
 const MAX_SNAPSHOTS: usize = 128;
 const MAX_NUMBERS: usize = 1 << 20;
@@ -148,21 +147,19 @@ impl SequenceEstimator {
         let mut budget = WorkBudget::new(is_over);
         let is_even = self.single.loaded().1.variance.is_constant();
         if is_even && self.window.len() > 0 {
-            let fresh = self.fresh(self.window.total.clone(), time_s);
-            if let Some(fresh) = self.fit_fresh(fresh, &mut budget) {
+            let known = self.window.total.clone();
+            if let Some(fresh) = self.explain(known, time_s, scale, &mut budget) {
                 self.accept(fresh);
                 return None;
             }
             // Somebody has turned or stopped: the same with a manoeuvre since the frame before.
+            let unit = 1.0 / self.ground_m();
             let mut opened = self.window.total.clone();
-            self.open(&mut opened, elapsed);
-            let fresh = self.fresh(opened, time_s);
-            if let Some(fresh) = self.fit_fresh(fresh, &mut budget) {
+            open(&mut opened, elapsed, unit);
+            if let Some(fresh) = self.explain(opened, time_s, scale, &mut budget) {
                 let all = self.window.snapshots.len();
                 self.window.fold(all);
-                let mut prior = std::mem::take(&mut self.window.prior);
-                self.open(&mut prior, elapsed);
-                self.window.prior = prior;
+                open(&mut self.window.prior, elapsed, unit);
                 self.accept(fresh);
                 return None;
             }
@@ -182,7 +179,7 @@ impl SequenceEstimator {
             alone.insert(Target::born(time_s), at, [0.0; 2]);
         }
         let fitted = if is_even {
-            self.fit_fresh(alone, &mut budget)
+            self.fit_fresh(alone, true, &mut budget)
         } else {
             None
         };
@@ -195,6 +192,28 @@ impl SequenceEstimator {
         None
     }
 
+    /// The newest frame on top of `known`; `None` where that does not explain it. Newcomers need the frame's own word: where it shows alone no
+    /// fewer emitters than are known, but fewer than with them, there are none.
+    fn explain(&mut self, known: JointInformation, time_s: f64, scale: f64, budget: &mut WorkBudget) -> Option<Window> {
+        let plain = self.fresh(known, time_s);
+        let before = plain.present(time_s).len();
+        let grown = self.fit_fresh(plain.clone(), true, budget)?;
+        let after = grown.present(time_s).len();
+        if after == before {
+            return Some(grown);
+        }
+        let alone = self
+            .single
+            .estimate_loaded(scale, &|| budget.is_exhausted())
+            .emitters
+            .len();
+        if (before..after).contains(&alone) {
+            self.fit_fresh(plain, false, budget)
+        } else {
+            Some(grown)
+        }
+    }
+
     /// Searches the frames of the window together with the loaded one, as what is remembered may be wrong. Whether that explains it.
     fn search_again(&mut self, time_s: f64, is_over: &dyn Fn() -> bool) -> bool {
         let Some(first) = self.window.snapshots.first() else {
@@ -204,47 +223,16 @@ impl SequenceEstimator {
         let mut next = self.window.clone();
         next.snapshots
             .append(&mut self.fresh(JointInformation::default(), time_s).snapshots);
-        let rules = self.rules;
         let mut budget = WorkBudget::of_frames(SEARCH_WORK, is_over);
-        let (space, _, _) = self.single.loaded();
-        let mut engine = Engine {
-            bases: &space.bases,
-            rules,
-            budget: &mut budget,
-            workspace: &mut space.workspace,
-        };
-        next.fit(&mut engine, WINDOW_STEPS);
-        let mut search = WindowSearch {
-            engine: &mut engine,
-            matched_filter: &mut space.matched_filter,
-            penalty: space.source_penalty,
-            left: Vec::new(),
-        };
-        search.refine(&mut next, born_s);
+        self.with_search(&mut budget, |_, search| {
+            next.fit(search.engine, WINDOW_STEPS);
+            search.refine(&mut next, born_s);
+        });
         let is_explained = next.is_last_explained();
         if is_explained {
             self.window = next;
         }
         is_explained
-    }
-
-    /// Adds to `knowledge` that every emitter may have changed its velocity since the frame before.
-    fn open(&self, knowledge: &mut JointInformation, elapsed: f64) {
-        let speed = (MANOEUVRE_M_S / self.ground_m()).powi(2);
-        for e in 0..knowledge.len() {
-            let at: Vec<usize> = (0..STATE).map(|k| STATE * e + k).collect();
-            let noise = DMatrix::from_fn(STATE, STATE, |r, c| {
-                let place = |k: usize| if k < 2 { 0.5 * elapsed } else { 1.0 };
-                let shared = if r % 2 == c % 2 {
-                    speed * place(r) * place(c)
-                } else {
-                    0.0
-                };
-                // Half of the position's is its own: when the manoeuvre was is not known.
-                if r == c { 1.2 * shared + 1e-12 } else { shared }
-            });
-            knowledge.add_noise(&at, &noise);
-        }
     }
 
     /// A window of the loaded frame alone, on top of `prior`.
@@ -281,30 +269,18 @@ impl SequenceEstimator {
         window.snapshots.append(&mut fresh.snapshots);
     }
 
-    /// Fits the newest frame to what is remembered, with births; `None` where that does not explain it.
-    fn fit_fresh(&mut self, mut fresh: Window, budget: &mut WorkBudget) -> Option<Window> {
-        let rules = self.rules;
+    /// Fits the newest frame to what is remembered, with newcomers where they are `allowed`; `None` where that does not explain it.
+    fn fit_fresh(&mut self, mut fresh: Window, allowed: bool, budget: &mut WorkBudget) -> Option<Window> {
         let time_s = fresh.time_s;
-        let (space, _, _) = self.single.loaded();
-        let mut engine = Engine {
-            bases: &space.bases,
-            rules,
-            budget,
-            workspace: &mut space.workspace,
-        };
-        fresh.fit(&mut engine, FRAME_STEPS);
-        let mut search = WindowSearch {
-            engine: &mut engine,
-            matched_filter: &mut space.matched_filter,
-            penalty: space.source_penalty,
-            left: Vec::new(),
-        };
-        let has_grown = search.grow(&mut fresh, time_s);
-        let left = search.left;
+        let (has_grown, left) = self.with_search(budget, |_, search| {
+            fresh.fit(search.engine, FRAME_STEPS);
+            let has_grown = allowed && search.grow(&mut fresh, time_s);
+            (has_grown, std::mem::take(&mut search.left))
+        });
         let is_explained = fresh.is_last_explained();
         if has_grown {
             self.left.clear();
-        } else if is_explained {
+        } else if is_explained && allowed {
             self.left.add(&left, MAX_SNAPSHOTS as f64);
         }
         is_explained.then_some(fresh)
@@ -325,63 +301,85 @@ impl SequenceEstimator {
             }
         }
         if has_died {
-            let mut budget = WorkBudget::of_frames(SEARCH_WORK, is_over);
-            let (space, _, _) = self.single.loaded();
-            let mut engine = Engine {
-                bases: &space.bases,
-                rules: self.rules,
-                budget: &mut budget,
-                workspace: &mut space.workspace,
-            };
-            self.window.fit(&mut engine, WINDOW_STEPS);
+            let mut budget = WorkBudget::new(is_over);
+            self.with_search(&mut budget, |window, search| window.relinearise_last(search.engine));
         }
     }
 
     /// Forgets newcomers that the frames since have not confirmed.
     fn drop_unconfirmed(&mut self, is_over: &dyn Fn() -> bool) {
         let mut budget = WorkBudget::new(is_over);
-        let (space, _, _) = self.single.loaded();
-        let targets = unconfirmed(&self.window, space.source_penalty);
-        let mut engine = Engine {
-            bases: &space.bases,
-            rules: self.rules,
-            budget: &mut budget,
-            workspace: &mut space.workspace,
-        };
-        self.window.discard(&mut engine, &targets);
+        self.with_search(&mut budget, |window, search| {
+            let targets = unconfirmed(window, search.penalty);
+            window.discard(search.engine, &targets);
+        });
     }
 
-    /// Keeps the window within its bounds, linearised and searched.
+    /// Keeps the window within its bounds, and linearised.
     fn tend(&mut self, is_over: &dyn Fn() -> bool) {
-        let rules = self.rules;
-        let mut budget = WorkBudget::of_frames(SEARCH_WORK, is_over);
-        let (space, compressed, _) = self.single.loaded();
+        let (_, compressed, _) = self.single.loaded();
         let numbers = (compressed.mx * compressed.my).max(1);
         let most = MAX_SNAPSHOTS.min(MAX_NUMBERS / numbers).max(2);
-        let mut engine = Engine {
-            bases: &space.bases,
-            rules,
-            budget: &mut budget,
-            workspace: &mut space.workspace,
-        };
-        let window = &mut self.window;
-        if window.snapshots.len() > most {
-            window.fold(window.snapshots.len() - most);
-        }
-        window.forget_dead();
-        if window.refresh(&mut engine, REFRESHED) && window.snapshots.len() <= REFRESHED {
-            window.fit(&mut engine, WINDOW_STEPS);
-        }
+        let mut budget = WorkBudget::of_frames(SEARCH_WORK, is_over);
+        self.with_search(&mut budget, |window, search| {
+            if window.snapshots.len() > most {
+                window.fold(window.snapshots.len() - most);
+            }
+            window.forget_dead();
+            if window.refresh(search.engine, REFRESHED) && window.snapshots.len() <= REFRESHED {
+                window.fit(search.engine, WINDOW_STEPS);
+            }
+        });
     }
 
     /// Searches the window for another number of emitters: begins when it has grown, and goes on with each frame for a share of its time.
     fn revise(&mut self, is_over: &dyn Fn() -> bool) {
+        let length = self.window.snapshots.len();
+        self.since_search += 1;
+        let is_due = self.since_search >= SEARCH_AFTER || length as f64 >= SEARCH_GROWTH * self.searched as f64;
+        let revision = self.revision.take().filter(|r| r.is_of(&self.window));
+        let begins = revision.is_none();
+        if begins && (length < 2 || !is_due) {
+            return;
+        }
+        if begins {
+            (self.since_search, self.searched) = (0, length);
+        }
+        let left = std::mem::take(&mut self.left);
+        let memory_s = self.memory_s;
         let mut budget = WorkBudget::of_frames(REVISION_WORK, is_over);
+        let (revision, has_changed) = self.with_search(&mut budget, |window, search| {
+            let revision = revision.or_else(|| Revision::begin(window, search, search.births(window, &left)));
+            let Some(mut revision) = revision else {
+                return (None, false);
+            };
+            match revision.advance(search) {
+                Revised::Finished => (None, false),
+                Revised::Unfinished => (Some(revision), false),
+                Revised::Better(mut better) => {
+                    let newer = window.snapshots.iter().filter(|s| s.time_s > revision.time_s());
+                    let newer: Vec<Snapshot> = newer.cloned().collect();
+                    better.catch_up(search.engine, &newer, memory_s);
+                    *window = better;
+                    (None, true)
+                }
+            }
+        });
+        self.revision = revision;
+        if has_changed {
+            self.searched = 0;
+        } else {
+            self.left = left;
+        }
+    }
+
+    /// Runs `run` on the window, with what a search of the loaded frame's space needs.
+    fn with_search<R>(&mut self, budget: &mut WorkBudget, run: impl FnOnce(&mut Window, &mut WindowSearch) -> R) -> R {
         let (space, _, _) = self.single.loaded();
         let mut engine = Engine {
             bases: &space.bases,
             rules: self.rules,
-            budget: &mut budget,
+            budget,
             workspace: &mut space.workspace,
         };
         let mut search = WindowSearch {
@@ -390,34 +388,6 @@ impl SequenceEstimator {
             penalty: space.source_penalty,
             left: Vec::new(),
         };
-        let window = &mut self.window;
-        let length = window.snapshots.len();
-        self.since_search += 1;
-        let mut revision = self.revision.take().filter(|r| r.is_of(window));
-        if revision.is_none() {
-            let is_due = self.since_search >= SEARCH_AFTER || length as f64 >= SEARCH_GROWTH * self.searched as f64;
-            if length < 2 || !is_due {
-                return;
-            }
-            (self.since_search, self.searched) = (0, length);
-            let births = search.births(window, &self.left);
-            let is_ambiguous = window.is_ambiguous();
-            if is_ambiguous || !births.is_empty() {
-                revision = Some(Revision::new(window, &search, births, is_ambiguous));
-            }
-        }
-        let Some(mut revision) = revision else { return };
-        match revision.advance(&mut search) {
-            Revised::Finished => {}
-            Revised::Unfinished => self.revision = Some(revision),
-            Revised::Better(mut better) => {
-                let newer = window.snapshots.iter().filter(|s| s.time_s > revision.time_s());
-                let newer: Vec<Snapshot> = newer.cloned().collect();
-                better.catch_up(search.engine, &newer, self.memory_s);
-                *window = better;
-                self.left.clear();
-                self.searched = 0;
-            }
-        }
+        run(&mut self.window, &mut search)
     }
 }

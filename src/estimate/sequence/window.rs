@@ -26,8 +26,6 @@ const UNEXPLAINED: f64 = 5.0;
 /// standard deviation in pairs of much light.
 const MOVED: f64 = 0.02;
 const MOVED_OVERLAPPING: f64 = 0.002;
-/// Pairs nearer than this many standard deviations of their difference are ambiguous: the window is searched again.
-const AMBIGUOUS: f64 = 4.0;
 
 /// Times the predicted decrease that must suffice to reach the cost asked for; see `fit::levenberg_marquardt`.
 const ABORT_FACTOR: f64 = 5.0;
@@ -334,6 +332,14 @@ impl Window {
         s.local = LocalQuadratic::new(engine, &s.compressed, s.nuisances, positions);
     }
 
+    /// Linearises the newest snapshot anew, as when one of its targets has turned out to be dark.
+    pub fn relinearise_last(&mut self, engine: &mut Engine) {
+        if let Some(last) = self.snapshots.len().checked_sub(1) {
+            self.relinearise(engine, last);
+            self.step();
+        }
+    }
+
     /// Adds up the prior and the snapshots as they are linearised, and takes a Gauss–Newton step.
     fn step(&mut self) {
         let mut total = self.prior.clone();
@@ -375,30 +381,6 @@ impl Window {
         if !targets.is_empty() {
             self.step();
         }
-    }
-
-    /// Whether a pair of emitters is not told apart for certain.
-    pub fn is_ambiguous(&self) -> bool {
-        let Some(covariance) = self.covariance() else {
-            return true;
-        };
-        let present = self.present(self.time_s);
-        present.iter().any(|&e| {
-            present.iter().take_while(|f| **f < e).any(|&f| {
-                let d = [0, 1].map(|k| self.state[STATE * e + k] - self.state[STATE * f + k]);
-                let of = |a: usize, b: usize| covariance[(a, b)];
-                let mut along = 0.0;
-                for r in 0..2 {
-                    for c in 0..2 {
-                        let (a, b) = (STATE * e, STATE * f);
-                        let s = of(a + r, a + c) + of(b + r, b + c) - of(a + r, b + c) - of(b + r, a + c);
-                        along += d[r] * s * d[c];
-                    }
-                }
-                let square = d[0] * d[0] + d[1] * d[1];
-                square * square < AMBIGUOUS * AMBIGUOUS * along
-            })
-        })
     }
 }
 
