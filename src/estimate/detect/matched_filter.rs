@@ -175,6 +175,14 @@ impl MatchedFilter {
         }
     }
 
+    /// Response along one axis, 0 for x, to a profile along it, at each of the axis' grid points: a spot's response is the product of two.
+    pub fn respond_along(&self, axis: usize, profile: &[f64]) -> Vec<f64> {
+        self.templates[axis]
+            .chunks_exact(self.strides[axis])
+            .map(|template| dot(&template[..profile.len()], profile))
+            .collect()
+    }
+
     /// Response over its standard deviation at every grid point.
     pub fn map(&self) -> &[f64] {
         &self.map

@@ -7,10 +7,14 @@
 
 mod joint_information;
 mod motion;
+mod report;
+mod residual_map;
+mod revision;
 mod search;
 mod sequence_estimator;
 mod snapshot;
 mod subspace;
+mod target;
 mod window;
 
 pub(crate) use sequence_estimator::SequenceEstimator;

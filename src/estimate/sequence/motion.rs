@@ -9,6 +9,8 @@ use crate::optics::Camera;
 
 /// Standard deviations of a speed along an axis, m/s, that emitters of a scene may have: all stand still, walk, cycle, drive.
 const SPEEDS_M_S: [f64; 4] = [0.01, 0.7, 2.5, SPEED_STD_M_S];
+/// Standard deviation of a change of velocity, m/s: a walker who turns round; a car changes its by as much within two seconds.
+const MANOEUVRE_M_S: f64 = 3.0;
 /// A hypothesis of less weight is left out.
 const LEAST_WEIGHT: f64 = 1e-3;
 
@@ -84,5 +86,24 @@ pub(crate) fn velocity_on_ground(camera: &Camera, sensor_m: [f64; 2], velocity: 
     Velocity {
         vx_m_s: (ahead[0] - behind[0]) / DT,
         vy_m_s: (ahead[1] - behind[1]) / DT,
+    }
+}
+
+/// Adds to `knowledge` that every emitter may have changed its velocity in the `elapsed` seconds since the frame before. `unit` is 1 m/s in σ/s.
+pub(crate) fn open(knowledge: &mut JointInformation, elapsed: f64, unit: f64) {
+    let speed = (MANOEUVRE_M_S * unit).powi(2);
+    for e in 0..knowledge.len() {
+        let at: Vec<usize> = (0..STATE).map(|k| STATE * e + k).collect();
+        let noise = DMatrix::from_fn(STATE, STATE, |r, c| {
+            let place = |k: usize| if k < 2 { 0.5 * elapsed } else { 1.0 };
+            let shared = if r % 2 == c % 2 {
+                speed * place(r) * place(c)
+            } else {
+                0.0
+            };
+            // Half of the position's is its own: when the manoeuvre was is not known.
+            if r == c { 1.2 * shared + 1e-12 } else { shared }
+        });
+        knowledge.add_noise(&at, &noise);
     }
 }

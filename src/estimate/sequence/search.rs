@@ -1,27 +1,30 @@
 //! The number of emitters of a window: births where the residuals of all frames together peak, deaths and merges where the light of a
 //! target is no more than noise, and a start from the subspace where frames suffice.
 
-use nalgebra::DMatrix;
-
 use crate::estimate::detect::matched_filter::MatchedFilter;
 use crate::estimate::model::hypothesis::{Nuisances, OVERLAPPING};
-use crate::estimate::sequence::snapshot::{Engine, LocalQuadratic, Snapshot, residual};
+use crate::estimate::sequence::joint_information::STATE;
+use crate::estimate::sequence::residual_map::{ResidualSum, peaks, residual_map};
+use crate::estimate::sequence::snapshot::{Engine, LocalQuadratic, Snapshot};
 use crate::estimate::sequence::subspace::Subspace;
-use crate::estimate::sequence::window::{Target, Window};
+use crate::estimate::sequence::target::Target;
+use crate::estimate::sequence::window::Window;
 
 /// Steps of a fit before a hypothesis is compared, and before it is kept.
-const TRIAL_STEPS: usize = 40;
-const CONVERGE_STEPS: usize = 100;
+pub(crate) const TRIAL_STEPS: usize = 40;
+pub(crate) const CONVERGE_STEPS: usize = 100;
 /// A residual peak is tried from this share of the penalty beyond the noise on: what other emitters have absorbed comes back in the joint fit.
 const TRIED: f64 = 0.6;
+/// The same where no other emitter is near: what the grid of the matched filter loses.
+const TRIED_ALONE: f64 = 0.9;
 /// Residual peaks tried in a round.
 const PEAKS: usize = 3;
+/// Pairs nearer than this many standard deviations of their difference are ambiguous: the window is searched again.
+const AMBIGUOUS: f64 = 4.0;
 /// Rounds of births and deaths.
 const ROUNDS: usize = 12;
 /// Targets that are moved to the residual's peaks, the weakest first.
-const RELOCATED: usize = 3;
-/// Least share of a spot that lies outside the emitters' span for a birth there: nearer, it is the same emitter.
-const LEAST_OUTSIDE: f64 = 1e-6;
+pub(crate) const RELOCATED: usize = 3;
 
 /// Least decrease of the deviance that a source must bring when its energy is free in each of `frames` frames: the bound of χ² with that
 /// many degrees of freedom (Laurent and Massart, 2000, eq. 4.3) that one frame exceeds as rarely as `single`, the penalty in a lone frame.
@@ -42,6 +45,8 @@ pub(crate) struct WindowSearch<'s, 'a, 'b> {
     pub matched_filter: &'s mut MatchedFilter,
     /// The penalty of a source in a lone frame.
     pub penalty: f64,
+    /// What the emitters found last leave; see `residual_map`.
+    pub left: Vec<f64>,
 }
 
 impl WindowSearch<'_, '_, '_> {
@@ -49,65 +54,26 @@ impl WindowSearch<'_, '_, '_> {
         score(window, self.penalty)
     }
 
-    /// Maxima of the light that the residuals of all frames leave for one more emitter, Σ (fᵀr)²/‖P⊥f‖², the highest first.
-    pub fn residual_peaks(&mut self, window: &Window) -> Vec<(f64, [f64; 2])> {
-        let Some(last) = window.snapshots.last() else {
-            return Vec::new();
+    /// Maxima of at least `least` of the residual map, the highest first.
+    pub fn residual_peaks(&mut self, window: &Window, least: f64) -> Vec<(f64, [f64; 2])> {
+        self.left = residual_map(self.engine, self.matched_filter, window);
+        peaks(self.matched_filter, &self.left, least)
+    }
+
+    /// Where the frames together show light that none shows alone.
+    pub fn births(&self, window: &Window, left: &ResidualSum) -> Vec<[f64; 2]> {
+        let beyond = |share: f64| left.frames + share * (penalty(self.penalty, left.frames) - left.frames);
+        let positions = window.positions(&window.state, window.time_s);
+        let is_near = |at: [f64; 2]| {
+            let mut others = positions.as_slice().chunks_exact(2);
+            others.any(|u| (u[0] - at[0]).hypot(u[1] - at[1]) < OVERLAPPING)
         };
-        let filter = &mut *self.matched_filter;
-        let mut sum: Vec<f64> = Vec::new();
-        for s in &window.snapshots {
-            let positions = window.positions(&window.state, s.time_s);
-            let (left, _) = residual(self.engine, &s.compressed, s.nuisances, &positions);
-            filter.respond(left, s.compressed.mx, s.compressed.my);
-            sum.resize(filter.map().len(), 0.0);
-            for (total, v) in sum.iter_mut().zip(filter.map()) {
-                *total += v * v;
-            }
-        }
-        // The share of a spot that lies outside the emitters' span: one minus cᵀG⁻¹c, from the emitters' own responses.
-        let positions = window.positions(&window.state, last.time_s);
-        let n = positions.len() / 2;
-        let (mx, my) = (last.compressed.mx, last.compressed.my);
-        let mut responses = DMatrix::zeros(n, sum.len());
-        let mut spots = Vec::new();
-        for i in 0..n {
-            let spot = unit_spot(self.engine, last, [positions[2 * i], positions[2 * i + 1]]);
-            filter.respond(&spot, mx, my);
-            for (k, v) in filter.map().iter().enumerate() {
-                responses[(i, k)] = *v;
-            }
-            spots.push(spot);
-        }
-        let inner = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(x, y)| x * y).sum::<f64>();
-        let mut gram = DMatrix::from_fn(n, n, |i, j| inner(&spots[i], &spots[j]));
-        for i in 0..n {
-            gram[(i, i)] *= 1.0 + 1e-12;
-        }
-        if n > 0 {
-            let Some(factor) = gram.cholesky() else {
-                return Vec::new();
-            };
-            for (k, total) in sum.iter_mut().enumerate() {
-                let c = responses.column(k).into_owned();
-                let outside = 1.0 - c.dot(&factor.solve(&c));
-                *total = if outside > LEAST_OUTSIDE { *total / outside } else { 0.0 };
-            }
-        }
-        let width = filter.width();
-        let height = sum.len() / width;
-        let mut found = Vec::new();
-        for (k, &value) in sum.iter().enumerate() {
-            let (i, j) = (k % width, k / width);
-            let mut around = (j.saturating_sub(1)..(j + 2).min(height))
-                .flat_map(|b| (i.saturating_sub(1)..(i + 2).min(width)).map(move |a| b * width + a))
-                .filter(|o| *o != k);
-            if around.all(|o| sum[o] < value) {
-                found.push((value, filter.position(k)));
-            }
-        }
-        found.sort_by(|a, b| b.0.total_cmp(&a.0));
-        found
+        peaks(self.matched_filter, &left.sum, beyond(TRIED))
+            .into_iter()
+            .filter(|(value, at)| is_near(*at) || *value > beyond(TRIED_ALONE))
+            .map(|(_, at)| at)
+            .take(PEAKS)
+            .collect()
     }
 
     /// Adds targets at residual peaks while the score improves. Returns whether any was added.
@@ -119,13 +85,10 @@ impl WindowSearch<'_, '_, '_> {
             }
             let frames = window.snapshots.iter().filter(|s| s.time_s >= born_s).count() as f64;
             let least = frames + TRIED * (penalty(self.penalty, frames) - frames);
-            let peaks = self.residual_peaks(window);
+            let peaks = self.residual_peaks(window, least);
             let before = self.score(window);
             let mut best: Option<Window> = None;
-            for (value, at) in peaks.into_iter().take(PEAKS) {
-                if value < least {
-                    break;
-                }
+            for (_, at) in peaks.into_iter().take(PEAKS) {
                 let mut next = window.clone();
                 next.insert(Target::born(born_s), at, [0.0; 2]);
                 next.fit(self.engine, TRIAL_STEPS);
@@ -182,13 +145,21 @@ impl WindowSearch<'_, '_, '_> {
         doubtful
     }
 
+    /// Targets whose removal is tried: doubtful ones, and those of least light.
+    pub fn weakest(&self, window: &Window) -> Vec<usize> {
+        let mut weakest = self.doubtful(window);
+        for e in by_light(window).into_iter().take(RELOCATED) {
+            if !weakest.contains(&e) {
+                weakest.push(e);
+            }
+        }
+        weakest
+    }
+
     /// Moves weak targets to where the residual peaks without them.
     fn relocate(&mut self, window: &mut Window) -> bool {
-        let evidence = light(window);
-        let mut order: Vec<usize> = (0..window.len()).collect();
-        order.sort_by(|&a, &b| evidence[a].total_cmp(&evidence[b]));
         let before = self.score(window);
-        for e in order.into_iter().take(RELOCATED) {
+        for e in by_light(window).into_iter().take(RELOCATED) {
             if self.engine.budget.is_exhausted() {
                 break;
             }
@@ -196,7 +167,7 @@ impl WindowSearch<'_, '_, '_> {
             let mut without = window.clone();
             without.remove(e);
             without.fit(self.engine, TRIAL_STEPS);
-            for (_, at) in self.residual_peaks(&without).into_iter().take(2) {
+            for (_, at) in self.residual_peaks(&without, 0.0).into_iter().take(2) {
                 let mut next = without.clone();
                 next.insert(target, at, [0.0; 2]);
                 next.fit(self.engine, TRIAL_STEPS);
@@ -220,12 +191,10 @@ impl WindowSearch<'_, '_, '_> {
         }
     }
 
-    /// A window from the subspace of the frames alone, if it explains them better than `window` does.
-    pub fn restart(&mut self, window: &mut Window) -> bool {
+    /// The window with emitters from the subspace of its frames alone, not fitted; `None` where they have too many coefficients for that.
+    pub fn restarted(&mut self, window: &Window) -> Option<Window> {
         let frames: Vec<_> = window.snapshots.iter().map(|s| &*s.compressed).collect();
-        let Some(subspace) = Subspace::new(&frames) else {
-            return false;
-        };
+        let subspace = Subspace::new(&frames)?;
         let first = window.snapshots.first().map_or(0.0, |s| s.time_s);
         let middle = 0.5 * (first + window.time_s);
         let still = Window {
@@ -263,24 +232,15 @@ impl WindowSearch<'_, '_, '_> {
                 best = Some(next);
             }
         }
-        let Some(best) = best else { return false };
+        let best = best?;
         let mut next = window.clone();
         while next.len() > 0 {
             next.remove(next.len() - 1);
         }
-        for e in 0..best.len() {
-            next.insert(
-                Target::born(first),
-                [best.state[4 * e], best.state[4 * e + 1]],
-                [0.0; 2],
-            );
+        for at in best.state.as_slice().chunks_exact(STATE) {
+            next.insert(Target::born(first), [at[0], at[1]], [0.0; 2]);
         }
-        next.fit(self.engine, CONVERGE_STEPS);
-        let is_better = self.score(&next) < self.score(window) - 1.0;
-        if is_better {
-            *window = next;
-        }
-        is_better
+        Some(next)
     }
 }
 
@@ -295,20 +255,46 @@ pub(crate) fn light(window: &Window) -> Vec<f64> {
     evidence
 }
 
-/// A spot of unit norm at `u`, in the coefficients of a snapshot.
-fn unit_spot(engine: &mut Engine, snapshot: &Snapshot, u: [f64; 2]) -> Vec<f64> {
-    let axes = engine.bases.axes();
-    let sizes = [snapshot.compressed.mx, snapshot.compressed.my];
-    let profiles: [Vec<f64>; 2] = [0, 1].map(|k| {
-        let (m, mut scratch) = (sizes[k], vec![0.0; 3 * axes[k].n]);
-        let mut out = vec![0.0; 3 * m];
-        axes[k].profile(u[k], 1.0, snapshot.compressed.reach, m, &mut scratch, &mut out);
-        out.truncate(m);
-        let norm = out.iter().map(|v| v * v).sum::<f64>().sqrt().max(1e-12);
-        out.iter().map(|v| v / norm).collect()
-    });
-    profiles[1]
-        .iter()
-        .flat_map(|y| profiles[0].iter().map(move |x| x * y))
-        .collect()
+/// Targets, those of least light first.
+fn by_light(window: &Window) -> Vec<usize> {
+    let evidence = light(window);
+    let mut order: Vec<usize> = (0..window.len()).collect();
+    order.sort_by(|&a, &b| evidence[a].total_cmp(&evidence[b]));
+    order
+}
+
+/// Targets, the last first, whose light over all frames that held them is less than their penalty: noise that was born as an emitter. Those with
+/// frames that have left the window are not among them.
+pub(crate) fn unconfirmed(window: &Window, single: f64) -> Vec<usize> {
+    let Some(first) = window.snapshots.first() else {
+        return Vec::new();
+    };
+    let (evidence, counts) = (light(window), window.counts());
+    let is_young = |e: &usize| window.targets[*e].born_s >= first.time_s && window.targets[*e].is_in(window.time_s);
+    let targets = (0..window.len()).rev().filter(is_young);
+    targets.filter(|&e| evidence[e] < penalty(single, counts[e])).collect()
+}
+
+/// Whether a pair of emitters is not told apart for certain.
+pub(crate) fn is_ambiguous(window: &Window) -> bool {
+    let Some(covariance) = window.covariance() else {
+        return true;
+    };
+    let present = window.present(window.time_s);
+    present.iter().any(|&e| {
+        present.iter().take_while(|f| **f < e).any(|&f| {
+            let d = [0, 1].map(|k| window.state[STATE * e + k] - window.state[STATE * f + k]);
+            let of = |a: usize, b: usize| covariance[(a, b)];
+            let mut along = 0.0;
+            for r in 0..2 {
+                for c in 0..2 {
+                    let (a, b) = (STATE * e, STATE * f);
+                    let s = of(a + r, a + c) + of(b + r, b + c) - of(a + r, b + c) - of(b + r, a + c);
+                    along += d[r] * s * d[c];
+                }
+            }
+            let square = d[0] * d[0] + d[1] * d[1];
+            square * square < AMBIGUOUS * AMBIGUOUS * along
+        })
+    })
 }

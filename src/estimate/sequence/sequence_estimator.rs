@@ -5,21 +5,23 @@ use std::sync::Arc;
 use jiff::Timestamp;
 use nalgebra::{DMatrix, DVector};
 
-use crate::estimate::emitter::{Estimate, Flags};
+use crate::estimate::emitter::Estimate;
 use crate::estimate::error::Error;
 use crate::estimate::estimator::Estimator;
 use crate::estimate::estimators::analytic::AnalyticEstimator;
 use crate::estimate::estimators::list::EstimatorSpec;
-use crate::estimate::fit::context::FitContext;
 use crate::estimate::fit::work_budget::WorkBudget;
 use crate::estimate::model::hypothesis::Nuisances;
 use crate::estimate::rules::Rules;
 use crate::estimate::sequence::joint_information::{JointInformation, STATE};
-use crate::estimate::sequence::motion::{Posterior, posterior, velocity_on_ground};
-use crate::estimate::sequence::search::WindowSearch;
-use crate::estimate::sequence::snapshot::{Engine, LocalQuadratic, Snapshot, hypothesis};
-use crate::estimate::sequence::window::{SPEED_STD_M_S, Target, Window};
-use crate::estimate::uncertainty::localise::localise;
+use crate::estimate::sequence::motion::open;
+use crate::estimate::sequence::report::report;
+use crate::estimate::sequence::residual_map::ResidualSum;
+use crate::estimate::sequence::revision::{Revised, Revision};
+use crate::estimate::sequence::search::{WindowSearch, unconfirmed};
+use crate::estimate::sequence::snapshot::{Engine, LocalQuadratic, Snapshot};
+use crate::estimate::sequence::target::Target;
+use crate::estimate::sequence::window::{SPEED_STD_M_S, Window};
 use crate::frame::Frame;
 use crate::optics::{Camera, Smear};
 
@@ -27,19 +29,21 @@ use crate::optics::{Camera, Smear};
 const DARK: f64 = 14.0;
 /// Frames nearer in time than this count as one draw of the fading, s: the coherence time of a turbulent atmosphere.
 const COHERENCE_S: f64 = 0.01;
-/// Standard deviation of a change of velocity, m/s: a walker who turns round; a car changes its by as much within two seconds.
-const MANOEUVRE_M_S: f64 = 3.0;
 /// Frames of the window, and the numbers that all of them may hold: bounds memory, and the time of a fit of the whole window.
 const MAX_SNAPSHOTS: usize = 128;
 const MAX_NUMBERS: usize = 1 << 20;
 /// Steps of a fit to a new frame, and of the whole window.
 const FRAME_STEPS: usize = 12;
 const WINDOW_STEPS: usize = 30;
-/// The window is searched when it has grown by this factor since, and at the latest after this many frames.
+/// Snapshots that are linearised anew with a frame: more follow a change sooner, each costs as much as a step of the frame's own fit.
+const REFRESHED: usize = 8;
+/// A search of the window begins when it has grown by this factor since the last, and at the latest after this many frames.
 const SEARCH_GROWTH: f64 = 1.4;
 const SEARCH_AFTER: usize = 32;
-/// Work of a search of the window, in frames' searches: it comes with one frame in `SEARCH_AFTER`.
-const SEARCH_WORK: f64 = 4.0;
+/// Work of a search that has to end with its frame, in frames' searches: where what is remembered explains nothing.
+const SEARCH_WORK: f64 = 0.5;
+/// Work of a search that goes on from frame to frame, a frame: less finds emitters later, more makes frames slower.
+const REVISION_WORK: f64 = 0.04;
 
 /// An estimator that remembers.
 pub(crate) struct SequenceEstimator {
@@ -50,7 +54,10 @@ pub(crate) struct SequenceEstimator {
     /// Times are seconds since this.
     epoch: Option<Timestamp>,
     window: Window,
-    /// Frames since the last search, and the window's length then.
+    /// What frames have left unexplained since the number of emitters changed.
+    left: ResidualSum,
+    /// The search in progress; frames since it began, and the window's length then.
+    revision: Option<Revision>,
     since_search: usize,
     searched: usize,
     /// Gap after which nothing is remembered, s.
@@ -72,6 +79,8 @@ impl SequenceEstimator {
             rules,
             epoch: None,
             window: Window::default(),
+            left: ResidualSum::default(),
+            revision: None,
             since_search: 0,
             searched: 0,
             memory_s,
@@ -89,6 +98,8 @@ impl SequenceEstimator {
             unknown: [extent * extent / 12.0, (SPEED_STD_M_S / self.ground_m()).powi(2)],
             ..Window::default()
         };
+        self.left.clear();
+        self.revision = None;
         self.since_search = 0;
         self.searched = 0;
     }
@@ -116,8 +127,19 @@ impl Estimator for SequenceEstimator {
             return Ok(alone);
         }
         self.bury(elapsed, is_over);
+        self.drop_unconfirmed(is_over);
         self.tend(is_over);
-        Ok(self.report(scale, is_over))
+        self.revise(is_over);
+        let name = self.spec.name;
+        Ok(report(
+            &mut self.single,
+            &self.window,
+            &self.camera,
+            self.rules,
+            name,
+            scale,
+            is_over,
+        ))
     }
 }
 
@@ -128,21 +150,19 @@ impl SequenceEstimator {
         let mut budget = WorkBudget::new(is_over);
         let is_even = self.single.loaded().1.variance.is_constant();
         if is_even && self.window.len() > 0 {
-            let fresh = self.fresh(self.window.total.clone(), time_s);
-            if let Some(fresh) = self.fit_fresh(fresh, &mut budget) {
+            let known = self.window.total.clone();
+            if let Some(fresh) = self.explain(known, time_s, scale, &mut budget) {
                 self.accept(fresh);
                 return None;
             }
             // Somebody has turned or stopped: the same with a manoeuvre since the frame before.
+            let unit = 1.0 / self.ground_m();
             let mut opened = self.window.total.clone();
-            self.open(&mut opened, elapsed);
-            let fresh = self.fresh(opened, time_s);
-            if let Some(fresh) = self.fit_fresh(fresh, &mut budget) {
+            open(&mut opened, elapsed, unit);
+            if let Some(fresh) = self.explain(opened, time_s, scale, &mut budget) {
                 let all = self.window.snapshots.len();
                 self.window.fold(all);
-                let mut prior = std::mem::take(&mut self.window.prior);
-                self.open(&mut prior, elapsed);
-                self.window.prior = prior;
+                open(&mut self.window.prior, elapsed, unit);
                 self.accept(fresh);
                 return None;
             }
@@ -162,7 +182,7 @@ impl SequenceEstimator {
             alone.insert(Target::born(time_s), at, [0.0; 2]);
         }
         let fitted = if is_even {
-            self.fit_fresh(alone, &mut budget)
+            self.fit_fresh(alone, true, &mut budget)
         } else {
             None
         };
@@ -175,6 +195,28 @@ impl SequenceEstimator {
         None
     }
 
+    /// The newest frame on top of `known`; `None` where that does not explain it. Newcomers need the frame's own word: where it shows alone no
+    /// fewer emitters than are known, but fewer than with them, there are none.
+    fn explain(&mut self, known: JointInformation, time_s: f64, scale: f64, budget: &mut WorkBudget) -> Option<Window> {
+        let plain = self.fresh(known, time_s);
+        let before = plain.present(time_s).len();
+        let grown = self.fit_fresh(plain.clone(), true, budget)?;
+        let after = grown.present(time_s).len();
+        if after == before {
+            return Some(grown);
+        }
+        let alone = self
+            .single
+            .estimate_loaded(scale, &|| budget.is_exhausted())
+            .emitters
+            .len();
+        if (before..after).contains(&alone) {
+            self.fit_fresh(plain, false, budget)
+        } else {
+            Some(grown)
+        }
+    }
+
     /// Searches the frames of the window together with the loaded one, as what is remembered may be wrong. Whether that explains it.
     fn search_again(&mut self, time_s: f64, is_over: &dyn Fn() -> bool) -> bool {
         let Some(first) = self.window.snapshots.first() else {
@@ -184,46 +226,16 @@ impl SequenceEstimator {
         let mut next = self.window.clone();
         next.snapshots
             .append(&mut self.fresh(JointInformation::default(), time_s).snapshots);
-        let rules = self.rules;
         let mut budget = WorkBudget::of_frames(SEARCH_WORK, is_over);
-        let (space, _, _) = self.single.loaded();
-        let mut engine = Engine {
-            bases: &space.bases,
-            rules,
-            budget: &mut budget,
-            workspace: &mut space.workspace,
-        };
-        next.fit(&mut engine, WINDOW_STEPS);
-        let mut search = WindowSearch {
-            engine: &mut engine,
-            matched_filter: &mut space.matched_filter,
-            penalty: space.source_penalty,
-        };
-        search.refine(&mut next, born_s);
+        self.with_search(&mut budget, |_, search| {
+            next.fit(search.engine, WINDOW_STEPS);
+            search.refine(&mut next, born_s);
+        });
         let is_explained = next.is_last_explained();
         if is_explained {
             self.window = next;
         }
         is_explained
-    }
-
-    /// Adds to `knowledge` that every emitter may have changed its velocity since the frame before.
-    fn open(&self, knowledge: &mut JointInformation, elapsed: f64) {
-        let speed = (MANOEUVRE_M_S / self.ground_m()).powi(2);
-        for e in 0..knowledge.len() {
-            let at: Vec<usize> = (0..STATE).map(|k| STATE * e + k).collect();
-            let noise = DMatrix::from_fn(STATE, STATE, |r, c| {
-                let place = |k: usize| if k < 2 { 0.5 * elapsed } else { 1.0 };
-                let shared = if r % 2 == c % 2 {
-                    speed * place(r) * place(c)
-                } else {
-                    0.0
-                };
-                // Half of the position's is its own: when the manoeuvre was is not known.
-                if r == c { 1.2 * shared + 1e-12 } else { shared }
-            });
-            knowledge.add_noise(&at, &noise);
-        }
     }
 
     /// A window of the loaded frame alone, on top of `prior`.
@@ -260,25 +272,21 @@ impl SequenceEstimator {
         window.snapshots.append(&mut fresh.snapshots);
     }
 
-    /// Fits the newest frame to what is remembered, with births; `None` where that does not explain it.
-    fn fit_fresh(&mut self, mut fresh: Window, budget: &mut WorkBudget) -> Option<Window> {
-        let rules = self.rules;
+    /// Fits the newest frame to what is remembered, with newcomers where they are `allowed`; `None` where that does not explain it.
+    fn fit_fresh(&mut self, mut fresh: Window, allowed: bool, budget: &mut WorkBudget) -> Option<Window> {
         let time_s = fresh.time_s;
-        let (space, _, _) = self.single.loaded();
-        let mut engine = Engine {
-            bases: &space.bases,
-            rules,
-            budget,
-            workspace: &mut space.workspace,
-        };
-        fresh.fit(&mut engine, FRAME_STEPS);
-        let mut search = WindowSearch {
-            engine: &mut engine,
-            matched_filter: &mut space.matched_filter,
-            penalty: space.source_penalty,
-        };
-        search.grow(&mut fresh, time_s);
-        fresh.is_last_explained().then_some(fresh)
+        let (has_grown, left) = self.with_search(budget, |_, search| {
+            fresh.fit(search.engine, FRAME_STEPS);
+            let has_grown = allowed && search.grow(&mut fresh, time_s);
+            (has_grown, std::mem::take(&mut search.left))
+        });
+        let is_explained = fresh.is_last_explained();
+        if has_grown {
+            self.left.clear();
+        } else if is_explained && allowed {
+            self.left.add(&left, MAX_SNAPSHOTS as f64);
+        }
+        is_explained.then_some(fresh)
     }
 
     /// Ends targets that have gone dark: frames before hold them still.
@@ -296,123 +304,93 @@ impl SequenceEstimator {
             }
         }
         if has_died {
-            let mut budget = WorkBudget::of_frames(SEARCH_WORK, is_over);
-            let (space, _, _) = self.single.loaded();
-            let mut engine = Engine {
-                bases: &space.bases,
-                rules: self.rules,
-                budget: &mut budget,
-                workspace: &mut space.workspace,
-            };
-            self.window.fit(&mut engine, WINDOW_STEPS);
+            let mut budget = WorkBudget::new(is_over);
+            self.with_search(&mut budget, |window, search| window.relinearise_last(search.engine));
         }
     }
 
-    /// Keeps the window within its bounds, linearised and searched.
+    /// Forgets newcomers that the frames since have not confirmed.
+    fn drop_unconfirmed(&mut self, is_over: &dyn Fn() -> bool) {
+        let mut budget = WorkBudget::new(is_over);
+        self.with_search(&mut budget, |window, search| {
+            let targets = unconfirmed(window, search.penalty);
+            window.discard(search.engine, &targets);
+        });
+    }
+
+    /// Keeps the window within its bounds, and linearised.
     fn tend(&mut self, is_over: &dyn Fn() -> bool) {
-        let rules = self.rules;
-        let mut budget = WorkBudget::of_frames(SEARCH_WORK, is_over);
-        let (space, compressed, _) = self.single.loaded();
+        let (_, compressed, _) = self.single.loaded();
         let numbers = (compressed.mx * compressed.my).max(1);
         let most = MAX_SNAPSHOTS.min(MAX_NUMBERS / numbers).max(2);
-        let mut engine = Engine {
-            bases: &space.bases,
-            rules,
-            budget: &mut budget,
-            workspace: &mut space.workspace,
-        };
-        let window = &mut self.window;
-        if window.snapshots.len() > most {
-            window.fold(window.snapshots.len() - most);
-        }
-        window.forget_dead();
-        if window.has_moved() {
-            window.fit(&mut engine, WINDOW_STEPS);
-        }
+        let mut budget = WorkBudget::of_frames(SEARCH_WORK, is_over);
+        self.with_search(&mut budget, |window, search| {
+            if window.snapshots.len() > most {
+                window.fold(window.snapshots.len() - most);
+            }
+            window.forget_dead();
+            if window.refresh(search.engine, REFRESHED) && window.snapshots.len() <= REFRESHED {
+                window.fit(search.engine, WINDOW_STEPS);
+            }
+        });
+    }
+
+    /// Searches the window for another number of emitters: begins when it has grown, and goes on with each frame for a share of its time.
+    fn revise(&mut self, is_over: &dyn Fn() -> bool) {
+        let length = self.window.snapshots.len();
         self.since_search += 1;
-        let length = window.snapshots.len();
-        if length < 2 || self.since_search < SEARCH_AFTER && (length as f64) < SEARCH_GROWTH * self.searched as f64 {
+        let is_due = self.since_search >= SEARCH_AFTER || length as f64 >= SEARCH_GROWTH * self.searched as f64;
+        let revision = self.revision.take().filter(|r| r.is_of(&self.window));
+        let begins = revision.is_none();
+        if begins && (length < 2 || !is_due) {
             return;
         }
-        (self.since_search, self.searched) = (0, length);
+        if begins {
+            (self.since_search, self.searched) = (0, length);
+        }
+        let left = std::mem::take(&mut self.left);
+        let memory_s = self.memory_s;
+        let mut budget = WorkBudget::of_frames(REVISION_WORK, is_over);
+        let (revision, has_changed) = self.with_search(&mut budget, |window, search| {
+            let revision = revision.or_else(|| Revision::begin(window, search, search.births(window, &left)));
+            let Some(mut revision) = revision else {
+                return (None, false);
+            };
+            match revision.advance(search) {
+                Revised::Finished => (None, false),
+                Revised::Unfinished => (Some(revision), false),
+                Revised::Better(mut better) => {
+                    let newer = window.snapshots.iter().filter(|s| s.time_s > revision.time_s());
+                    let newer: Vec<Snapshot> = newer.cloned().collect();
+                    better.catch_up(search.engine, &newer, memory_s);
+                    *window = better;
+                    (None, true)
+                }
+            }
+        });
+        self.revision = revision;
+        if has_changed {
+            self.searched = 0;
+        } else {
+            self.left = left;
+        }
+    }
+
+    /// Runs `run` on the window, with what a search of the loaded frame's space needs.
+    fn with_search<R>(&mut self, budget: &mut WorkBudget, run: impl FnOnce(&mut Window, &mut WindowSearch) -> R) -> R {
+        let (space, _, _) = self.single.loaded();
+        let mut engine = Engine {
+            bases: &space.bases,
+            rules: self.rules,
+            budget,
+            workspace: &mut space.workspace,
+        };
         let mut search = WindowSearch {
             engine: &mut engine,
             matched_filter: &mut space.matched_filter,
             penalty: space.source_penalty,
+            left: Vec::new(),
         };
-        let is_ambiguous = window.is_ambiguous();
-        let born_s = window.snapshots[0].time_s;
-        let has_grown = search.grow(window, born_s);
-        if is_ambiguous || has_grown {
-            search.refine(window, born_s);
-            search.restart(window);
-        }
-    }
-
-    /// The emitters at the newest frame's time.
-    fn report(&mut self, scale: f64, is_over: &dyn Fn() -> bool) -> Estimate {
-        let sigma = self.camera.spot_sigma_m;
-        let window = &self.window;
-        let present = window.present(window.time_s);
-        let n = present.len();
-        let posterior = posterior(&window.total, 1.0 / (self.camera.ground_scale() * sigma));
-        let mut known = DMatrix::zeros(2 * n, 2 * n);
-        let mut positions = window.positions(&window.state, window.time_s);
-        let mut budget = WorkBudget::new(is_over);
-        let (space, compressed, frame) = self.single.loaded();
-        if let Some(Posterior { state, covariance }) = &posterior {
-            positions = window.positions(state, window.time_s);
-            let place = |k: usize| STATE * present[k / 2] + k % 2;
-            let own = DMatrix::from_fn(2 * n, 2 * n, |r, c| covariance[(place(r), place(c))]);
-            let mut engine = Engine {
-                bases: &space.bases,
-                rules: self.rules,
-                budget: &mut budget,
-                workspace: &mut space.workspace,
-            };
-            let local = LocalQuadratic::new(&mut engine, compressed, Nuisances::default(), positions.clone());
-            if let Some(information) = own.cholesky().map(|c| c.inverse()) {
-                known = information - local.information;
-            }
-        }
-        let mut hypothesis = hypothesis(&positions, Nuisances::default());
-        hypothesis.converged = true;
-        let mut context = FitContext {
-            bases: &space.bases,
-            compressed,
-            rules: self.rules,
-            budget: &mut budget,
-            workspace: &mut space.workspace,
-        };
-        let noise_j = scale * self.camera.noise_std_j;
-        let mut found = localise(
-            &mut context,
-            &mut hypothesis,
-            frame,
-            &self.camera,
-            noise_j,
-            None,
-            Some(&known),
-        );
-        for (e, emitter) in found.emitters.iter_mut().enumerate() {
-            emitter.energy_j = emitter.energy_j.max(0.0);
-            if let Some(Posterior { state, .. }) = &posterior {
-                let velocity = [2, 3].map(|k| state[STATE * present[e] + k] * sigma);
-                emitter.velocity = Some(velocity_on_ground(&self.camera, emitter.sensor_m, velocity));
-            }
-            if is_over() {
-                emitter.flags |= Flags::OUT_OF_TIME;
-            }
-        }
-        Estimate {
-            emitters: found.emitters,
-            estimator: self.spec.name,
-            is_cut_short: is_over(),
-            reduced_chi2: found.reduced_chi2,
-            spot_error: 0.0,
-            saturated_share: frame.saturated_share(),
-            condition: found.condition,
-            steps: budget.steps,
-        }
+        run(&mut self.window, &mut search)
     }
 }

@@ -2,8 +2,10 @@
 
 use nalgebra::DVector;
 
+use crate::estimate::model::hypothesis::OVERLAPPING;
 use crate::estimate::sequence::joint_information::{JointInformation, STATE};
 use crate::estimate::sequence::snapshot::{Engine, LocalQuadratic, Snapshot};
+use crate::estimate::sequence::target::Target;
 
 /// Damping λ: first value and range, as in the fit of one frame.
 const LAMBDA_START: f64 = 1e-3;
@@ -19,64 +21,23 @@ pub(crate) const SPEED_STD_M_S: f64 = 8.0;
 /// Standard deviations of χ² from which a frame contradicts what is remembered, as the flag `poor_fit` of one frame: nearer, noise alone would end the
 /// memory within hours.
 const UNEXPLAINED: f64 = 5.0;
-/// The window is fitted anew when a position has moved this far since it was linearised, as a share of the distance to the nearest emitter,
-/// at most of a σ: the information of overlapping spots changes over that distance.
+/// A snapshot is linearised anew when a position has moved by this many σ since, or, where another emitter is within `OVERLAPPING`, by this share
+/// of the distance to it: the information on the pair's difference changes with that distance. Smaller takes time, larger leaves biases beyond the
+/// standard deviation in pairs of much light.
 const MOVED: f64 = 0.02;
-/// Pairs nearer than this many standard deviations of their difference are ambiguous: the window is searched again.
-const AMBIGUOUS: f64 = 4.0;
+const MOVED_OVERLAPPING: f64 = 0.002;
 
-/// Frames from which a target's mean energy is known well enough to miss it, and over how many it is averaged.
-const FEW: f64 = 3.0;
-const MANY: f64 = 100.0;
+/// Times the predicted decrease that must suffice to reach the cost asked for; see `fit::levenberg_marquardt`.
+const ABORT_FACTOR: f64 = 5.0;
 
-/// An emitter that the window follows.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct Target {
-    /// Earlier frames do not hold it, s.
-    pub born_s: f64,
-    /// This frame and later ones do not hold it, s; it is forgotten with the last frame that does.
-    pub died_s: f64,
-    /// Mean energy of its frames, and their number up to the length of the memory.
-    pub mean_energy: f64,
-    pub frames: f64,
-    /// ln of the evidence that it has gone dark over that it has not, never below zero.
-    pub darkness: f64,
-}
-
-impl Target {
-    pub fn born(born_s: f64) -> Self {
-        Self {
-            born_s,
-            died_s: f64::INFINITY,
-            mean_energy: 0.0,
-            frames: 0.0,
-            darkness: 0.0,
-        }
-    }
-
-    /// Whether a frame may hold it.
-    pub fn is_in(&self, time_s: f64) -> bool {
-        self.born_s <= time_s && time_s < self.died_s
-    }
-
-    /// Takes the energy that a frame measured, with its variance, at `weight` of an independent draw of the fading. The evidence is
-    /// between no light and light that is exponentially distributed about its mean, which no fading exceeds by much in the dark.
-    pub fn weigh(&mut self, energy: f64, variance: f64, weight: f64) {
-        let std = variance.sqrt();
-        if self.frames >= FEW && self.mean_energy > 0.0 && std.is_finite() {
-            let z = energy / std - std / self.mean_energy;
-            // e^{z²/2}·Φ(z), by its asymptote where Φ underflows.
-            let tail = if z < -6.0 {
-                -1.0 / (z * (2.0 * std::f64::consts::PI).sqrt())
-            } else {
-                (0.5 * z * z).min(600.0).exp() * 0.5 * libm::erfc(-z * std::f64::consts::FRAC_1_SQRT_2)
-            };
-            let alive = ((2.0 * std::f64::consts::PI).sqrt() * std / self.mean_energy * tail).ln();
-            self.darkness = (self.darkness - weight * alive).max(0.0);
-        }
-        self.frames = (self.frames + 1.0).min(MANY);
-        self.mean_energy += (energy - self.mean_energy) / self.frames;
-    }
+/// How a fit ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Progress {
+    Converged,
+    /// The cost asked for is out of reach.
+    Hopeless,
+    /// Steps or work are spent.
+    Unfinished,
 }
 
 /// All that is remembered.
@@ -94,8 +55,9 @@ pub(crate) struct Window {
     pub total: JointInformation,
     /// Snapshots of noise alone that were left out; see `subspace`.
     pub dropped: f64,
-    /// −2 ln L of the last fit.
+    /// −2 ln L of the last fit, and the damping λ it ended with; 0 to begin with `LAMBDA_START`.
     pub cost: f64,
+    pub damping: f64,
     /// Variances of position, σ², and velocity, σ²/s², of an emitter of which nothing is known.
     pub unknown: [f64; 2],
 }
@@ -230,20 +192,32 @@ impl Window {
         total
     }
 
-    /// Fits all snapshots and the prior together by Levenberg–Marquardt, at most `steps` steps from `state` on. Sets `total` and `cost`, and
-    /// returns whether it has converged.
-    pub fn fit(&mut self, engine: &mut Engine, steps: usize) -> bool {
+    /// Fits all snapshots and the prior together by Levenberg–Marquardt, at most `steps` steps from `state` on. Sets `total` and `cost`.
+    pub fn fit(&mut self, engine: &mut Engine, steps: usize) {
+        self.damping = 0.0;
+        self.fit_below(engine, &mut { steps }, f64::INFINITY);
+    }
+
+    /// [`Window::fit`] of the `steps` that are left, given up as soon as a cost below `highest` is out of reach. Called again, it goes on.
+    pub fn fit_below(&mut self, engine: &mut Engine, steps: &mut usize, highest: f64) -> Progress {
         let mut locals = Vec::new();
         let mut trial = Vec::new();
-        let mut cost = self.linearise(engine, &self.state.clone(), &mut locals);
+        let is_linear = self.damping > 0.0;
+        let mut cost = if is_linear {
+            locals.extend(self.snapshots.iter_mut().map(|s| std::mem::take(&mut s.local)));
+            self.cost
+        } else {
+            self.linearise(engine, &self.state.clone(), &mut locals)
+        };
         let mut total = self.sum(&self.state, &locals);
-        let mut lambda = LAMBDA_START;
-        let mut has_converged = self.len() == 0;
+        let mut lambda = if is_linear { self.damping } else { LAMBDA_START };
+        let mut progress = Progress::Unfinished;
+        if self.len() == 0 {
+            progress = Progress::Converged;
+        }
         let span = self.snapshots.first().map_or(0.0, |s| (self.time_s - s.time_s).abs());
-        for _ in 0..if has_converged { 0 } else { steps } {
-            if engine.budget.is_exhausted() {
-                break;
-            }
+        while progress == Progress::Unfinished && *steps > 0 && !engine.budget.is_exhausted() {
+            *steps -= 1;
             let Some(factor) = total.factor(lambda) else {
                 lambda *= 4.0;
                 if lambda > LAMBDA_CEILING {
@@ -252,8 +226,13 @@ impl Window {
                 continue;
             };
             let mut step = factor.solve(&total.gradient);
-            if step.dot(&total.gradient) < NEGLIGIBLE_DECREASE && lambda <= LAMBDA_START {
-                has_converged = true;
+            let predicted = step.dot(&total.gradient);
+            if predicted < NEGLIGIBLE_DECREASE && lambda <= LAMBDA_START {
+                progress = Progress::Converged;
+                break;
+            }
+            if lambda <= LAMBDA_START && cost - ABORT_FACTOR * predicted > highest {
+                progress = Progress::Hopeless;
                 break;
             }
             shorten(&mut step, span);
@@ -268,7 +247,7 @@ impl Window {
             } else {
                 lambda *= 4.0;
                 if lambda > LAMBDA_CEILING {
-                    has_converged = true;
+                    progress = Progress::Converged;
                     break;
                 }
             }
@@ -277,8 +256,8 @@ impl Window {
             s.local = local;
         }
         self.total = total;
-        self.cost = cost;
-        has_converged
+        (self.cost, self.damping) = (cost, lambda);
+        progress
     }
 
     /// Covariance of the state given all that is known; `None` where it is singular.
@@ -303,48 +282,105 @@ impl Window {
         })
     }
 
-    /// Whether positions have moved so far that snapshots need a new linearisation.
-    pub fn has_moved(&self) -> bool {
+    /// How far positions have moved since each snapshot was linearised: 1 and more where it needs a new linearisation.
+    fn staleness(&self) -> Vec<f64> {
         let n = self.len();
         let at = |e: usize| [self.state[STATE * e], self.state[STATE * e + 1]];
         let reach: Vec<f64> = (0..n)
             .map(|e| {
                 let apart = |f: usize| (at(e)[0] - at(f)[0]).hypot(at(e)[1] - at(f)[1]);
-                MOVED * (0..n).filter(|f| *f != e).map(apart).fold(1.0, f64::min)
+                let nearest = (0..n).filter(|f| *f != e).map(apart).fold(f64::INFINITY, f64::min);
+                if nearest > OVERLAPPING {
+                    MOVED
+                } else {
+                    MOVED_OVERLAPPING * nearest.min(1.0)
+                }
             })
             .collect();
-        self.snapshots.iter().any(|s| {
+        let of = |s: &Snapshot| {
             let moved = self.positions(&self.state, s.time_s) - &s.local.positions;
-            let present = self.present(s.time_s);
-            present
-                .iter()
-                .enumerate()
-                .any(|(i, &e)| moved[2 * i].hypot(moved[2 * i + 1]) > reach[e])
-        })
+            let shares = self.present(s.time_s).into_iter().zip(moved.as_slice().chunks_exact(2));
+            shares.map(|(e, d)| d[0].hypot(d[1]) / reach[e]).fold(0.0, f64::max)
+        };
+        self.snapshots.iter().map(of).collect()
     }
 
-    /// Whether a pair of emitters is not told apart for certain.
-    pub fn is_ambiguous(&self) -> bool {
-        let Some(covariance) = self.covariance() else {
-            return true;
-        };
-        let present = self.present(self.time_s);
-        present.iter().any(|&e| {
-            present.iter().take_while(|f| **f < e).any(|&f| {
-                let d = [0, 1].map(|k| self.state[STATE * e + k] - self.state[STATE * f + k]);
-                let of = |a: usize, b: usize| covariance[(a, b)];
-                let mut along = 0.0;
-                for r in 0..2 {
-                    for c in 0..2 {
-                        let (a, b) = (STATE * e, STATE * f);
-                        let s = of(a + r, a + c) + of(b + r, b + c) - of(a + r, b + c) - of(b + r, a + c);
-                        along += d[r] * s * d[c];
-                    }
+    /// Linearises anew the snapshots that need it most, at most `most` of them, and takes a Gauss–Newton step. Returns whether any did.
+    pub fn refresh(&mut self, engine: &mut Engine, most: usize) -> bool {
+        let mut stale: Vec<(usize, f64)> = self
+            .staleness()
+            .into_iter()
+            .enumerate()
+            .filter(|(_, s)| *s > 1.0)
+            .collect();
+        if stale.is_empty() {
+            return false;
+        }
+        stale.sort_by(|a, b| b.1.total_cmp(&a.1));
+        stale.truncate(most);
+        for (k, _) in stale {
+            self.relinearise(engine, k);
+        }
+        self.step();
+        true
+    }
+
+    /// Linearises one snapshot at the state. The caller adds up anew.
+    fn relinearise(&mut self, engine: &mut Engine, k: usize) {
+        let positions = self.positions(&self.state, self.snapshots[k].time_s);
+        let s = &mut self.snapshots[k];
+        s.local = LocalQuadratic::new(engine, &s.compressed, s.nuisances, positions);
+    }
+
+    /// Linearises the newest snapshot anew, as when one of its targets has turned out to be dark.
+    pub fn relinearise_last(&mut self, engine: &mut Engine) {
+        if let Some(last) = self.snapshots.len().checked_sub(1) {
+            self.relinearise(engine, last);
+            self.step();
+        }
+    }
+
+    /// Adds up the prior and the snapshots as they are linearised, and takes a Gauss–Newton step.
+    fn step(&mut self) {
+        let mut total = self.prior.clone();
+        total.recentre(&self.state);
+        for s in &self.snapshots {
+            self.absorb(&mut total, &s.local, s.time_s);
+        }
+        if let Some(factor) = total.factor(LAMBDA_FLOOR) {
+            let span = self.snapshots.first().map_or(0.0, |s| (self.time_s - s.time_s).abs());
+            let mut step = factor.solve(&total.gradient);
+            shorten(&mut step, span);
+            self.state += step;
+            total.recentre(&self.state);
+        }
+        self.total = total;
+    }
+
+    /// Goes on with frames that came while this window was searched.
+    pub fn catch_up(&mut self, engine: &mut Engine, newer: &[Snapshot], memory_s: f64) {
+        for s in newer {
+            self.advance(s.time_s, memory_s);
+            self.snapshots.push(s.clone());
+            self.relinearise(engine, self.snapshots.len() - 1);
+            self.step();
+        }
+    }
+
+    /// Forgets targets, highest index first, and that any snapshot held them.
+    pub fn discard(&mut self, engine: &mut Engine, targets: &[usize]) {
+        for &e in targets {
+            let born_s = self.targets[e].born_s;
+            self.remove(e);
+            for k in 0..self.snapshots.len() {
+                if self.snapshots[k].time_s >= born_s {
+                    self.relinearise(engine, k);
                 }
-                let square = d[0] * d[0] + d[1] * d[1];
-                square * square < AMBIGUOUS * AMBIGUOUS * along
-            })
-        })
+            }
+        }
+        if !targets.is_empty() {
+            self.step();
+        }
     }
 }
 

@@ -1,0 +1,90 @@
+//! What is reported of a window: its emitters at the newest frame's time, with the posterior of all frames.
+
+use nalgebra::DMatrix;
+
+use crate::estimate::emitter::{Estimate, Flags};
+use crate::estimate::estimators::analytic::AnalyticEstimator;
+use crate::estimate::fit::context::FitContext;
+use crate::estimate::fit::work_budget::WorkBudget;
+use crate::estimate::model::hypothesis::Nuisances;
+use crate::estimate::rules::Rules;
+use crate::estimate::sequence::joint_information::STATE;
+use crate::estimate::sequence::motion::{Posterior, posterior, velocity_on_ground};
+use crate::estimate::sequence::snapshot::{Engine, LocalQuadratic, hypothesis};
+use crate::estimate::sequence::window::Window;
+use crate::estimate::uncertainty::localise::localise;
+use crate::optics::Camera;
+
+/// The emitters at the newest frame's time; `single` holds that frame, whose noise is `scale` times the configured noise.
+pub(crate) fn report(
+    single: &mut AnalyticEstimator,
+    window: &Window,
+    camera: &Camera,
+    rules: Rules,
+    name: &'static str,
+    scale: f64,
+    is_over: &dyn Fn() -> bool,
+) -> Estimate {
+    let sigma = camera.spot_sigma_m;
+    let present = window.present(window.time_s);
+    let n = present.len();
+    let posterior = posterior(&window.total, 1.0 / (camera.ground_scale() * sigma));
+    let mut known = DMatrix::zeros(2 * n, 2 * n);
+    let mut positions = window.positions(&window.state, window.time_s);
+    let mut budget = WorkBudget::new(is_over);
+    let (space, compressed, frame) = single.loaded();
+    if let Some(Posterior { state, covariance }) = &posterior {
+        positions = window.positions(state, window.time_s);
+        let place = |k: usize| STATE * present[k / 2] + k % 2;
+        let own = DMatrix::from_fn(2 * n, 2 * n, |r, c| covariance[(place(r), place(c))]);
+        let mut engine = Engine {
+            bases: &space.bases,
+            rules,
+            budget: &mut budget,
+            workspace: &mut space.workspace,
+        };
+        let local = LocalQuadratic::new(&mut engine, compressed, Nuisances::default(), positions.clone());
+        if let Some(information) = own.cholesky().map(|c| c.inverse()) {
+            known = information - local.information;
+        }
+    }
+    let mut hypothesis = hypothesis(&positions, Nuisances::default());
+    hypothesis.converged = true;
+    let mut context = FitContext {
+        bases: &space.bases,
+        compressed,
+        rules,
+        budget: &mut budget,
+        workspace: &mut space.workspace,
+    };
+    let noise_j = scale * camera.noise_std_j;
+    let mut found = localise(
+        &mut context,
+        &mut hypothesis,
+        frame,
+        camera,
+        noise_j,
+        None,
+        Some(&known),
+    );
+    for (e, emitter) in found.emitters.iter_mut().enumerate() {
+        emitter.energy_j = emitter.energy_j.max(0.0);
+        if let Some(Posterior { state, .. }) = &posterior {
+            let velocity = [2, 3].map(|k| state[STATE * present[e] + k] * sigma);
+            emitter.velocity = Some(velocity_on_ground(camera, emitter.sensor_m, velocity));
+        }
+        if is_over() {
+            emitter.flags |= Flags::OUT_OF_TIME;
+        }
+    }
+    Estimate {
+        emitters: found.emitters,
+        estimator: name,
+        is_cut_short: is_over(),
+        reduced_chi2: found.reduced_chi2,
+        spot_error: 0.0,
+        saturated_share: frame.saturated_share(),
+        condition: found.condition,
+        steps: budget.steps,
+    }
+}

@@ -1,0 +1,140 @@
+//! Where the residuals of a window's frames leave light for one more emitter.
+
+use nalgebra::DMatrix;
+
+use crate::estimate::detect::matched_filter::MatchedFilter;
+use crate::estimate::model::bases::Bases;
+use crate::estimate::sequence::snapshot::{Engine, Snapshot, residual};
+use crate::estimate::sequence::window::Window;
+
+/// Least share of a spot that lies outside the emitters' span for a birth there: nearer, it is the same emitter.
+const LEAST_OUTSIDE: f64 = 1e-6;
+/// Square of the overlap with all emitters below which a spot counts as outside their span: neglecting it underestimates a peak by as much.
+const NEGLIGIBLE_OVERLAP: f64 = 1e-3;
+
+/// A spot of unit norm: its profiles along x and y in the coefficients of a snapshot.
+struct UnitSpot {
+    profiles: [Vec<f64>; 2],
+}
+
+impl UnitSpot {
+    fn new(bases: &Bases, snapshot: &Snapshot, u: [f64; 2]) -> Self {
+        let axes = bases.axes();
+        let sizes = [snapshot.compressed.mx, snapshot.compressed.my];
+        let profiles = [0, 1].map(|k| {
+            let (m, mut scratch) = (sizes[k], vec![0.0; 3 * axes[k].n]);
+            let mut out = vec![0.0; 3 * m];
+            axes[k].profile(u[k], 1.0, snapshot.compressed.reach, m, &mut scratch, &mut out);
+            out.truncate(m);
+            let norm = out.iter().map(|v| v * v).sum::<f64>().sqrt().max(1e-12);
+            out.iter_mut().for_each(|v| *v /= norm);
+            out
+        });
+        Self { profiles }
+    }
+
+    fn overlap(&self, other: &Self) -> f64 {
+        let along = |k: usize| -> f64 {
+            let pairs = self.profiles[k].iter().zip(&other.profiles[k]);
+            pairs.map(|(a, b)| a * b).sum()
+        };
+        along(0) * along(1)
+    }
+}
+
+/// What the residuals of all frames leave for one more emitter at each point of the matched filter's grid, Σ (fᵀr)²/‖P⊥f‖².
+pub(crate) fn residual_map(engine: &mut Engine, filter: &mut MatchedFilter, window: &Window) -> Vec<f64> {
+    let mut sum: Vec<f64> = Vec::new();
+    for s in &window.snapshots {
+        let positions = window.positions(&window.state, s.time_s);
+        let (left, _) = residual(engine, &s.compressed, s.nuisances, &positions);
+        filter.respond(left, s.compressed.mx, s.compressed.my);
+        sum.resize(filter.map().len(), 0.0);
+        for (total, v) in sum.iter_mut().zip(filter.map()) {
+            *total += v * v;
+        }
+    }
+    if let Some(last) = window.snapshots.last() {
+        let positions = window.positions(&window.state, last.time_s);
+        let spots = positions.as_slice().chunks_exact(2);
+        let spots: Vec<UnitSpot> = spots.map(|u| UnitSpot::new(engine.bases, last, [u[0], u[1]])).collect();
+        divide_by_outside(filter, &spots, &mut sum);
+    }
+    sum
+}
+
+/// The residual maps of single frames added up, as long as they are of the same emitters: light that no frame shows alone.
+#[derive(Default)]
+pub(crate) struct ResidualSum {
+    pub sum: Vec<f64>,
+    pub frames: f64,
+}
+
+impl ResidualSum {
+    /// Adds a frame's map; older ones fade, so that about `most` count.
+    pub fn add(&mut self, map: &[f64], most: f64) {
+        let kept = 1.0 - 1.0 / most;
+        self.frames = kept * self.frames + 1.0;
+        self.sum.resize(map.len(), 0.0);
+        for (sum, v) in self.sum.iter_mut().zip(map) {
+            *sum = kept * *sum + v;
+        }
+    }
+
+    pub fn clear(&mut self) {
+        self.sum.clear();
+        self.frames = 0.0;
+    }
+}
+
+/// Divides by the share of a spot that lies outside the emitters' span: one minus cᵀG⁻¹c with c its overlaps with them and G theirs.
+fn divide_by_outside(filter: &MatchedFilter, spots: &[UnitSpot], sum: &mut [f64]) {
+    let n = spots.len();
+    let gram = DMatrix::from_fn(n, n, |i, j| {
+        let ridge = if i == j { 1.0 + 1e-12 } else { 1.0 };
+        ridge * spots[i].overlap(&spots[j])
+    });
+    let Some(factor) = gram.cholesky() else {
+        sum.fill(0.0);
+        return;
+    };
+    let factor = factor.l();
+    let along = |k: usize| -> Vec<Vec<f64>> { spots.iter().map(|s| filter.respond_along(k, &s.profiles[k])).collect() };
+    let [x, y] = [along(0), along(1)];
+    let width = filter.width();
+    let mut overlaps = vec![0.0; n];
+    for (k, total) in sum.iter_mut().enumerate() {
+        let (i, j) = (k % width, k / width);
+        for (c, (x, y)) in overlaps.iter_mut().zip(x.iter().zip(&y)) {
+            *c = x[i] * y[j];
+        }
+        if overlaps.iter().map(|c| c * c).sum::<f64>() < NEGLIGIBLE_OVERLAP {
+            continue;
+        }
+        let mut outside = 1.0;
+        for r in 0..n {
+            let known: f64 = (0..r).map(|c| factor[(r, c)] * overlaps[c]).sum();
+            overlaps[r] = (overlaps[r] - known) / factor[(r, r)];
+            outside -= overlaps[r] * overlaps[r];
+        }
+        *total = if outside > LEAST_OUTSIDE { *total / outside } else { 0.0 };
+    }
+}
+
+/// Points of at least `least` that are above all their neighbours, the highest first, with their positions, σ.
+pub(crate) fn peaks(filter: &MatchedFilter, sum: &[f64], least: f64) -> Vec<(f64, [f64; 2])> {
+    let width = filter.width();
+    let height = sum.len() / width;
+    let mut found = Vec::new();
+    for (k, &value) in sum.iter().enumerate().filter(|(_, v)| **v >= least) {
+        let (i, j) = (k % width, k / width);
+        let mut around = (j.saturating_sub(1)..(j + 2).min(height))
+            .flat_map(|b| (i.saturating_sub(1)..(i + 2).min(width)).map(move |a| b * width + a))
+            .filter(|o| *o != k);
+        if around.all(|o| sum[o] < value) {
+            found.push((value, filter.position(k)));
+        }
+    }
+    found.sort_by(|a, b| b.0.total_cmp(&a.0));
+    found
+}

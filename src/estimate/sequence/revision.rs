@@ -1,0 +1,157 @@
+//! The search of a window for another number of emitters, in shares of a frame's time: one proposal is fitted after another, each as far as the
+//! frame's work allows, and goes on with the next frame.
+
+use std::collections::VecDeque;
+
+use crate::estimate::sequence::search::{CONVERGE_STEPS, RELOCATED, TRIAL_STEPS, WindowSearch, is_ambiguous};
+use crate::estimate::sequence::target::Target;
+use crate::estimate::sequence::window::{Progress, Window};
+
+/// A proposal counts as better when it lowers the score by this: what unfinished fits differ by.
+const LEAST_GAIN: f64 = 1.0;
+/// Residual peaks at which an emitter is tried that was removed elsewhere.
+const MOVES: usize = 2;
+
+/// Another explanation of the window.
+enum Proposal {
+    /// The same emitters, fitted to the end: what the others are compared with.
+    Same,
+    Birth([f64; 2]),
+    Death(usize),
+    /// An emitter that has been removed from the window, at another place.
+    Move(Box<Window>, Target, [f64; 2]),
+    /// What the principal components of all frames show.
+    Restart,
+}
+
+/// A proposal being fitted.
+struct Trial {
+    window: Window,
+    steps: usize,
+    /// The emitter without which it is, to be tried elsewhere.
+    without: Option<Target>,
+}
+
+/// What became of a frame's share of the search.
+pub(crate) enum Revised {
+    Unfinished,
+    /// Nothing is better.
+    Finished,
+    /// A window that explains the frames better, as of the time when the search began.
+    Better(Window),
+}
+
+/// A search in progress.
+pub(crate) struct Revision {
+    base: Window,
+    /// Of the fitted base.
+    score: f64,
+    is_fitted: bool,
+    proposals: VecDeque<Proposal>,
+    trial: Option<Trial>,
+}
+
+impl Revision {
+    /// Of a window, with an emitter more at one of `births`, and, where emitters are not told apart for certain, with one fewer, one
+    /// elsewhere, or all anew; `None` where there is nothing to try.
+    pub fn begin(window: &Window, search: &WindowSearch, births: Vec<[f64; 2]>) -> Option<Self> {
+        let mut proposals = VecDeque::from([Proposal::Same]);
+        proposals.extend(births.into_iter().map(Proposal::Birth));
+        if is_ambiguous(window) {
+            proposals.push_back(Proposal::Restart);
+            proposals.extend(search.weakest(window).into_iter().map(Proposal::Death));
+        }
+        (proposals.len() > 1).then(|| Self {
+            base: window.clone(),
+            score: f64::INFINITY,
+            is_fitted: false,
+            proposals,
+            trial: None,
+        })
+    }
+
+    /// The time as of which the window is searched.
+    pub fn time_s(&self) -> f64 {
+        self.base.time_s
+    }
+
+    /// Whether `window` still follows the emitters that are being searched for, through the frames that are searched.
+    pub fn is_of(&self, window: &Window) -> bool {
+        let lives = |w: &Window| -> Vec<_> { w.targets.iter().map(|t| (t.born_s, t.died_s)).collect() };
+        window.snapshots.iter().any(|s| s.time_s == self.base.time_s) && lives(window) == lives(&self.base)
+    }
+
+    /// Goes on until the budget is spent or something is found.
+    pub fn advance(&mut self, search: &mut WindowSearch) -> Revised {
+        while !search.engine.budget.is_exhausted() {
+            let Some(mut trial) = self.trial.take() else {
+                let Some(proposal) = self.proposals.pop_front() else {
+                    return Revised::Finished;
+                };
+                self.trial = self.start(search, proposal);
+                continue;
+            };
+            let highest = self.score - LEAST_GAIN - search.score(&trial.window) + trial.window.cost;
+            let progress = trial.window.fit_below(search.engine, &mut trial.steps, highest);
+            if progress == Progress::Unfinished && trial.steps > 0 {
+                self.trial = Some(trial);
+                continue;
+            }
+            if let Some(better) = self.conclude(search, trial) {
+                return Revised::Better(better);
+            }
+        }
+        Revised::Unfinished
+    }
+
+    fn start(&self, search: &mut WindowSearch, proposal: Proposal) -> Option<Trial> {
+        let born_s = self.base.snapshots.first().map_or(self.base.time_s, |s| s.time_s);
+        let mut window = self.base.clone();
+        let mut steps = TRIAL_STEPS;
+        let mut without = None;
+        match proposal {
+            Proposal::Same => {}
+            Proposal::Birth(at) => window.insert(Target::born(born_s), at, [0.0; 2]),
+            Proposal::Death(e) => {
+                without = Some(window.targets[e]);
+                window.remove(e);
+            }
+            Proposal::Move(rest, target, at) => {
+                window = *rest;
+                window.insert(target, at, [0.0; 2]);
+            }
+            Proposal::Restart => {
+                window = search.restarted(&window)?;
+                steps = CONVERGE_STEPS;
+            }
+        }
+        window.damping = 0.0;
+        Some(Trial { window, steps, without })
+    }
+
+    /// Compares a fitted trial. Returns it where it is better.
+    fn conclude(&mut self, search: &mut WindowSearch, trial: Trial) -> Option<Window> {
+        let Trial { window, without, .. } = trial;
+        let score = search.score(&window);
+        if !self.is_fitted {
+            (self.is_fitted, self.score, self.base) = (true, score, window);
+            return None;
+        }
+        if score < self.score - LEAST_GAIN {
+            return Some(window);
+        }
+        let moves = self
+            .proposals
+            .iter()
+            .filter(|p| matches!(p, Proposal::Move(..)))
+            .count();
+        if let Some(target) = without.filter(|_| moves < RELOCATED * MOVES) {
+            let peaks = search.residual_peaks(&window, 0.0);
+            for (_, at) in peaks.into_iter().take(MOVES) {
+                self.proposals
+                    .push_back(Proposal::Move(Box::new(window.clone()), target, at));
+            }
+        }
+        None
+    }
+}

@@ -1,0 +1,55 @@
+//! An emitter that the window follows, and whether it has gone dark.
+
+/// Frames from which a target's mean energy is known well enough to miss it, and over how many it is averaged.
+const FEW: f64 = 3.0;
+const MANY: f64 = 100.0;
+
+/// An emitter that the window follows.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Target {
+    /// Earlier frames do not hold it, s.
+    pub born_s: f64,
+    /// This frame and later ones do not hold it, s; it is forgotten with the last frame that does.
+    pub died_s: f64,
+    /// Mean energy of its frames, and their number up to the length of the memory.
+    pub mean_energy: f64,
+    pub frames: f64,
+    /// ln of the evidence that it has gone dark over that it has not, never below zero.
+    pub darkness: f64,
+}
+
+impl Target {
+    pub fn born(born_s: f64) -> Self {
+        Self {
+            born_s,
+            died_s: f64::INFINITY,
+            mean_energy: 0.0,
+            frames: 0.0,
+            darkness: 0.0,
+        }
+    }
+
+    /// Whether a frame may hold it.
+    pub fn is_in(&self, time_s: f64) -> bool {
+        self.born_s <= time_s && time_s < self.died_s
+    }
+
+    /// Takes the energy that a frame measured, with its variance, at `weight` of an independent draw of the fading. The evidence is
+    /// between no light and light that is exponentially distributed about its mean, which no fading exceeds by much in the dark.
+    pub fn weigh(&mut self, energy: f64, variance: f64, weight: f64) {
+        let std = variance.sqrt();
+        if self.frames >= FEW && self.mean_energy > 0.0 && std.is_finite() {
+            let z = energy / std - std / self.mean_energy;
+            // e^{z²/2}·Φ(z), by its asymptote where Φ underflows.
+            let tail = if z < -6.0 {
+                -1.0 / (z * (2.0 * std::f64::consts::PI).sqrt())
+            } else {
+                (0.5 * z * z).min(600.0).exp() * 0.5 * libm::erfc(-z * std::f64::consts::FRAC_1_SQRT_2)
+            };
+            let alive = ((2.0 * std::f64::consts::PI).sqrt() * std / self.mean_energy * tail).ln();
+            self.darkness = (self.darkness - weight * alive).max(0.0);
+        }
+        self.frames = (self.frames + 1.0).min(MANY);
+        self.mean_energy += (energy - self.mean_energy) / self.frames;
+    }
+}

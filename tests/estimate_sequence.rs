@@ -1,0 +1,171 @@
+//! The estimator `sequence` from outside: walks with fading, newcomers, people who leave, turn or stop, and a clock that jumps.
+
+use jiff::{SignedDuration, Timestamp};
+use ndarray::Array2;
+use oapwatch::estimate::{Config, Estimate, Estimator, build};
+use oapwatch::frame::Frame;
+use oapwatch::optics::{self, Camera, add_spot};
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use rand_distr::{Distribution, Normal};
+
+const MEAN_ENERGY_J: f64 = 7e-3;
+const RATE_HZ: f64 = 10.0;
+
+/// Where somebody is at a time, s; nowhere while dark.
+type Walk = fn(f64) -> Option<[f64; 2]>;
+
+/// Frames of people who walk and whose beams fade independently: exponentially distributed energies.
+struct Scene {
+    camera: Camera,
+    walks: Vec<Walk>,
+    rng: ChaCha8Rng,
+    next: u64,
+}
+
+impl Scene {
+    fn new(sigma_m: f64, walks: &[Walk]) -> Self {
+        let config = optics::Config {
+            spot_sigma_m: Some(sigma_m),
+            pixels: [32; 2],
+            noise_std_j: 1e-6,
+            ..Default::default()
+        };
+        Self {
+            camera: config.camera().expect("a camera"),
+            walks: walks.to_vec(),
+            rng: ChaCha8Rng::seed_from_u64(5),
+            next: 0,
+        }
+    }
+
+    fn estimator(&self) -> Box<dyn Estimator> {
+        let config = Config {
+            name: Some("sequence".to_owned()),
+            ..Default::default()
+        };
+        build(&config, &self.camera).expect("an estimator")
+    }
+
+    /// Those who shine at the newest frame.
+    fn truth(&self) -> Vec<[f64; 2]> {
+        let last_s = (self.next - 1) as f64 / RATE_HZ;
+        self.walks.iter().filter_map(|walk| walk(last_s)).collect()
+    }
+
+    fn frame(&mut self) -> Frame {
+        let time_s = self.next as f64 / RATE_HZ;
+        let noise = Normal::new(0.0, self.camera.noise_std_j).expect("noise is positive and finite");
+        let mut pixels = Array2::from_shape_simple_fn(self.camera.shape(), || noise.sample(&mut self.rng));
+        let buffer = pixels.as_slice_mut().expect("a fresh array is contiguous");
+        for at in self.walks.iter().filter_map(|walk| walk(time_s)) {
+            let energy_j = -MEAN_ENERGY_J * (1.0 - self.rng.random::<f64>()).ln();
+            add_spot(&self.camera, self.camera.to_sensor(at), energy_j, buffer);
+        }
+        self.next += 1;
+        Frame {
+            index: self.next - 1,
+            time: Timestamp::UNIX_EPOCH + SignedDuration::from_secs_f64(time_s),
+            pixels,
+            masked: None,
+        }
+    }
+
+    /// The answer to the last of so many frames.
+    fn run(&mut self, estimator: &mut dyn Estimator, frames: usize) -> Estimate {
+        let answers = (0..frames).map(|_| estimator.estimate(&self.frame()).expect("a usable frame"));
+        answers.last().expect("a frame")
+    }
+}
+
+/// Distance of each true position to the nearest emitter, m.
+fn misses(truth: &[[f64; 2]], found: &Estimate) -> Vec<f64> {
+    let nearest = |p: &[f64; 2]| {
+        let all = found.emitters.iter().map(|e| (p[0] - e.x_m).hypot(p[1] - e.y_m));
+        all.fold(f64::INFINITY, f64::min)
+    };
+    truth.iter().map(nearest).collect()
+}
+
+#[test]
+fn frames_together_separate_what_no_frame_can() {
+    // σ is 33 m on the ground: a pair 12 m apart is one spot, and a frame's bound on it is many metres.
+    let walks: [Walk; 3] = [
+        |t| Some([-20.0 + 0.8 * t, 10.0]),
+        |t| Some([-8.0 + 0.5 * t, 10.0 - 0.4 * t]),
+        |_| Some([60.0, -50.0]),
+    ];
+    let mut scene = Scene::new(4e-3, &walks);
+    let mut together = scene.estimator();
+    let found = scene.run(&mut *together, 60);
+    assert_eq!(found.emitters.len(), 3, "{:?}", found.emitters);
+    for (truth, miss) in scene.truth().iter().zip(misses(&scene.truth(), &found)) {
+        assert!(miss < 2.0, "{truth:?} is missed by {miss} m");
+    }
+    let velocity = found.emitters.iter().map(|e| e.velocity.expect("it is followed"));
+    let fastest = velocity.map(|v| v.vx_m_s.hypot(v.vy_m_s)).fold(0.0, f64::max);
+    assert!((0.4..1.4).contains(&fastest), "{fastest} m/s");
+}
+
+#[test]
+fn who_comes_is_seen_at_once_and_who_goes_is_gone_within_a_second() {
+    let walks: [Walk; 3] = [
+        |t| Some([-60.0 + t, 20.0]),
+        |t| (t >= 2.0).then_some([50.0, 50.0]),
+        |t| (t < 4.0).then_some([20.0, -70.0]),
+    ];
+    let mut scene = Scene::new(1e-3, &walks);
+    let mut together = scene.estimator();
+    assert_eq!(scene.run(&mut *together, 20).emitters.len(), 2);
+    assert_eq!(scene.run(&mut *together, 1).emitters.len(), 3);
+    assert_eq!(scene.run(&mut *together, 19).emitters.len(), 3);
+    let found = scene.run(&mut *together, 10);
+    assert_eq!(found.emitters.len(), 2);
+    assert!(misses(&scene.truth(), &found).iter().all(|m| *m < 0.1));
+}
+
+#[test]
+fn who_turns_round_or_stops_is_followed() {
+    let walks: [Walk; 2] = [
+        |t| Some([20.0 - (t - 3.0).abs(), 20.0]),
+        |t| Some([-50.0 + 1.4 * t.min(3.0), -20.0]),
+    ];
+    let mut scene = Scene::new(1e-3, &walks);
+    let mut together = scene.estimator();
+    scene.run(&mut *together, 30);
+    for _ in 0..30 {
+        let found = scene.run(&mut *together, 1);
+        assert_eq!(found.emitters.len(), 2);
+        let misses = misses(&scene.truth(), &found);
+        assert!(misses.iter().all(|m| *m < 0.3), "{misses:?} at frame {}", scene.next);
+    }
+}
+
+#[test]
+fn noise_is_no_newcomer_that_stays() {
+    let walks: [Walk; 4] = [
+        |t| Some([-60.0 + t, 20.0]),
+        |t| Some([50.0, 50.0 - t]),
+        |_| Some([20.0, -70.0]),
+        |t| Some([-70.0 - t, -60.0]),
+    ];
+    let mut scene = Scene::new(1e-3, &walks);
+    let mut together = scene.estimator();
+    let counts: Vec<usize> = (0..200).map(|_| scene.run(&mut *together, 1).emitters.len()).collect();
+    let wrong = counts.iter().filter(|n| **n != 4).count();
+    assert!(wrong <= 2, "{counts:?}");
+}
+
+#[test]
+fn a_clock_that_jumps_ends_the_memory() {
+    let walks: [Walk; 1] = [|t| Some([t, 0.0])];
+    let mut scene = Scene::new(1e-3, &walks);
+    let mut used = scene.estimator();
+    scene.run(&mut *used, 10);
+    let mut late = scene.frame();
+    late.time = Timestamp::UNIX_EPOCH - SignedDuration::from_secs(5);
+    let place = |e: &Estimate| e.emitters.iter().map(|e| [e.x_m, e.y_m]).collect::<Vec<_>>();
+    let found = place(&used.estimate(&late).expect("a usable frame"));
+    let mut new = scene.estimator();
+    assert_eq!(found, place(&new.estimate(&late).expect("a usable frame")));
+}
