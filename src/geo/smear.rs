@@ -66,8 +66,11 @@ mod tests {
             };
             let moved = at(0.5 * exposure_s) - at(-0.5 * exposure_s);
             let found = Vector2::from(smear.displacement_m(place));
-            // The flow is quadratic in the place: what a straight line misses is a fiftieth in a corner.
-            assert!((found - moved).norm() < 0.05 * moved.norm(), "{found} {moved}");
+            // The flow has a part quadratic in the place: what a linear one misses of it is 12 µm in a corner.
+            assert!(
+                (found - moved).norm() < 0.05 * smear.longest_m(&camera),
+                "{found} {moved}"
+            );
         }
     }
 }

@@ -189,6 +189,58 @@ async fn an_eavesdropper_comes_is_acknowledged_and_goes_and_a_restart_is_survive
     assert_eq!(page.errors(), Vec::<String>::new());
 }
 
+#[tokio::test]
+async fn a_picture_lies_below_a_platform_that_moves() {
+    let dir = tempfile::tempdir().expect("a folder");
+    let port = TcpListener::bind("127.0.0.1:0")
+        .and_then(|l| l.local_addr())
+        .expect("a free port")
+        .port();
+    let mut png = png::Encoder::new(
+        std::fs::File::create(dir.path().join("yard.png")).expect("a file"),
+        2,
+        2,
+    );
+    png.set_color(png::ColorType::Grayscale);
+    let mut writer = png.write_header().expect("a header");
+    writer.write_image_data(&[90, 200, 200, 90]).expect("four pixels");
+    writer.finish().expect("the picture is written");
+    let scene = concat!(env!("CARGO_MANIFEST_DIR"), "/config/scenes/flight.toml");
+    let config = dir.path().join("oapwatch.toml");
+    let text = format!(
+        "[source]\nscene = {scene:?}\n[api]\nlisten = \"127.0.0.1:{port}\"\n[api.background]\npicture = \"yard.png\"\n\
+         corners_m = [[-140.0, 100.0], [130.0, 140.0], [-140.0, -100.0]]\nattribution = \"surveyors\"\n"
+    );
+    std::fs::write(&config, text).expect("the config is written");
+    let _daemon = Daemon::start(&config);
+    let Some(mut page) = Browser::open(&dir.path().join("profile"), &format!("http://127.0.0.1:{port}/")).await else {
+        return;
+    };
+    let shown = [
+        (
+            "the picture is drawn",
+            "document.querySelectorAll('#map image[transform]').length === 1",
+        ),
+        (
+            "with whom it is by",
+            "document.querySelector('#map .attribution').textContent === 'surveyors'",
+        ),
+        (
+            "the platform's place and attitude are said",
+            "/^UAV at .* m, heading \\d+°/.test(document.getElementById('platform').textContent)",
+        ),
+        (
+            "users are verified on it",
+            "document.querySelectorAll('#map .beam.verified').length >= 3",
+        ),
+    ];
+    for (what, condition) in shown {
+        until(&mut page, what, condition).await;
+    }
+    page.screenshot("background").await;
+    assert_eq!(page.errors(), Vec::<String>::new());
+}
+
 /// Where pictures of the page go, if anybody wants them.
 fn pictures() -> Option<PathBuf> {
     std::env::var_os("OAPWATCH_TEST_PICTURES").map(PathBuf::from)

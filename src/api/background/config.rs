@@ -91,7 +91,7 @@ impl Config {
 }
 
 /// East and north, m, of a latitude and longitude, degrees, at the origin's height.
-pub(super) fn local_of(axes: &LocalAxes, [latitude_deg, longitude_deg]: [f64; 2]) -> [f64; 2] {
+pub fn local_of(axes: &LocalAxes, [latitude_deg, longitude_deg]: [f64; 2]) -> [f64; 2] {
     let height_m = axes.to_geodetic([0.0; 3]).height_m;
     let [x, y, _] = axes.to_local(Geodetic {
         latitude_deg,

@@ -1,14 +1,12 @@
 //! Map tiles of a folder or an MBTiles file (MBTiles 1.3), by zoom, column and row of the XYZ scheme (rows from the north).
 
-use std::fs::File;
-use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 
 use rusqlite::{Connection, OpenFlags, OptionalExtension};
 
 use super::config::Error;
-use super::raster_type;
+use super::raster::{raster_type, read_bounded};
 
 /// Bytes of a tile: those of 256 or 512 pixels take some tens of kB.
 const MOST_BYTES: u64 = 1 << 20;
@@ -100,17 +98,6 @@ impl Tiles {
             }
         }
     }
-}
-
-/// The bytes of a regular file, `None` where there are more than `most`.
-pub(super) fn read_bounded(path: &Path, most: u64) -> std::io::Result<Option<Vec<u8>>> {
-    let file = File::open(path)?;
-    if !file.metadata()?.is_file() {
-        return Err(std::io::Error::other("no regular file"));
-    }
-    let mut bytes = Vec::new();
-    file.take(most + 1).read_to_end(&mut bytes)?;
-    Ok((bytes.len() as u64 <= most).then_some(bytes))
 }
 
 #[cfg(test)]

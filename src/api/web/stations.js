@@ -19,7 +19,7 @@ export function poseWords(pose) {
 export function viewWords({ nadir_m: nadir, z_m: z, heading_deg: heading, roll_deg: roll, pitch_deg: pitch, pose_age_s: age }) {
   const whole = (v) => `${Math.round(v) + 0}`.replace("-", "−");
   const tilt = Math.max(Math.abs(roll), Math.abs(pitch)) >= 0.5 ? `, roll ${whole(roll)}°, pitch ${whole(pitch)}°` : "";
-  return `UAV above ${nadir.map(whole).join(", ")} m, at ${whole(z)} m, heading ${whole(heading)}°${tilt}${age > 0.5 ? `, pose ${lasting(age * 1000)} old` : ""}`;
+  return `UAV at ${[...nadir, z].map(whole).join(", ")} m, heading ${whole(heading)}°${tilt}${age > 0.5 ? `, pose ${lasting(age * 1000)} old` : ""}`;
 }
 
 export function showStations(stations, isHub) {
