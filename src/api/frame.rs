@@ -7,6 +7,7 @@ use axum::response::{IntoResponse, Response};
 use serde::Deserialize;
 
 use super::extract::{Query, within};
+use super::picture_cache::Look;
 use super::problem::Problem;
 use super::state::State;
 use super::{conditional, picture, positions};
@@ -25,9 +26,14 @@ pub struct PictureQuery {
     scale: Option<usize>,
     /// Whether detections are drawn; true when left out
     detections: Option<bool>,
+    /// Whether the model and the residual are drawn beside the frame, each anew for the picture; false when left out
+    fit: Option<bool>,
 }
 
 /// The latest frame as a picture, +x to the right and +y up, with its detections drawn
+///
+/// With `fit` the model stands beside it, in the same colours, and the residual: data minus model in standard deviations of a pixel's
+/// noise, from -5 (blue) over 0 (black) to 5 (orange).
 #[utoipa::path(get, path = "/v1/frame.png", tag = "positions", params(PictureQuery),
     responses(
         (status = 200, description = "The picture", body = Vec<u8>, content_type = "image/png"),
@@ -50,24 +56,36 @@ pub async fn frame_png(
     };
     let frame = latest.snapshot.frame.clone().ok_or_else(none)?;
     let (ny, nx) = frame.pixels.dim();
-    let side = nx.max(ny).max(1);
+    let with_fit = query.fit.unwrap_or(false) && latest.snapshot.camera.shape() == (ny, nx);
+    let width = if with_fit { 3 * nx } else { nx };
+    let side = width.max(ny).max(1);
     let scale = match query.scale {
         Some(scale) => within("scale", scale, 1, 64)?.min((MAX_SIDE / side).max(1)),
-        None => picture::scale_for(&frame, DEFAULT_SIDE),
+        None => picture::scale_for(&frame, DEFAULT_SIDE).min((MAX_SIDE / side).max(1)),
     };
-    let look = (scale, query.detections.unwrap_or(true));
+    let look = Look {
+        scale,
+        detections: query.detections.unwrap_or(true),
+        fit: with_fit,
+    };
     let (seq, png) = match state.pictures.get(&latest, look) {
         Some(drawn) => drawn,
         None => {
             let published = latest.clone();
+            let fitter = state.fitter.clone();
             let draw = move || {
                 let snapshot = &published.snapshot;
-                let marks = if look.1 {
+                let marks = if look.detections {
                     picture::marks_of(snapshot)
                 } else {
                     Vec::new()
                 };
-                picture::png(&frame, &snapshot.camera, &marks, look.0)
+                let camera = &snapshot.camera;
+                let fit = look.fit.then(|| fitter.fit(camera, (*frame).clone()));
+                match fit.flatten() {
+                    Some(fit) => picture::fit_png(&fit, camera, &marks, look.scale),
+                    None => picture::png(&frame, camera, &marks, look.scale),
+                }
             };
             let drawn = tokio::task::spawn_blocking(draw).await.expect("drawing does not panic");
             let png = drawn.map_err(|e| Problem::new(StatusCode::INTERNAL_SERVER_ERROR, e.to_string()))?;

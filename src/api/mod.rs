@@ -56,8 +56,8 @@ pub use picture::frame_png;
 pub use pose_status::{PoseNow, PoseStatus};
 pub use server::{Error, Server};
 pub use snapshot::{
-    ClaimsStatus, FrameCounts, JournalStatus, Latency, Snapshot, SourceState, SourceStatus, StationPlace, StationPose,
-    StationState, StationStatus, Status, ViewStatus,
+    ClaimsStatus, FitStatus, FrameCounts, JournalStatus, Latency, Snapshot, SourceState, SourceStatus, StationPlace,
+    StationPose, StationState, StationStatus, Status, ViewStatus,
 };
 pub use state::{Acknowledged, Command, State, ZonesRefused};
 pub use tokens::TokenError;

@@ -10,8 +10,15 @@ use super::feed::Published;
 /// A picture is drawn anew at most this often, however many viewers ask.
 const REDRAW: Duration = Duration::from_millis(100);
 
-/// Scale, and whether detections are drawn.
-pub type Look = (usize, bool);
+/// What is drawn.
+#[derive(Clone, Copy, PartialEq)]
+pub struct Look {
+    /// Picture pixels a sensor pixel.
+    pub scale: usize,
+    pub detections: bool,
+    /// Whether model and residual stand beside the frame.
+    pub fit: bool,
+}
 
 /// The pictures of one frame.
 #[derive(Default)]

@@ -37,6 +37,8 @@ pub struct Status {
     pub journal: JournalStatus,
     pub webhooks: Vec<EndpointStatus>,
     pub estimator: String,
+    /// How the estimator explains frames; null before the first one, and at a hub.
+    pub fit: Option<FitStatus>,
     /// Alerts not cleared, by kind.
     pub alerts_open: BTreeMap<AlertKind, u64>,
     /// Half-widths of the watched area on the ground of a level camera over the origin, m.
@@ -46,6 +48,21 @@ pub struct Status {
     /// The access points of a hub.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub stations: Vec<StationStatus>,
+}
+
+/// How the estimator explains the latest usable frame.
+#[derive(Clone, Debug, Serialize, utoipa::ToSchema)]
+pub struct FitStatus {
+    /// Weighted squared residual per degree of freedom; near 1 where the model explains the frame; null of an estimator without it.
+    pub reduced_chi2: Option<f64>,
+    /// Share of a spot's light by which spots were taken to differ from the model; 0 where it explains the frame.
+    pub spot_error: f64,
+    /// What to do where the spot's shape is the reason in most of the latest frames.
+    pub hint: Option<&'static str>,
+}
+
+impl FitStatus {
+    pub const CALIBRATE: &'static str = "the spot is not what the config says: run oapwatch calibrate";
 }
 
 /// What the camera sees of the ground in the latest frame.

@@ -157,13 +157,7 @@ impl Compute {
                 metrics::counter!(metric::FRAMES_CUT_SHORT).increment(u64::from(estimate.is_cut_short));
                 metrics::gauge!(metric::REDUCED_CHI2).set(estimate.reduced_chi2);
                 metrics::gauge!(metric::SPOT_ERROR).set(estimate.spot_error);
-                if estimate.spot_error > 0.0 && self.camera.spot_error.is_none() && !s.has_warned_of_spot {
-                    s.has_warned_of_spot = true;
-                    tracing::warn!(
-                        spot_error = estimate.spot_error,
-                        "the spot is not what the config says: run `oapwatch calibrate`"
-                    );
-                }
+                s.explained(estimate, self.camera.spot_error.is_some());
                 if s.last_good.is_none() {
                     tracing::info!(frame = frame.index, "the first usable frame was processed");
                 }
@@ -327,6 +321,7 @@ impl Compute {
             },
             webhooks: self.webhooks.status(),
             estimator: self.pipeline.estimator().to_owned(),
+            fit: s.fit.clone(),
             alerts_open: s.open_by_kind(),
             field_of_view_m: self
                 .camera

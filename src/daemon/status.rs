@@ -8,12 +8,15 @@ use std::time::{Duration, Instant};
 use jiff::Timestamp;
 use metrics::{counter, gauge};
 
-use crate::api::{FrameCounts, Latency, Snapshot, SourceState};
+use crate::api::{FitStatus, FrameCounts, Latency, Snapshot, SourceState};
+use crate::estimate::Estimate;
 use crate::metric;
 use crate::monitor::{Alert, AlertEvent, AlertEventKind, AlertKind, AlertState, PositionStatus, Report};
 
 /// Frames over which rate and latency are computed.
 const WINDOW: usize = 128;
+/// Frames over which it is judged whether spots differ from the model: a single one may by chance.
+const SPOT_FRAMES: u32 = 10;
 /// Without a frame for this long the rate is 0.
 const STALE: Duration = Duration::from_secs(2);
 
@@ -27,6 +30,10 @@ pub(super) struct State {
     pub fault: Option<String>,
     /// Whether it was said that the spots differ from the model.
     pub has_warned_of_spot: bool,
+    /// How the latest usable frame was explained.
+    pub fit: Option<FitStatus>,
+    /// Frames whose spots differ from the model less those whose spots do not, within 0 and [`SPOT_FRAMES`].
+    misshapen: u32,
     pub source: SourceState,
     pub latencies: VecDeque<Duration>,
     pub arrivals: VecDeque<Instant>,
@@ -53,6 +60,8 @@ impl State {
             last_good: None,
             fault: None,
             has_warned_of_spot: false,
+            fit: None,
+            misshapen: 0,
             source: SourceState::Starting,
             latencies: VecDeque::with_capacity(WINDOW),
             arrivals: VecDeque::with_capacity(WINDOW),
@@ -67,6 +76,24 @@ impl State {
 
     pub fn arrived(&mut self, at: Instant) {
         push(&mut self.arrivals, at);
+    }
+
+    /// Takes how a frame was explained; `is_known`: whether the spot error is configured.
+    pub fn explained(&mut self, estimate: &Estimate, is_known: bool) {
+        self.misshapen = match estimate.spot_error > 0.0 && !is_known {
+            true => (self.misshapen + 1).min(SPOT_FRAMES),
+            false => self.misshapen.saturating_sub(1),
+        };
+        let is_misshapen = 2 * self.misshapen > SPOT_FRAMES;
+        self.fit = Some(FitStatus {
+            reduced_chi2: Some(estimate.reduced_chi2).filter(|c| c.is_finite()),
+            spot_error: estimate.spot_error,
+            hint: is_misshapen.then_some(FitStatus::CALIBRATE),
+        });
+        if is_misshapen && !self.has_warned_of_spot {
+            self.has_warned_of_spot = true;
+            tracing::warn!(spot_error = estimate.spot_error, "{}", FitStatus::CALIBRATE);
+        }
     }
 
     pub fn took(&mut self, time: Duration) {

@@ -45,6 +45,7 @@ pub fn of(chain: &mut Chain, facts: Facts, now: Timestamp) -> Snapshot {
         journal: journal(facts.journal),
         webhooks: facts.webhooks,
         estimator: "fleet".to_owned(),
+        fit: None,
         alerts_open: chain.open_by_kind(),
         field_of_view_m,
         view: None,

@@ -391,6 +391,7 @@ pub fn snapshot(number: u64) -> api::Snapshot {
             },
             webhooks: Vec::new(),
             estimator: "fit".into(),
+            fit: None,
             alerts_open: BTreeMap::new(),
             field_of_view_m: [125.0, 125.0],
             view: None,

@@ -65,6 +65,7 @@ fn snapshot() -> api::Snapshot {
             },
             webhooks: Vec::new(),
             estimator: "ml".into(),
+            fit: None,
             alerts_open: BTreeMap::new(),
             field_of_view_m: [125.0, 125.0],
             view: None,

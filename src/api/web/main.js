@@ -217,6 +217,7 @@ function notices() {
   if (source.kind === "simulator") texts.push("Simulation: these frames are computed, no camera is watched.");
   if (source.kind === "fleet" && !latest.status.stations?.length) texts.push("No access point has said anything yet.");
   if (source.kind === "replay") texts.push("Replay: these frames come from a recording.");
+  if (latest.status.fit?.hint) texts.push(`${latest.status.fit.hint}. Until then positions are less precise, and faint beams beside bright ones are not seen.`.replace(/^./, (c) => c.toUpperCase()));
   if (journal.place === "memory") texts.push("Journal in memory: a restart of the monitor forgets all alerts. [journal] path in its config keeps them.");
   const list = $("notices");
   list.hidden = !texts.length;
@@ -235,6 +236,7 @@ function facts() {
     ["Source", `${s.source.kind}, ${stalled() ? "silent" : s.source.state}`, s.source.state !== "running" || stalled() ? "bad" : ["v4l2", "fleet"].includes(s.source.kind) ? "" : "warn"],
     ["Frames", `${s.source.rate_hz.toFixed(1)} /s`],
     ["Latency", `${micros(s.latency.median_us)}`, "", `99 % within ${micros(s.latency.p99_us)}`],
+    ["Fit", s.fit?.reduced_chi2 == null ? "none" : `χ² ${s.fit.reduced_chi2.toFixed(2)}`, s.fit?.hint ? "warn" : "", s.fit?.spot_error ? `spots differ from the model by ${(100 * s.fit.spot_error).toFixed(1)} % of their light` : "squared residual a degree of freedom: near 1 where the model explains the frame"],
     ["Dropped", `${s.frames.dropped}`, "", `${s.frames.captured} captured, ${s.frames.unusable} unusable`],
     ["Claims", s.claims.users || claimAge !== null ? `${s.claims.users} users${claimAge === null ? "" : `, ${lasting(claimAge)} ago`}` : "none", "", `${s.claims.accepted} accepted, ${s.claims.malformed} malformed${s.claims.log ? `, from ${s.claims.log}` : ""}`],
     ["Journal", s.journal.healthy ? (s.journal.place === "memory" ? "memory" : "on disk") : "failing", s.journal.healthy ? (s.journal.place === "memory" ? "warn" : "") : "bad", s.journal.fault ?? s.journal.place],
@@ -253,13 +255,27 @@ function facts() {
 let fetching = false;
 let shownFrame = null;
 let url = null;
+// The residual takes a fit of its own: seldom anew.
+const RESIDUAL_MS = 2000;
+let shownAt = 0;
+let withFit = false;
+$("residual").addEventListener("click", () => {
+  withFit = !withFit;
+  shownFrame = null;
+  shownAt = 0;
+  $("residual").setAttribute("aria-pressed", withFit);
+  $("fit-words").hidden = !withFit;
+  $("sensor").classList.toggle("with-fit", withFit);
+  frame();
+});
 async function frame() {
-  const seen = latest && latest.frame !== shownFrame && linkState === "live";
+  const seen = latest && latest.frame !== shownFrame && linkState === "live" && !(withFit && performance.now() - shownAt < RESIDUAL_MS);
   if (!seen || fetching || document.hidden || timeline.at !== null) return;
   fetching = true;
   try {
     const number = latest.frame;
-    const picture = await (await link.request("/v1/frame.png")).blob();
+    const picture = await (await link.request(withFit ? "/v1/frame.png?fit=true" : "/v1/frame.png")).blob();
+    shownAt = performance.now();
     const before = url;
     url = URL.createObjectURL(picture);
     $("frame").src = url;

@@ -1,5 +1,6 @@
 //! What a template keeps to whatever the frames say: a prior that fades at the edge, a centre, a support with all its light.
 
+use super::statistics::HALO;
 use super::template_model::TemplateModel;
 use crate::optics::Camera;
 
@@ -48,6 +49,17 @@ pub fn prior(model: &TemplateModel, is_first: bool) -> Vec<f64> {
     prior
 }
 
+/// Where light near the edge of the support is looked at, share of its radius: inside of where the prior fades.
+const EDGE: [f64; 2] = [0.6, 0.8];
+
+/// The share of a spot's light by which it differs from a template that ends at the edge of its support: the light near the edge, as even
+/// over a spot's width as a spot's own, over the halo's height there. Real tails fall no slower than the halo does beyond.
+pub fn light_left_out(camera: &Camera, model: &TemplateModel) -> f64 {
+    let distance = 0.5 * (EDGE[0] + EDGE[1]) * model.radius_m() / camera.spot_sigma_m;
+    let height = 1.0 / (1.0 + (distance / HALO).powi(2));
+    light_at_edge(camera, model) / (norm(camera, model).powi(2) * height)
+}
+
 /// Largest light of a unit-energy spot in a pixel near the edge of the support, of eight directions: a tail may point one way, and
 /// the mean of many splines is free of their noise.
 pub fn light_at_edge(camera: &Camera, model: &TemplateModel) -> f64 {
@@ -56,7 +68,7 @@ pub fn light_at_edge(camera: &Camera, model: &TemplateModel) -> f64 {
     for j in 0..n {
         for i in 0..n {
             let (x, y) = (model.knot(i), model.knot(j));
-            if (0.6..0.8).contains(&(x.hypot(y) / model.radius_m())) {
+            if (EDGE[0]..EDGE[1]).contains(&(x.hypot(y) / model.radius_m())) {
                 let octant = usize::from(x > 0.0) + 2 * usize::from(y > 0.0) + 4 * usize::from(x.abs() > y.abs());
                 sum[octant] += model.coefficients[j * n + i];
                 count[octant] += 1.0;

@@ -22,8 +22,11 @@ pub const FIRST_RADIUS: f64 = 6.0;
 const GROWTH: f64 = 1.5;
 /// Most splines a side: what a matrix of them costs in each round.
 const MOST_SPLINES: usize = 97;
-/// Light at the edge that matters: of the brightest spot, in standard deviations of one pixel.
-const EDGE_LIGHT: f64 = 0.3;
+/// Largest half of the support, half sensors: spots near an edge show their tails as far as the other edge.
+const WIDEST: f64 = 1.8;
+/// Light at the edge that matters: of the brightest spot, in standard deviations of one pixel. The tails of five spots at this height add
+/// up to a quarter of an emitter's threshold; more leaves them to the spot error, less takes longer.
+const EDGE_LIGHT: f64 = 0.1;
 /// Support of what changes over the field, σ: aberrations that change widely are near the core.
 const FIELD_RADIUS: f64 = 7.0;
 /// Default number of rounds, and the relative fall of χ² per degree of freedom below which there are no more.
@@ -329,7 +332,7 @@ impl<'a> Learner<'a> {
     /// Rounds until χ² settles; the support grows while there is light at its edge.
     pub fn run(&mut self, rounds: usize, progress: &mut dyn FnMut(Round)) {
         let mut before = f64::INFINITY;
-        let widest = 0.9 * self.camera.x.half_width().max(self.camera.y.half_width());
+        let widest = WIDEST * self.camera.x.half_width().max(self.camera.y.half_width());
         for round in 0..rounds {
             self.fit(if round == 0 { 15 } else { 6 });
             if self.patches.is_empty() {

@@ -264,6 +264,7 @@ pub fn learn(
     let spot_error = variance
         .spot_error
         .max(1.0 / information)
+        .max(constraints::light_left_out(camera, &last.model) / LEFT)
         .min(Camera::LARGEST_SPOT_ERROR);
     let gain_scatter = maps.as_ref().and_then(pixel_maps::gain_scatter);
     let calibration = Calibration {
@@ -309,6 +310,9 @@ pub fn learn(
 }
 
 const FLASH_PASSES: usize = 3;
+/// Significance that light beyond the learned support keeps under the weights of a spot error, as in the estimator: well below an
+/// emitter's threshold.
+const LEFT: f64 = 2.0;
 /// Degrees that are tried in turn while the held-out frames gain by them.
 const FIELD_DEGREES: [usize; 3] = [2, 3, 4];
 const FIELD_ROUNDS: usize = 4;

@@ -11,7 +11,7 @@ use crate::stats::median;
 /// Rings around spots, σ, within each of which the template's error is measured.
 const RINGS: [f64; 6] = [0.0, 1.5, 3.0, 5.0, 8.0, 12.0];
 /// The halo that a spot error is a share of: half-width at half its height, σ. That of the estimator's noise model.
-const HALO: f64 = 3.0;
+pub const HALO: f64 = 3.0;
 /// Standard deviations from which a figure counts.
 const SIGNIFICANT: f64 = 3.0;
 /// Residuals beyond this many σ are outliers, with what a template that is this wrong would add.

@@ -3,10 +3,12 @@
 //! A stranger stands beside one user; a lens makes the same rings, tails and ghosts beside all. The share of its light by which a spot
 //! misses the model at an offset is therefore taken to be what three quarters of the bright spots show there at least.
 
+use crate::estimate::model::bases::Bases;
 use crate::estimate::model::halo;
 use crate::estimate::model::hypothesis::{Hypothesis, PointSource};
 use crate::estimate::model_order::candidate::Candidate;
 use crate::estimate::model_order::proposals::disjoint_close_pairs;
+use crate::estimate::model_order::ring_misfit::Rings;
 use crate::estimate::model_order::search::Search;
 
 /// Offsets at which spots are compared: their spacing and the largest along an axis, σ.
@@ -26,6 +28,8 @@ const MAX_LEFT: f64 = 0.35;
 const MAX_LEFT_OF_ONE: f64 = 0.5;
 /// Share of the spots that a misfit is common to, at an offset and in all. Half agree by chance where a crowd is not resolved yet.
 const COMMON: f64 = 0.75;
+/// Spots nearer to the sensor's middle than this share of the farthest one's distance show little of a misfit that grows with it.
+const LEAST_SCALE: f64 = 0.3;
 /// Other bright spots within [`NEAR`] σ of half of the spots, up to which these are no crowd.
 const MAX_NEAR: usize = 1;
 const NEAR: f64 = 5.0;
@@ -40,6 +44,9 @@ pub(crate) const MAX_SPOT_ERROR: f64 = 0.1;
 /// discs, Moffat profiles, defocus, coma and astigmatism up to 0.06.
 const MAX_CORE: f64 = 0.1;
 
+/// Width of a sensor, σ, up to which one or two spots show no shape beside a width: on narrower ones spots are all core. Smaller takes melted
+/// spots of another width for a lens's, larger leaves two spots of a lens on 20 × 20 pixels to invented sources.
+const NARROW: f64 = 8.5;
 /// Sources nearer than this to a brighter one, σ, may be a part of its spot whatever their energy.
 pub(crate) const CORE: f64 = 2.5;
 /// Relative difference up to which the distances between the sources of two pairs are alike.
@@ -93,47 +100,94 @@ pub(crate) fn distance2(a: [f64; 2], b: [f64; 2]) -> f64 {
     (a[0] - b[0]).powi(2) + (a[1] - b[1]).powi(2)
 }
 
-/// The spot error that a fitted hypothesis of at least `least` bright spots shows, 0 where their residuals have nothing in common.
-pub(crate) fn common_misfit(search: &mut Search, candidate: &mut Candidate, least: usize) -> f64 {
+/// Whether spots are all core on this sensor.
+pub(crate) fn is_narrow(bases: &Bases) -> bool {
+    bases.axes().iter().any(|b| b.edges[b.n] - b.edges[0] < NARROW)
+}
+
+/// The spot error that a fitted hypothesis shows: by rings around its bright spots, or offset by offset where these are `least` or more. 0
+/// where their residuals have nothing in common. `is_explained`: whether more sources explain the frame.
+pub(crate) fn common_misfit(search: &mut Search, candidate: &mut Candidate, least: usize, is_explained: bool) -> f64 {
     let (mx, my) = (search.compressed().mx, search.compressed().my);
     let bases = search.context.bases;
     let norm = halo::spot_norm(bases);
-    let residual = &candidate.evaluation(&mut search.context).residual;
-    search.matched_filter.respond(residual, mx, my);
+    let residual = candidate.evaluation(&mut search.context).residual.clone();
+    search.matched_filter.respond(&residual, mx, my);
     let filter = &*search.matched_filter;
     let sources = &candidate.sources;
     let brightest = sources.iter().fold(0.0, |m: f64, s| m.max(s.a));
     let mut bright: Vec<&PointSource> = sources.iter().filter(|s| s.a > BRIGHT * brightest).collect();
     bright.sort_by(|a, b| b.a.total_cmp(&a.a));
     let near = |s: &&PointSource| bright.iter().filter(|t| distance2(s.u, t.u) < NEAR * NEAR).count() - 1;
-    if bright.len() < least || 2 * bright.iter().filter(|s| near(s) > MAX_NEAR).count() > bright.len() {
+    if bright.is_empty() || 2 * bright.iter().filter(|s| near(s) > MAX_NEAR).count() > bright.len() {
         return 0.0;
     }
     bright.truncate(MAX_SPOTS);
+    let rings = Rings {
+        axes: bases.axes(),
+        residual: &residual,
+        stride: mx,
+        is_masked: &search.frame.is_masked,
+        norm,
+    };
+    let ring = match is_narrow(bases) {
+        true => None,
+        false => rings.common(&bright, CORE, is_explained),
+    };
+    let ring = match ring {
+        Some((largest, core)) if core < MAX_CORE => (largest / LEFT).min(MAX_SPOT_ERROR),
+        _ => 0.0,
+    };
+    if bright.len() < least {
+        return ring;
+    }
     let ends = bases.axes().map(|b| [b.edges[0], b.edges[b.n]]);
     let middle = ends.map(|[low, high]| 0.5 * (low + high));
-    let radial = |s: &&PointSource| {
-        let d = [0, 1].map(|k| s.u[k] - middle[k]);
-        let length = d[0].hypot(d[1]);
-        if length > 0.0 {
-            d.map(|v| v / length)
-        } else {
-            [1.0, 0.0]
-        }
+    let from_middle = |s: &PointSource| [0, 1].map(|k| s.u[k] - middle[k]);
+    let far = bright
+        .iter()
+        .map(|s| from_middle(s).map(|v| v * v).iter().sum::<f64>().sqrt())
+        .fold(f64::MIN_POSITIVE, f64::max);
+    let turned = |axis: [f64; 2]| {
+        bright
+            .iter()
+            .map(|s| View {
+                spot: s,
+                axis,
+                scale: 1.0,
+            })
+            .collect::<Vec<View>>()
     };
-    let views = |turn: &dyn Fn(&&PointSource) -> [f64; 2]| bright.iter().map(|s| (*s, turn(s))).collect::<Vec<View>>();
-    // Along the sensor's axes; along each spot's direction from the sensor's middle, as for coma; and each spot with itself turned by half a
-    // turn, as few spots have little else to be compared with.
-    let along_axes = views(&|_| [1.0, 0.0]);
-    let mirrored = [along_axes.clone(), views(&|_| [-1.0, 0.0])].concat();
-    [along_axes, views(&radial), mirrored]
+    // Along the sensor's axes; along each spot's direction from the sensor's middle and growing with the distance from it, as coma does; and
+    // each spot with itself turned by half a turn, as few spots have little else to be compared with.
+    let along_axes = turned([1.0, 0.0]);
+    let radial = bright.iter().filter_map(|s| {
+        let [x, y] = from_middle(s);
+        let length = x.hypot(y);
+        let scale = length / far;
+        (scale > LEAST_SCALE).then(|| View {
+            spot: s,
+            axis: [x / length, y / length],
+            scale,
+        })
+    });
+    let radial: Vec<View> = radial.collect();
+    let mirrored = [along_axes.clone(), turned([-1.0, 0.0])].concat();
+    [along_axes, radial, mirrored]
         .iter()
         .map(|views| compare(views, sources, norm, ends, |u| filter.response_at(u)))
-        .fold(0.0, f64::max)
+        .fold(ring, f64::max)
 }
 
-/// A spot and the direction that its offsets are taken along.
-type View<'a> = (&'a PointSource, [f64; 2]);
+/// A spot as it is compared.
+#[derive(Clone, Copy)]
+struct View<'a> {
+    spot: &'a PointSource,
+    /// The direction that its offsets are taken along.
+    axis: [f64; 2],
+    /// Its share of the common misfit, 1 of the spot that has most.
+    scale: f64,
+}
 
 fn compare(
     views: &[View],
@@ -154,7 +208,8 @@ fn compare(
                 continue;
             }
             values.clear();
-            for (i, (spot, [c, s])) in views.iter().enumerate() {
+            for (i, view) in views.iter().enumerate() {
+                let (spot, [c, s]) = (view.spot, view.axis);
                 let u = [
                     spot.u[0] + c * offset[0] - s * offset[1],
                     spot.u[1] + s * offset[0] + c * offset[1],
@@ -165,9 +220,9 @@ fn compare(
                 let own = spot.a * halo::height(d2);
                 let is_own = sources
                     .iter()
-                    .all(|t| std::ptr::eq(t, *spot) || t.a * halo::height(distance2(t.u, u)) < own);
+                    .all(|t| std::ptr::eq(t, spot) || t.a * halo::height(distance2(t.u, u)) < own);
                 if let Some(r) = response(u).filter(|_| is_own) {
-                    values.push((r / (spot.a * norm), r, i));
+                    values.push((r / (spot.a * norm * view.scale), r, i));
                 }
             }
             // In a crowd few spots have an offset to themselves, and a few agree by chance.
@@ -191,7 +246,7 @@ fn compare(
             let is_visible = values.iter().any(|v| v.1.abs() > VISIBLE);
             for &(_, r, i) in &values {
                 if is_visible {
-                    let t = common * views[i].0.a * norm;
+                    let t = common * views[i].spot.a * norm * views[i].scale;
                     sums[i][0] += r * r - 1.0;
                     sums[i][1] += r * t;
                     sums[i][2] += t * t;

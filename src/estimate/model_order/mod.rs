@@ -16,5 +16,6 @@ mod proposals_test;
 pub mod pruning;
 pub mod refine;
 pub mod reweighting;
+pub mod ring_misfit;
 pub mod search;
 pub mod spot_error;

@@ -8,7 +8,7 @@ use crate::estimate::model::halo::{Halo, height, spot_norm};
 use crate::estimate::model::hypothesis::{Hypothesis, Nuisances, PointSource, Width};
 use crate::estimate::model_order::candidate::Candidate;
 use crate::estimate::model_order::common_misfit::{
-    CORE, MAX_SPOT_ERROR, are_pairs_alike, bright_spots, common_misfit, distance2,
+    CORE, MAX_SPOT_ERROR, are_pairs_alike, bright_spots, common_misfit, distance2, is_narrow,
 };
 use crate::estimate::model_order::maximum_likelihood::refit_reweighted;
 use crate::estimate::model_order::search::{Search, SearchSpace};
@@ -27,9 +27,6 @@ const HIGH_PEAK: f64 = 0.2;
 /// something in common.
 const LEAST_SPOTS: usize = 3;
 const CHANCE: f64 = 5.0;
-/// Width of a sensor, σ, up to which one or two spots show no shape beside a width: on narrower ones spots are all core. Smaller takes melted
-/// spots of another width for a lens's, larger leaves two spots of a lens on 20 × 20 pixels to invented sources.
-const NARROW: f64 = 8.5;
 /// Share of the variance that the halo of other spots adds to a position: their misfit is smooth across a spot, while the weights must hold
 /// at its worst place. Found from Airy discs at SNR 1000, the kind of spot whose positions others move most.
 const POSITION_SHARE: f64 = 0.1;
@@ -67,13 +64,15 @@ pub(crate) fn inspect_shape(
     budget: &mut WorkBudget,
 ) -> Shape {
     let is_explained = excess < MOST_EXCESS;
-    let is_narrow = space.bases.axes().iter().any(|b| b.edges[b.n] - b.edges[0] < NARROW);
+    let is_narrow = is_narrow(&space.bases);
     let has_width = hypothesis.nuisances.width != Width::Known;
     let (merged, separate) = (bright_spots(hypothesis, true), bright_spots(hypothesis, false));
     let mut alternatives = match is_explained {
         false => vec![merged, separate],
         true if has_width || are_pairs_alike(hypothesis) => vec![merged],
-        true if separate.len() >= LEAST_SPOTS && separate.len() < hypothesis.sources.len() => vec![separate],
+        true if (!is_narrow || separate.len() >= LEAST_SPOTS) && separate.len() < hypothesis.sources.len() => {
+            vec![separate]
+        }
         true => return Shape::AsModelled,
     };
     compressed.load(frame, &space.bases.x, &space.bases.y);
@@ -100,7 +99,7 @@ pub(crate) fn inspect_shape(
         } else {
             1
         };
-        let error = common_misfit(&mut search, &mut candidate, least);
+        let error = common_misfit(&mut search, &mut candidate, least, is_explained);
         if error > 0.0 {
             return Shape::Different(error, candidate.into_hypothesis());
         }

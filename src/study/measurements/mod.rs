@@ -22,13 +22,22 @@ pub struct Measurement {
     pub name: &'static str,
     /// Stories (devices of a calibration, frames of a format, walks of a cell), unless another number is asked for.
     pub stories: u64,
-    run: fn(stories: u64, seed: u64) -> Measured,
+    run: Run,
+}
+
+enum Run {
+    Whole(fn(stories: u64, seed: u64) -> Measured),
+    /// Of the rows that are named.
+    Rows(fn(stories: u64, seed: u64, only: &[String]) -> Measured),
 }
 
 impl Measurement {
-    /// Measures `stories` stories, whose seeds begin with `seed`.
-    pub fn run(&self, stories: u64, seed: u64) -> Measured {
-        (self.run)(stories, seed)
+    /// Measures `stories` stories, whose seeds begin with `seed`; where a measurement has rows, those that `only` names.
+    pub fn run(&self, stories: u64, seed: u64, only: &[String]) -> Measured {
+        match self.run {
+            Run::Whole(run) => run(stories, seed),
+            Run::Rows(run) => run(stories, seed, only),
+        }
     }
 }
 
@@ -49,12 +58,26 @@ pub const ALL: &[Measurement] = &[
     measurement("shadow", 10, pixels::shadows),
     measurement("flights", 10, flights::flights),
     measurement("calibration", 5, calibration::error_left),
-    measurement("lens", 40, lens::lenses),
+    rows("lens", 40, lens::uncalibrated),
+    rows("lens-calibrated", 40, lens::calibrated),
+    rows("lens-alerts", 30, lens::honest),
     measurement("sequence", 8, sequence::frames_together),
     measurement("smear", 100, smear::smears),
     measurement("formats", 200, formats::cost),
 ];
 
 const fn measurement(name: &'static str, stories: u64, run: fn(u64, u64) -> Measured) -> Measurement {
-    Measurement { name, stories, run }
+    Measurement {
+        name,
+        stories,
+        run: Run::Whole(run),
+    }
+}
+
+const fn rows(name: &'static str, stories: u64, run: fn(u64, u64, &[String]) -> Measured) -> Measurement {
+    Measurement {
+        name,
+        stories,
+        run: Run::Rows(run),
+    }
 }

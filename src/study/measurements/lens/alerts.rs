@@ -1,0 +1,54 @@
+//! Honest users through a lens that the config does not describe: nobody is to be alerted.
+
+use std::fmt::Write;
+
+use rayon::prelude::*;
+
+use super::super::measured::{Measured, exceptions};
+use crate::study::stories::pixels::{PixelStory, RATE_HZ, review};
+
+/// Spots on the story's pixels of 0.75 mm, as wide as its Gaussian of 1 mm.
+const SPOTS: [(&str, &str); 6] = [
+    ("Gaussian", ""),
+    ("Airy disc", "kind = \"airy\"\nfirst_zero_m = 2.9e-3"),
+    ("Moffat, β 2.5", "kind = \"moffat\"\ncore_m = 2.05e-3\nindex = 2.5"),
+    ("defocus disc", "kind = \"defocus\"\nradius_m = 1.8e-3\nblur_m = 2.5e-4"),
+    (
+        "coma, growing off axis",
+        "kind = \"zernike\"\nfirst_zero_m = 2.9e-3\n[[effects.spot.term]]\nnoll = 8\nwaves = [0.0, 0.2]\n[[effects.spot.term]]\nnoll = 7\nwaves = [0.0, 0.0, 0.2]",
+    ),
+    (
+        "ghost of 2 %",
+        "kind = \"ghost\"\nshare = 0.02\noffset_m = [4.5e-3, -3.0e-3]\nspread_m = 1.0e-3",
+    ),
+];
+/// Seconds of a story.
+const HONEST_S: f64 = 120.0;
+
+/// Four honest users through each lens, so many stories of two minutes: thirty make an hour.
+pub fn honest(stories: u64, seed: u64, only: &[String]) -> Measured {
+    let mut text = "| lens | honest frames | alerts |\n|---|---|---|\n".to_owned();
+    let mut all = Vec::new();
+    for (name, spot) in SPOTS.into_iter().filter(|(name, _)| super::is_named(name, only)) {
+        let tell = |k| {
+            let table = if spot.is_empty() {
+                String::new()
+            } else {
+                format!("[effects.spot]\n{spot}\n")
+            };
+            let mut story = PixelStory::with(k, &table);
+            story.seconds = HONEST_S;
+            (k, review(&story).raised())
+        };
+        let mut raised: Vec<_> = (seed..seed + stories).into_par_iter().map(tell).collect();
+        let count: usize = raised.iter().map(|(_, raised)| raised.len()).sum();
+        let frames = stories as f64 * HONEST_S * RATE_HZ;
+        writeln!(text, "| {name} | {frames} | {count} |").expect("text takes all");
+        raised.retain(|(_, raised)| !raised.is_empty());
+        all.extend(raised);
+    }
+    Measured {
+        text: format!("{text}\n{}", exceptions(&all)),
+        holds: all.is_empty(),
+    }
+}

@@ -1,0 +1,119 @@
+//! What the estimator makes of spots that are no Gaussians: without a calibration, and with one that was learned blind.
+
+mod alerts;
+mod bench;
+mod shapes;
+mod tally;
+
+use std::fmt::Write;
+use std::time::Instant;
+
+use super::measured::Measured;
+use crate::estimate;
+use crate::optics::Camera;
+pub use alerts::honest;
+use bench::{Bench, Layout};
+use shapes::{LENSES, Lens};
+use tally::Tally;
+
+const SNRS: [f64; 4] = [30.0, 100.0, 300.0, 1000.0];
+/// Largest share of invented emitters, %, of separated spots on 64 × 64 pixels without a calibration.
+const MOST_INVENTED: f64 = 1.0;
+const FIGURES: &str = "number right %, invented %, missed %, in ellipse %, error over bound, median and longest ms";
+
+/// So many frames of each lens, peak SNR and layout, without a calibration; of the rows that `only` names.
+pub fn uncalibrated(frames: u64, seed: u64, only: &[String]) -> Measured {
+    let mut text =
+        format!("| lens | SNR | {FIGURES}: 64×64 apart | 64×64, pairs 2 σ apart | 20×20 |\n|---|---|---|---|---|\n");
+    let mut holds = true;
+    for (lens, snr) in rows(only) {
+        let cells = [(64, Layout::Apart), (64, Layout::Pairs), (20, Layout::Apart)].map(|(pixels, layout)| {
+            let mut bench = Bench::new(lens, pixels, snr, seed);
+            let camera = bench.camera.clone();
+            measure(&mut bench, layout, &camera, frames)
+        });
+        holds &= 100.0 * cells[0].invented as f64 <= MOST_INVENTED * cells[0].spots as f64;
+        let cells = cells.map(Tally::cell);
+        writeln!(text, "| {} | {snr} | {} |", lens.name, cells.join(" | ")).expect("text takes all");
+    }
+    Measured { text, holds }
+}
+
+/// The same with a calibration that was learned from other frames of the lens, whose positions it was not told.
+pub fn calibrated(frames: u64, seed: u64, only: &[String]) -> Measured {
+    let mut text = format!(
+        "| lens | SNR | 64×64: learned | {FIGURES}: apart | pairs 2 σ apart | 20×20: learned | apart |\n|---|---|---|---|---|---|---|\n"
+    );
+    for (lens, snr) in rows(only) {
+        let mut cells = Vec::new();
+        for (pixels, layouts) in [(64, &[Layout::Apart, Layout::Pairs][..]), (20, &[Layout::Apart])] {
+            let mut bench = Bench::new(lens, pixels, snr, seed);
+            let (camera, learned) = calibrate(&mut bench);
+            cells.push(learned);
+            for layout in layouts {
+                let tally = measure(&mut bench, *layout, &camera, frames);
+                let tally = match lens.is_uniform {
+                    true => tally,
+                    false => tally.without_distortion(),
+                };
+                cells.push(tally.cell());
+            }
+        }
+        writeln!(text, "| {} | {snr} | {} |", lens.name, cells.join(" | ")).expect("text takes all");
+    }
+    Measured { text, holds: true }
+}
+
+/// Lenses and peak SNRs of the rows, "Airy disc 300", that `only` names.
+fn rows(only: &[String]) -> impl Iterator<Item = (Lens, f64)> {
+    let all = LENSES.iter().flat_map(|lens| SNRS.map(|snr| (*lens, snr)));
+    all.filter(move |(lens, snr)| is_named(&format!("{} {snr}", lens.name), only))
+}
+
+/// Whether the name begins with one of `only`, in whole words; true where there is none.
+fn is_named(name: &str, only: &[String]) -> bool {
+    let name = name.to_lowercase();
+    let begins = |text: &String| {
+        let rest = name.strip_prefix(&text.to_lowercase());
+        rest.is_some_and(|rest| !rest.starts_with(char::is_alphanumeric))
+    };
+    only.is_empty() || only.iter().any(begins)
+}
+
+/// The camera after `oapwatch calibrate`, and what that found; the camera as it is where that refused or found nothing better.
+fn calibrate(bench: &mut Bench) -> (Camera, String) {
+    let plain = bench.camera.clone();
+    match bench.learn() {
+        Err(error) => (plain, format!("refused: {error}")),
+        Ok(learned) if !learned.is_better(&plain) => (plain, "the Gaussian stays".to_owned()),
+        Ok(learned) => {
+            let text = format!(
+                "χ² {:.1} to {:.3}, {} terms of degree {}, spot error {:.1e}",
+                learned.before.reduced(),
+                learned.after.reduced(),
+                learned.shape.terms(),
+                learned.field_degree,
+                learned.calibration.spot_error.unwrap_or_default()
+            );
+            let camera = learned.calibration.applied_to(&plain);
+            (camera.expect("a calibration of this camera"), text)
+        }
+    }
+}
+
+/// What `ml` makes of so many frames as `camera` describes them.
+fn measure(bench: &mut Bench, layout: Layout, camera: &Camera, frames: u64) -> Tally {
+    let mut estimator = estimate::build(&estimate::Config::default(), camera).expect("an estimator");
+    let mut tally = Tally::default();
+    for index in 0..frames {
+        let (frame, spots) = bench.frame(index, layout);
+        let clock = Instant::now();
+        let estimate = estimator.estimate(&frame).expect("a frame that can be used");
+        let time_ms = 1e3 * clock.elapsed().as_secs_f64();
+        let ground: Vec<_> = spots.places_m.iter().map(|p| bench.camera.to_ground(*p)).collect();
+        let bounds = bench.bounds(&spots);
+        let scale = bench.camera.ground_scale();
+        tally.count(&estimate.emitters, &ground, &bounds, scale, time_ms);
+    }
+    tally
+}
