@@ -230,7 +230,7 @@ fn a_thousand_zones_are_taken_and_more_are_refused_by_name() {
         let (status, problem) = json_of(daemon.send("PUT", "/v1/zones", "", &zones(n)));
         let said = problem["detail"].as_str().unwrap();
         assert!(
-            status == 422 && said.contains(&format!("expected at most 1000 zones, found {n}")),
+            status == 422 && said.contains(&format!("expected at most 1000, found {n}")),
             "{said}"
         );
     }

@@ -15,8 +15,9 @@ use super::process::{Daemon, alerts};
 /// Nobody reads a station's log here, and none of its requests is one too many.
 const QUIET: &str = "[log]\nlevel = \"off\"\n[api]\nrequests_per_second = 100000\n";
 
-/// A number from the environment, for a longer or shorter measurement.
+/// `OAPWATCH_FLEET_<name>` from the environment, for a longer or shorter measurement.
 fn number(name: &str, usual: u64) -> u64 {
+    let name = format!("OAPWATCH_FLEET_{name}");
     let set = std::env::var(name).ok().and_then(|text| text.parse().ok());
     set.unwrap_or(usual)
 }
