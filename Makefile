@@ -36,6 +36,7 @@ test-skips:
 	@test -x /usr/sbin/rsyslogd -a -x /usr/bin/prometheus-alertmanager || echo "Skipping other systems: rsyslog or prometheus-alertmanager is missing (make setup-test installs them)"
 	@test -x target/pymavlink/bin/python || echo "Skipping telemetry sent by pymavlink: it is missing (make setup-test installs it)"
 	@command -v nats-server >/dev/null || echo "Skipping the fleet with a real server: nats-server is missing (make setup-test installs it)"
+	@command -v mosquitto_sub >/dev/null || echo "Skipping MQTT clients of the fleet: mosquitto-clients is missing (make setup-test installs it)"
 	@test -x target/systems/bin/taky || echo "Skipping TAK and SAPIENT: taky or sapient-pydantic is missing (make setup-test installs them)"
 	@test -x target/schemathesis/bin/schemathesis || echo "Skipping requests made from the API's description: schemathesis is missing (make setup-test installs it)"
 
@@ -52,7 +53,7 @@ setup:
 setup-test:
 	$(call need,command -v chromium,chromium chromium-driver)
 	$(call need,test -x /usr/sbin/rsyslogd -a -e /usr/lib/$(shell uname -m)-linux-gnu/rsyslog/lmnsd_gtls.so -a -x /usr/bin/prometheus-alertmanager,rsyslog rsyslog-gnutls prometheus-alertmanager)
-	$(call need,command -v nats-server,nats-server)
+	$(call need,sh -c 'command -v nats-server && command -v mosquitto_sub',nats-server mosquitto-clients)
 	$(call need,python3 -c 'import ensurepip$(comma) venv',python3-venv)
 	$(call venv,schemathesis,tests/schemathesis/requirements.txt)
 	$(call venv,pymavlink,tests/platform/requirements.txt)
@@ -116,6 +117,14 @@ soak: build
 # Floods of requests and of claims, slow and endless clients, a thousand viewers, a gigabyte of garbage: what they cost the monitor. Not in CI: minutes.
 siege: build
 	OAPWATCH_PROGRAM=$(CURDIR)/target/release/oapwatch cargo test --release --locked --test daemon -- --ignored --nocapture --test-threads 1 siege
+
+.PHONY: fleet-measured
+# Kills while alerts flow, an alert's way to the hub, a thousand access points on one hub, frames while the server is gone: what
+# docs/fleet.md says of them. Not in CI: minutes. FLEET=kills and the like runs one of them.
+FLEET ?=
+fleet-measured: build
+	$(call need,command -v nats-server,nats-server)
+	OAPWATCH_PROGRAM=$(CURDIR)/target/release/oapwatch cargo test --release --locked --test daemon -- --ignored --nocapture --test-threads 1 fleet_measured::$(FLEET)
 
 .PHONY: overload
 # How old results grow under ten times the frames that the daemon can handle.

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use jiff::Timestamp;
-use serde::Serialize;
+use serde::{Serialize, Serializer};
 
 use super::pose_status::PoseStatus;
 use crate::frame::Frame;
@@ -121,9 +121,20 @@ pub struct StationStatus {
     pub footprint_m: Vec<[f64; 2]>,
     /// Null for a platform without poses, which is level and over its own origin.
     pub pose: Option<StationPose>,
+    /// Whether its users are compared with those of other stations: not where its frames are dated further from the hub's clock than
+    /// 5 s.
+    pub is_compared: bool,
+    /// Messages that were refused since the hub began, by reason: "other_version", "malformed", "other_station" (in another's name),
+    /// "too_large", "late" (older than what is known), "too_many_stations".
+    pub refused: BTreeMap<&'static str, u64>,
     /// The station's own `GET /v1/status`, without `view`.
+    #[serde(serialize_with = "shared")]
     #[schema(value_type = Object)]
-    pub status: serde_json::Value,
+    pub status: Arc<serde_json::Value>,
+}
+
+fn shared<S: Serializer>(status: &Arc<serde_json::Value>, serializer: S) -> Result<S::Ok, S::Error> {
+    status.as_ref().serialize(serializer)
 }
 
 /// Where the platform of an access point is, by the newest pose that its station used.
@@ -169,6 +180,8 @@ pub enum StationState {
     Blind,
     /// No message has arrived for `[fleet] lost_after_s`.
     Lost,
+    /// Nothing that it has said could be used.
+    Refused,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, utoipa::ToSchema)]

@@ -40,15 +40,16 @@ pub fn run(args: Args) -> Outcome {
         tracing::warn!(%refused, "transparent huge pages stay on: memory use will be higher");
     }
     let daemon = Daemon::new(config, args.config).map_err(Failure::Config)?;
-    runtime()?.block_on(daemon.run(logging)).map_err(Failure::Other)
+    // One core is the compute thread's.
+    runtime(1)?.block_on(daemon.run(logging)).map_err(Failure::Other)
 }
 
-/// Where a daemon's tasks run.
-pub(super) fn runtime() -> Result<tokio::runtime::Runtime, Failure> {
+/// Where a daemon's tasks run: on all cores but `taken`.
+pub(super) fn runtime(taken: usize) -> Result<tokio::runtime::Runtime, Failure> {
     let cores = std::thread::available_parallelism().map_or(1, |n| n.get());
     tokio::runtime::Builder::new_multi_thread()
         .enable_all()
-        .worker_threads(cores.saturating_sub(1).clamp(1, MOST_SERVING))
+        .worker_threads(cores.saturating_sub(taken).clamp(1, MOST_SERVING))
         .max_blocking_threads(MOST_WAITING)
         .thread_name("oapwatch")
         .build()

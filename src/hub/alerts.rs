@@ -140,9 +140,10 @@ impl HubAlerts {
         if let Some(open) = self.open.values_mut().find(|open| is_shared(open, &member.0, &alert)) {
             self.of_member.insert(member.clone(), open.alert.id.clone());
             open.members.push(member);
-            open.alert.evidence[REPORTED] = json!(open.members);
+            note_reporters(&mut open.alert, &open.members);
+            // Either way the list of who reports it is in the journal, from which a later run goes on.
             if alert.severity <= open.alert.severity {
-                return None;
+                return Some(event(AlertEventKind::Reported, &open.alert));
             }
             open.alert.severity = alert.severity;
             return Some(event(AlertEventKind::Updated, &open.alert));
@@ -186,7 +187,8 @@ impl HubAlerts {
         let open = self.open.get_mut(&id)?;
         open.members.retain(|other| other != member);
         if !open.members.is_empty() {
-            return None;
+            note_reporters(&mut open.alert, &open.members);
+            return Some(event(AlertEventKind::Reported, &open.alert));
         }
         let mut open = self.open.remove(&id)?;
         open.alert.state = AlertState::Cleared;
@@ -291,10 +293,16 @@ fn adopted(member: &Member, mut alert: Alert, members: &[Member]) -> Alert {
     alert.station = Some(name.clone());
     // The station's zones name webhooks of its own; its maintenance is the hub's too.
     alert.webhooks = alert.maintenance.is_some().then(Vec::new);
-    if let Value::Object(evidence) = &mut alert.evidence {
-        evidence.insert(REPORTED.to_owned(), json!(members));
-    }
+    note_reporters(&mut alert, members);
     alert
+}
+
+/// Evidence is an object or null; a station may send anything.
+fn note_reporters(alert: &mut Alert, members: &[Member]) {
+    if !alert.evidence.is_object() {
+        alert.evidence = json!({});
+    }
+    alert.evidence[REPORTED] = json!(members);
 }
 
 fn event(event: AlertEventKind, alert: &Alert) -> AlertEvent {

@@ -39,14 +39,17 @@ fn one_cause_at_two_stations_is_one_alert_until_both_clear_it() {
     assert_eq!(raised.alert.id, "harbour.a.1");
     assert_eq!(raised.alert.station, Some(name("a")));
     let second = alerts.take(&name("b"), stranger(AlertEventKind::Raised, "1", 5.0), NOBODY);
-    assert!(second.is_none(), "within ten metres it is the same stranger");
+    let second = second.expect("who reports it is history");
+    assert_eq!(
+        (second.event, second.alert.id.as_str()),
+        (AlertEventKind::Reported, "harbour.a.1"),
+        "within ten metres it is the same stranger"
+    );
+    assert_eq!(second.alert.evidence[REPORTED].as_array().map(Vec::len), Some(2));
     let third = alerts.take(&name("b"), stranger(AlertEventKind::Raised, "2", 50.0), NOBODY);
     assert_eq!(third.unwrap().alert.id, "harbour.b.2");
-    assert!(
-        alerts
-            .take(&name("a"), stranger(AlertEventKind::Cleared, "1", 0.0), NOBODY)
-            .is_none()
-    );
+    let first = alerts.take(&name("a"), stranger(AlertEventKind::Cleared, "1", 0.0), NOBODY);
+    assert_eq!(first.unwrap().event, AlertEventKind::Reported);
     let cleared = alerts
         .take(&name("b"), stranger(AlertEventKind::Cleared, "1", 5.0), NOBODY)
         .unwrap();
@@ -136,4 +139,38 @@ fn after_a_restart_the_list_goes_on() {
         .unwrap();
     assert_eq!(cleared.alert.id, "harbour.a.1");
     assert!(again.open_by_kind().is_empty());
+}
+
+#[test]
+fn after_a_restart_it_is_known_who_reports_an_alert() {
+    let mut alerts = HubAlerts::default();
+    alerts.take(&name("a"), stranger(AlertEventKind::Raised, "1", 0.0), NOBODY);
+    let shared = alerts
+        .take(&name("b"), stranger(AlertEventKind::Raised, "1", 5.0), NOBODY)
+        .unwrap();
+    // The journal holds the alert as its last event has it.
+    let mut again = HubAlerts::default();
+    again.restore(vec![shared.alert]);
+    let mut clear = |station: &str, x_m| {
+        let cleared = again.take(&name(station), stranger(AlertEventKind::Cleared, "1", x_m), NOBODY);
+        let event = cleared.unwrap();
+        (event.event, event.alert.id)
+    };
+    let id = "harbour.a.1".to_owned();
+    assert_eq!(clear("a", 0.0), (AlertEventKind::Reported, id.clone()));
+    assert_eq!(clear("b", 5.0), (AlertEventKind::Cleared, id));
+    assert!(again.open_by_kind().is_empty());
+}
+
+#[test]
+fn evidence_of_any_form_is_taken() {
+    for evidence in [json!(null), json!("text"), json!([1, 2]), json!(3)] {
+        let mut alerts = HubAlerts::default();
+        for station in ["a", "b"] {
+            let mut event = stranger(AlertEventKind::Raised, "1", 0.0);
+            event.alert.evidence = evidence.clone();
+            let taken = alerts.take(&name(station), event, NOBODY).unwrap();
+            assert!(taken.alert.evidence[REPORTED].is_array(), "{evidence}");
+        }
+    }
 }

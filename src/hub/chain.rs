@@ -55,13 +55,13 @@ pub enum Heard {
 }
 
 impl Heard {
-    /// `None` where no message was heard.
-    pub fn topic(&self) -> Option<Topic> {
+    /// What was heard of whom; `None` where no message was.
+    pub fn said(&self) -> Option<(Topic, StationName)> {
         match self {
-            Self::Alert(_) => Some(Topic::Alert),
-            Self::Positions(_) => Some(Topic::Positions),
-            Self::Pose(_) => Some(Topic::Pose),
-            Self::Health(_) => Some(Topic::Health),
+            Self::Alert(message) => Some((Topic::Alert, message.name.clone())),
+            Self::Positions(message) => Some((Topic::Positions, message.name.clone())),
+            Self::Pose(message) => Some((Topic::Pose, message.name.clone())),
+            Self::Health(message) => Some((Topic::Health, message.name.clone())),
             Self::Acknowledge { .. } | Self::Withdraw { .. } | Self::Tick => None,
         }
     }

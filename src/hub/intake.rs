@@ -1,5 +1,7 @@
 //! Messages of the fleet, checked: who may have sent them, and whether they can be read.
 
+use std::borrow::Cow;
+
 use async_nats::Message;
 use metrics::counter;
 use serde::de::DeserializeOwned;
@@ -13,16 +15,20 @@ use crate::monitor::StationName;
 const LARGEST: usize = 1 << 20;
 
 /// What every message holds.
+///
+/// `site` and `station` one by one: a flattened [`StationName`] would have all of the message kept to search it.
 #[derive(serde::Deserialize)]
-struct Head {
+struct Head<'a> {
     version: u32,
-    #[serde(flatten)]
-    name: StationName,
+    #[serde(borrow)]
+    site: Cow<'a, str>,
+    #[serde(borrow)]
+    station: Cow<'a, str>,
 }
 
-/// Reads a message of this topic. One that cannot be used is counted by reason: it is another version, malformed, too large, or in
+/// Reads a message of this topic, and counts it. The error says why it cannot be used: it is another version, malformed, too large, or in
 /// the name of another station than its subject's, which is the one that the server lets its sender use.
-pub fn read<T: DeserializeOwned>(message: &Message, topic: Topic) -> Option<T> {
+pub fn read<T: DeserializeOwned>(message: &Message, topic: Topic) -> Result<T, &'static str> {
     let outcome = parse(message, topic);
     let word = match &outcome {
         Ok(_) => "taken",
@@ -30,8 +36,11 @@ pub fn read<T: DeserializeOwned>(message: &Message, topic: Topic) -> Option<T> {
     };
     count(topic, word);
     outcome
-        .inspect_err(|reason| tracing::warn!(subject = %message.subject, reason, "a fleet message is refused"))
-        .ok()
+}
+
+/// The station whose subject a message came on.
+pub fn sender(message: &Message) -> Option<StationName> {
+    Subject::parse(&message.subject).map(|subject| subject.name)
 }
 
 pub fn count(topic: Topic, outcome: &'static str) {
@@ -48,7 +57,7 @@ fn parse<T: DeserializeOwned>(message: &Message, topic: Topic) -> Result<T, &'st
     if head.version != VERSION {
         return Err("other_version");
     }
-    if head.name != subject.name {
+    if (&*head.site, &*head.station) != (&*subject.name.site, &*subject.name.station) {
         return Err("other_station");
     }
     serde_json::from_slice(&message.payload).map_err(|_| "malformed")

@@ -4,8 +4,10 @@ mod alerts;
 pub mod chain;
 mod conflicts;
 mod intake;
+mod latest;
 mod picture;
 mod record;
+mod refusals;
 mod review;
 #[allow(clippy::disallowed_methods, reason = "silence is measured in the hub's own time")]
 mod run;

@@ -28,7 +28,8 @@ pub struct Picture {
 /// hub's own and stay with a user from one station to the next.
 pub fn draw<'a>(fresh: impl Iterator<Item = &'a PositionsMessage>, tracks: &mut Tracks, tolerated_m: f64) -> Picture {
     let mut picture = Picture::default();
-    let mut beams: Vec<(TrackedPosition, StationName)> = Vec::new();
+    let mut beams: Vec<TrackedPosition> = Vec::new();
+    let mut of_user: HashMap<&str, Vec<usize>> = HashMap::new();
     for message in fresh {
         picture.time = picture.time.max(message.time);
         picture.frame = picture.frame.max(message.frame);
@@ -36,25 +37,24 @@ pub fn draw<'a>(fresh: impl Iterator<Item = &'a PositionsMessage>, tracks: &mut 
         for emitter in &message.emitters {
             let mut beam = emitter.clone();
             beam.track = tracks.number(&message.name, emitter);
-            let same = beams.iter_mut().find(|(other, _)| {
-                beam.user.is_some() && other.user == beam.user && is_near(other, &beam, tolerated_m)
-            });
-            match same {
-                Some((other, _)) => fuse(other, &beam, &message.name),
-                None => {
-                    beam.station = Some(message.name.clone());
-                    beams.push((beam, message.name.clone()));
+            if let Some(user) = &emitter.user {
+                let theirs = of_user.entry(user).or_default();
+                if let Some(k) = theirs.iter().find(|k| is_near(&beams[**k], &beam, tolerated_m)) {
+                    fuse(&mut beams[*k], &beam, &message.name);
+                    continue;
                 }
+                theirs.push(beams.len());
             }
+            beam.station = Some(message.name.clone());
+            beams.push(beam);
         }
         picture.unseen.extend(message.unseen.iter().cloned());
     }
     tracks.forget_unused();
     picture.unseen.sort();
     picture.unseen.dedup();
-    let is_seen = |user: &String| beams.iter().any(|(b, _)| b.user.as_deref() == Some(user));
-    picture.unseen.retain(|user| !is_seen(user));
-    picture.emitters = beams.into_iter().map(|(beam, _)| beam).collect();
+    picture.unseen.retain(|user| !of_user.contains_key(user.as_str()));
+    picture.emitters = beams;
     picture
 }
 

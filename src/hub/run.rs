@@ -2,26 +2,28 @@
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
-use async_nats::{Client, Message, jetstream};
-use futures_util::StreamExt;
+use async_nats::{Client, Message};
 use jiff::Timestamp;
-use tokio::sync::{mpsc, oneshot};
-use tokio::time::MissedTickBehavior;
+use serde::de::DeserializeOwned;
+use tokio::sync::{mpsc, oneshot, watch};
 
 use super::chain::{Chain, Heard, Settings, Taken};
 use super::intake;
+use super::latest::Latest;
 use super::record::Recorder;
+use super::refusals::Refusals;
 use super::snapshot;
-use super::stream::{BATCH, consume, subscribe};
+use super::stations::Refused;
+use super::stream::{BATCH, Delivered, consume};
 use crate::api::{Acknowledged, Command, Feed, ZonesRefused};
 use crate::config::Config;
 use crate::fleet::Topic;
 use crate::fleet::message::{HealthMessage, PositionsMessage};
 use crate::journal::Journal;
 use crate::monitor::zones::ZoneMap;
-use crate::monitor::{Acknowledgement, LightError, MaintenanceError, Withdrawal};
+use crate::monitor::{Acknowledgement, LightError, MaintenanceError, StationName, Withdrawal};
 use crate::notify::Notifier;
 use crate::optics::Camera;
 use crate::supervisor::Supervisor;
@@ -41,6 +43,9 @@ pub struct Run {
     camera: Arc<Camera>,
     chain: Chain,
     recorder: Option<Recorder>,
+    refusals: Refusals,
+    /// At reading the stream of alerts; grows when it is to be read again from the last event that is confirmed.
+    attempt: watch::Sender<u64>,
     supervisor: Supervisor,
 }
 
@@ -64,6 +69,8 @@ impl Run {
             camera: Arc::new(config.optics.camera()?),
             chain: Chain::new(Settings::new(config), open, taken, started_at),
             recorder: Recorder::start(&config.record)?,
+            refusals: Refusals::default(),
+            attempt: watch::Sender::new(0),
             supervisor: Supervisor::default(),
         })
     }
@@ -76,15 +83,14 @@ impl Run {
         shutdown: impl Future<Output = ()> + Send,
     ) {
         let (sender, mut alerts) = mpsc::channel(BATCH);
-        let consumer = tokio::spawn(consume(client.clone(), self.site.clone(), sender));
-        let subscribe = |topic| subscribe(&client, self.site.as_deref(), topic);
-        let (mut positions, mut poses, mut health) = (
-            subscribe(Topic::Positions).await,
-            subscribe(Topic::Pose).await,
-            subscribe(Topic::Health).await,
-        );
+        let attempts = self.attempt.subscribe();
+        let consumer = tokio::spawn(consume(client.clone(), self.site.clone(), sender, attempts));
+        let latest = Arc::new(Latest::default());
+        let hearing = tokio::spawn({
+            let (latest, site) = (latest.clone(), self.site.clone());
+            async move { latest.hear(&client, site.as_deref()).await }
+        });
         let mut tick = tokio::time::interval(TICK);
-        tick.set_missed_tick_behavior(MissedTickBehavior::Delay);
         let mut shutdown = std::pin::pin!(shutdown);
         let mut batch = Vec::with_capacity(BATCH);
         loop {
@@ -98,16 +104,19 @@ impl Run {
                     self.take_alerts(std::mem::take(&mut batch)).await;
                 }
                 Some(command) = commands.recv() => self.obey(command).await,
-                _ = tick.tick() => self.tick().await,
-                Some(message) = health.next() => self.take_message::<HealthMessage>(&message, Topic::Health, Heard::Health),
-                Some(message) = poses.next() => self.take_message(&message, Topic::Pose, Heard::Pose),
-                Some(message) = positions.next() => {
-                    self.take_message::<PositionsMessage>(&message, Topic::Positions, Heard::Positions);
+                _ = tick.tick() => {
+                    let began = Instant::now();
+                    self.tick().await;
+                    // Messages get half of the time at least, however many stations a picture has to show.
+                    let took = began.elapsed();
+                    tick.reset_after(TICK.saturating_sub(took).max(took));
                 }
+                (topic, message) = latest.next() => self.take_latest(topic, &message),
             }
         }
         self.supervisor.stopping();
         consumer.abort();
+        hearing.abort();
         self.journal.settled().await;
     }
 
@@ -116,43 +125,69 @@ impl Run {
         if let Some(recorder) = &mut self.recorder {
             recorder.heard(now, &heard, &self.chain);
         }
-        let topic = heard.topic();
+        let said = heard.said();
         let outcome = self.chain.take(heard, now);
-        if let Some((topic, refused)) = topic.zip(outcome.refused) {
+        if let Some(((topic, name), refused)) = said.zip(outcome.refused) {
             intake::count(topic, refused.name());
+            // A repeated event has been taken before: nothing is amiss.
+            if refused != Refused::Repeated {
+                self.refuse(Some(name), topic, refused.name());
+            }
         }
         outcome.taken
     }
 
     /// Takes a message that raises nothing by itself.
-    fn take_message<T: serde::de::DeserializeOwned>(
-        &mut self,
-        message: &Message,
-        topic: Topic,
-        heard: impl Fn(T) -> Heard,
-    ) {
-        if let Some(read) = intake::read(message, topic) {
-            self.take(heard(read), Timestamp::now());
+    fn take_latest(&mut self, topic: Topic, message: &Message) {
+        let heard = match topic {
+            Topic::Health => self.read::<HealthMessage>(message, topic).map(Heard::Health),
+            Topic::Pose => self.read(message, topic).map(Heard::Pose),
+            Topic::Positions => self.read::<PositionsMessage>(message, topic).map(Heard::Positions),
+            Topic::Alert => self.read(message, topic).map(Heard::Alert),
+        };
+        if let Some(heard) = heard {
+            self.take(heard, Timestamp::now());
         }
     }
 
-    async fn take_alerts(&mut self, messages: Vec<jetstream::Message>) {
+    /// `None` where it cannot be used, which its station's status then shows.
+    fn read<T: DeserializeOwned>(&mut self, message: &Message, topic: Topic) -> Option<T> {
+        let read = intake::read(message, topic);
+        if let Err(reason) = read {
+            self.refuse(intake::sender(message), topic, reason);
+        }
+        read.ok()
+    }
+
+    fn refuse(&mut self, sender: Option<StationName>, topic: Topic, reason: &'static str) {
+        let Some(name) = sender else { return };
+        let n = self.refusals.note(&name, reason, Timestamp::now());
+        // A station of another version says so ten times a second.
+        if n == 1 {
+            tracing::warn!(%name, topic = topic.name(), reason, "fleet messages are refused");
+        }
+    }
+
+    async fn take_alerts(&mut self, mut messages: Vec<Delivered>) {
         let now = Timestamp::now();
+        // What an attempt that failed had left behind it comes again, in its order.
+        messages.retain(|delivered| delivered.attempt == *self.attempt.borrow());
         let mut taken = Vec::new();
-        for message in &messages {
-            if let Some(read) = intake::read(message, Topic::Alert) {
+        for Delivered { message, .. } in &messages {
+            if let Some(read) = self.read(message, Topic::Alert) {
                 taken.extend(self.take(Heard::Alert(read), now));
             }
         }
         if !self.record(taken).await {
             // They are not confirmed, so they come again; what is on disk says from where.
             self.chain.take_again_from(self.journal.origins().unwrap_or_default());
+            self.attempt.send_modify(|attempt| *attempt += 1);
             if let Some(recorder) = &mut self.recorder {
                 recorder.interrupt();
             }
             return;
         }
-        for message in messages {
+        for Delivered { message, .. } in messages {
             if let Err(error) = message.ack().await {
                 tracing::debug!(%error, "an alert event is not confirmed; it comes again and is recognised");
             }
@@ -196,6 +231,7 @@ impl Run {
             camera: self.camera.clone(),
             journal: self.journal.health(),
             webhooks: self.notifier.status(),
+            refusals: &self.refusals,
         };
         let snapshot = snapshot::of(&mut self.chain, facts, now);
         let stations = snapshot.status.stations.len();

@@ -5,6 +5,7 @@ use std::sync::Arc;
 use jiff::Timestamp;
 
 use super::chain::Chain;
+use super::refusals::Refusals;
 use crate::api::{
     ClaimsStatus, FrameCounts, JournalStatus, Latency, Snapshot, SourceState, SourceStatus, StationStatus, Status,
 };
@@ -14,18 +15,21 @@ use crate::notify::EndpointStatus;
 use crate::optics::Camera;
 
 /// What is shown beside the chain's own.
-pub struct Facts {
+pub struct Facts<'a> {
     pub started_at: Timestamp,
     /// Pictures a second.
     pub rate_hz: f64,
     pub camera: Arc<Camera>,
     pub journal: journal::Health,
     pub webhooks: Vec<EndpointStatus>,
+    pub refusals: &'a Refusals,
 }
 
-pub fn of(chain: &mut Chain, facts: Facts, now: Timestamp) -> Snapshot {
+pub fn of(chain: &mut Chain, facts: Facts<'_>, now: Timestamp) -> Snapshot {
     let picture = chain.picture(now);
-    let stations = chain.statuses(now);
+    let mut stations = chain.statuses(now);
+    let source = source(&stations, facts.rate_hz, picture.time);
+    facts.refusals.show(&mut stations);
     let furthest = picture
         .emitters
         .iter()
@@ -35,7 +39,7 @@ pub fn of(chain: &mut Chain, facts: Facts, now: Timestamp) -> Snapshot {
     let status = Status {
         version: env!("CARGO_PKG_VERSION"),
         started_at: facts.started_at,
-        source: source(&stations, facts.rate_hz, picture.time),
+        source,
         frames: FrameCounts::default(),
         latency: Latency::default(),
         claims: ClaimsStatus {

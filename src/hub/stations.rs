@@ -1,6 +1,7 @@
 //! What each access point said last, and what follows from all of it together.
 
 use std::collections::{BTreeMap, HashMap};
+use std::sync::Arc;
 
 use jiff::Timestamp;
 use nalgebra::{Matrix2, Vector2};
@@ -49,7 +50,14 @@ struct Station {
     last_seen: Timestamp,
     positions: Option<(Timestamp, PositionsMessage)>,
     pose: Option<(Timestamp, PoseMessage)>,
-    health: Option<HealthMessage>,
+    health: Option<Health>,
+}
+
+/// The newest health message.
+#[derive(Debug)]
+struct Health {
+    status: Arc<Value>,
+    alerts_waiting: u64,
 }
 
 /// What alerts depend on of a station, in a recording.
@@ -123,7 +131,10 @@ impl Stations {
 
     pub fn take_health(&mut self, message: HealthMessage, now: Timestamp) -> Result<(), Refused> {
         let station = self.station(&message.name, now)?;
-        station.health = Some(message);
+        station.health = Some(Health {
+            status: Arc::new(message.status),
+            alerts_waiting: message.alerts_waiting,
+        });
         Ok(())
     }
 
@@ -183,7 +194,7 @@ impl Stations {
     /// both covariances allow, and by the way that a user can have gone between the two times.
     pub fn conflicts(&self, now: Timestamp, tolerated_m: f64) -> BTreeMap<String, [Sighting; 2]> {
         let mut places: HashMap<&str, Vec<Place>> = HashMap::new();
-        for message in self.fresh(now).filter(|m| seconds(m.time, now).abs() <= LARGEST_LAG_S) {
+        for message in self.fresh(now).filter(|message| is_of(message, now)) {
             for emitter in &message.emitters {
                 if let Some(user) = &emitter.user {
                     places.entry(user).or_default().push(Place::seen(message, emitter));
@@ -225,8 +236,9 @@ impl Stations {
 
     pub fn statuses(&self, now: Timestamp, lost_after_s: f64) -> Vec<StationStatus> {
         let status = |(name, station): (&StationName, &Station)| {
-            let positions = station.positions.as_ref().map(|(_, message)| message);
-            let status = station.health.as_ref().map(|h| h.status.clone()).unwrap_or(Value::Null);
+            let arrived = station.positions.as_ref();
+            let positions = arrived.map(|(_, message)| message);
+            let status = station.health.as_ref().map(|h| h.status.clone()).unwrap_or_default();
             let is_blind = status["source"]["state"]
                 .as_str()
                 .is_some_and(|state| state != "running");
@@ -239,20 +251,24 @@ impl Stations {
                     (false, false) => StationState::Good,
                 },
                 last_seen_at: station.last_seen,
-                lag_s: station
-                    .positions
-                    .as_ref()
-                    .map(|(at, message)| seconds(message.time, *at)),
+                lag_s: arrived.map(|(at, message)| seconds(message.time, *at)),
                 alerts_waiting: station.health.as_ref().map_or(0, |h| h.alerts_waiting),
                 emitters: positions.map_or(0, |p| p.emitters.len()),
                 field_of_view_m: positions.map(|p| p.field_of_view_m),
                 footprint_m: positions.map(footprint).unwrap_or_default(),
                 pose: station.pose.as_ref().map(|(at, message)| pose_at(message, *at, now)),
+                is_compared: arrived.is_none_or(|(at, message)| is_of(message, *at)),
+                refused: BTreeMap::new(),
                 status,
             }
         };
         self.known.iter().map(status).collect()
     }
+}
+
+/// Whether a frame is of about this time of the hub's clock, so that it can be compared with other stations'.
+fn is_of(message: &PositionsMessage, time: Timestamp) -> bool {
+    seconds(message.time, time).abs() <= LARGEST_LAG_S
 }
 
 /// Where a platform is, by what its station said of it at `at`.

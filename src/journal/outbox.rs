@@ -14,7 +14,7 @@ pub struct Subscription {
     pub endpoint: String,
     /// All kinds when `None`.
     pub kinds: Option<Vec<AlertKind>>,
-    /// Whether what an operator does to an alert is an event too; it is no news to most receivers.
+    /// Whether what an operator does to an alert is an event too, and at a hub who else reports it; it is no news to most receivers.
     pub has_operator_acts: bool,
 }
 
@@ -94,7 +94,7 @@ fn is_named(endpoint: &str, event: &AlertEvent) -> bool {
 
 impl Subscription {
     pub fn wants(&self, event: &AlertEvent) -> bool {
-        (self.has_operator_acts || !event.event.is_by_operator())
+        (self.has_operator_acts || event.event.is_news())
             && self
                 .kinds
                 .as_ref()

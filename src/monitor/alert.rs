@@ -248,9 +248,9 @@ impl Alert {
 }
 
 impl AlertEventKind {
-    /// Whether it is an operator's own act, which webhooks do not report.
-    pub fn is_by_operator(self) -> bool {
-        matches!(self, Self::Acknowledged | Self::Unacknowledged)
+    /// Whether it is news to webhooks: neither an operator's own act nor another access point's word on the same cause.
+    pub fn is_news(self) -> bool {
+        matches!(self, Self::Raised | Self::Updated | Self::Cleared)
     }
 }
 
@@ -265,6 +265,9 @@ pub enum AlertEventKind {
     /// An acknowledgement was undone.
     #[serde(rename = "alert.unacknowledged")]
     Unacknowledged,
+    /// At a hub: another access point reports the same cause, or no longer does.
+    #[serde(rename = "alert.reported")]
+    Reported,
     #[serde(rename = "alert.cleared")]
     Cleared,
 }

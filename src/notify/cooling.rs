@@ -81,13 +81,15 @@ impl CoolDown {
             AlertEventKind::Raised => self.raised(delivery, alert, now),
             AlertEventKind::Updated => self.updated(delivery, alert, now),
             AlertEventKind::Cleared => self.cleared(delivery, alert, now),
-            AlertEventKind::Acknowledged | AlertEventKind::Unacknowledged => match self.held.get_mut(&alert.id) {
-                Some(held) => {
-                    held.deliveries.push(delivery);
-                    Ruling::Hold
+            AlertEventKind::Acknowledged | AlertEventKind::Unacknowledged | AlertEventKind::Reported => {
+                match self.held.get_mut(&alert.id) {
+                    Some(held) => {
+                        held.deliveries.push(delivery);
+                        Ruling::Hold
+                    }
+                    None => Ruling::Send(vec![delivery]),
                 }
-                None => Ruling::Send(vec![delivery]),
-            },
+            }
         }
     }
 

@@ -1,33 +1,16 @@
 //! Stations, a real NATS server and the hub, killed while alerts flow.
 
-use std::collections::BTreeMap;
 use std::net::UdpSocket;
-use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use futures_util::StreamExt;
 use serde_json::{Value, json};
 
+use crate::journals::agree;
 use crate::nats::{Server, hub, station, station_with};
 use crate::process::{Daemon, alerts};
-
-/// The events of each alert in a journal, in order; `prefix` is what the hub puts before a station's ids.
-fn histories(journal: &Path, prefix: &str) -> BTreeMap<String, Vec<String>> {
-    let db = rusqlite::Connection::open_with_flags(journal, rusqlite::OpenFlags::SQLITE_OPEN_READ_ONLY).unwrap();
-    let mut rows = db.prepare("SELECT alert, body FROM event ORDER BY seq").unwrap();
-    let row = |row: &rusqlite::Row| Ok((row.get::<_, String>(0)?, row.get::<_, String>(1)?));
-    let mut found: BTreeMap<String, Vec<String>> = BTreeMap::new();
-    for (id, body) in rows.query_map([], row).unwrap().map(Result::unwrap) {
-        let event: Value = serde_json::from_str(&body).unwrap();
-        if let Some(own) = id.strip_prefix(prefix) {
-            let name = event["event"].as_str().unwrap().to_owned();
-            found.entry(own.to_owned()).or_default().push(name);
-        }
-    }
-    found
-}
 
 #[test]
 fn alerts_reach_the_hub_once_each_whoever_is_killed() {
@@ -66,16 +49,7 @@ fn alerts_reach_the_hub_once_each_whoever_is_killed() {
     hub_daemon.wait_for("/v1/alerts?limit=500", "alert of ap8", of_ap8);
 
     // What a station has, the hub has once, in order; alerts that two stations share are one of theirs.
-    let end = Instant::now() + Duration::from_secs(20);
-    loop {
-        let at_station = histories(&dir.path().join("ap7/journal.db"), "");
-        let at_hub = histories(&dir.path().join("hub/journal.db"), "harbour.ap7.");
-        if !at_station.is_empty() && at_station == at_hub {
-            break;
-        }
-        assert!(Instant::now() < end, "{at_station:?}\nat the hub: {at_hub:?}");
-        std::thread::sleep(Duration::from_millis(200));
-    }
+    agree(dir.path(), "hub", "ap7", Duration::from_secs(20));
 }
 
 #[test]

@@ -15,13 +15,13 @@ use crate::process::{Daemon, alerts};
 const CA: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/data/tls/ca.pem");
 
 /// A key that the program made.
-struct Key {
+pub struct Key {
     file: PathBuf,
     public: String,
 }
 
 impl Key {
-    fn new(file: PathBuf) -> Self {
+    pub fn new(file: PathBuf) -> Self {
         let nkey = || {
             Command::new(env!("CARGO_BIN_EXE_oapwatch"))
                 .arg("nkey")
@@ -44,7 +44,7 @@ impl Key {
 }
 
 /// The shipped config with keys, certificates and folders that are here.
-fn config(dir: &Path, port: u16, ap7: &Key, hub: &Key) -> String {
+pub fn config(dir: &Path, port: u16, ap7: &Key, hub: &Key) -> String {
     let tls = format!("{}/tests/data/tls", env!("CARGO_MANIFEST_DIR"));
     let store = dir.join("nats").display().to_string();
     let mut text = include_str!("../../deploy/nats-server.conf").to_owned();
@@ -63,7 +63,7 @@ fn config(dir: &Path, port: u16, ap7: &Key, hub: &Key) -> String {
 }
 
 /// A config that speaks for `station`, or the hub's, with `key`.
-fn start(dir: &Path, command: &str, names: &str, port: u16, key: &Key) -> Daemon {
+pub fn start(dir: &Path, command: &str, names: &str, port: u16, key: &Key) -> Daemon {
     let dir = dir.join(format!("{command}-{}", names.len()));
     std::fs::create_dir_all(&dir).unwrap();
     let nkey = &key.file;

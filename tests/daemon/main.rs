@@ -1,9 +1,13 @@
 //! The daemon as an operator meets it: a process, an address, signals.
 
 mod fleet;
+mod fleet_bad_input;
+mod fleet_leaf;
+mod fleet_measured;
 mod fleet_permissions;
 mod fleet_review;
 mod geojson;
+mod journals;
 mod nats;
 mod over_http;
 mod places;

@@ -54,18 +54,32 @@ impl Server {
         Some(Self { child, port })
     }
 
-    /// Kills it as the kernel would; gives the port for the next one.
-    pub fn kill(mut self) -> u16 {
+    /// Its process.
+    pub fn id(&self) -> u32 {
+        self.child.id()
+    }
+
+    pub fn signal(&self, name: &str) {
+        let status = Command::new("kill").args([name, &self.child.id().to_string()]).status();
+        assert!(status.unwrap().success());
+    }
+
+    /// Kills it as the kernel would.
+    pub fn end(&mut self) {
         let _ = self.child.kill();
         let _ = self.child.wait();
+    }
+
+    /// As [`Server::end`]; gives the port for the next one.
+    pub fn kill(mut self) -> u16 {
+        self.end();
         self.port
     }
 }
 
 impl Drop for Server {
     fn drop(&mut self) {
-        let _ = self.child.kill();
-        let _ = self.child.wait();
+        self.end();
     }
 }
 
@@ -75,9 +89,14 @@ pub fn station(dir: &Path, name: &str, scene: &str, port: u16) -> Daemon {
 
 /// `more` is the rest of its config: keys of `[fleet]`, then other tables.
 pub fn station_with(dir: &Path, name: &str, scene: &str, port: u16, more: &str) -> Daemon {
+    let scene = format!("{}/config/scenes/{scene}.toml", env!("CARGO_MANIFEST_DIR"));
+    station_of(dir, name, Path::new(&scene), port, more)
+}
+
+/// As [`station_with`], with a scene of its own.
+pub fn station_of(dir: &Path, name: &str, scene: &Path, port: u16, more: &str) -> Daemon {
     let dir = dir.join(name);
     std::fs::create_dir_all(&dir).unwrap();
-    let scene = format!("{}/config/scenes/{scene}.toml", env!("CARGO_MANIFEST_DIR"));
     let config = format!(
         "[source]\nkind = \"simulator\"\nscene = {scene:?}\n[journal]\npath = \"journal.db\"\n\
          [fleet]\nurl = \"nats://127.0.0.1:{port}\"\nsite = \"harbour\"\nstation = {name:?}\n{more}"

@@ -168,6 +168,86 @@ fn zones_are_put_checked_and_kept() {
 }
 
 #[test]
+fn of_two_operators_who_change_the_same_zones_one_is_refused() {
+    let dir = tempfile::tempdir().unwrap();
+    scene(dir.path());
+    let daemon = Daemon::start(dir.path(), CONFIG);
+    daemon.wait_for("/v1/positions", "frames", |v| v["frame"].as_u64() > Some(3));
+    let (_, before) = json_of(daemon.send(
+        "PUT",
+        "/v1/zones",
+        "",
+        &collection(vec![square("yard", "watch", 0.0, 0.0)]),
+    ));
+    let tag = daemon.header("/v1/zones", "etag");
+    assert_eq!(before["features"].as_array().map(Vec::len), Some(1));
+    let header = format!("If-Match: {tag}\r\n");
+    let put = |name: &str| {
+        json_of(daemon.send(
+            "PUT",
+            "/v1/zones",
+            &header,
+            &collection(vec![square(name, "watch", 0.0, 0.0)]),
+        ))
+    };
+    let answers = std::thread::scope(|scope| {
+        let [a, b] = ["north", "south"].map(|name| scope.spawn(move || put(name)));
+        [a.join().unwrap(), b.join().unwrap()]
+    });
+    let [winner, loser] = match answers {
+        [a, b] if a.0 == 200 => [a, b],
+        [a, b] => [b, a],
+    };
+    assert_eq!((winner.0, loser.0), (200, 412), "{winner:?} {loser:?}");
+    assert!(
+        loser.1["detail"].as_str().unwrap().contains("somebody else"),
+        "{loser:?}"
+    );
+    let (_, zones) = json_of(daemon.get("/v1/zones"));
+    assert_eq!(zones["features"], winner.1["features"]);
+}
+
+#[test]
+fn a_thousand_zones_are_taken_and_more_are_refused_by_name() {
+    let dir = tempfile::tempdir().unwrap();
+    scene(dir.path());
+    let daemon = Daemon::start(dir.path(), CONFIG);
+    daemon.wait_for("/v1/positions", "frames", |v| v["frame"].as_u64() > Some(3));
+    let zones = |n: usize| {
+        let zone = |k: usize| {
+            square(
+                &format!("z-{k}"),
+                "watch",
+                50.0 * (k % 64) as f64,
+                50.0 * (k / 64) as f64,
+            )
+        };
+        collection((0..n).map(zone).collect())
+    };
+    let (status, taken) = json_of(daemon.send("PUT", "/v1/zones", "", &zones(1000)));
+    assert_eq!((status, taken["features"].as_array().map(Vec::len)), (200, Some(1000)));
+    for n in [1001, 5000] {
+        let (status, problem) = json_of(daemon.send("PUT", "/v1/zones", "", &zones(n)));
+        let said = problem["detail"].as_str().unwrap();
+        assert!(
+            status == 422 && said.contains(&format!("expected at most 1000, found {n}")),
+            "{said}"
+        );
+    }
+    let huge = json!({
+        "type": "Feature", "properties": { "name": "huge", "kind": "ignore" },
+        "geometry": { "type": "Polygon", "coordinates": [[[-1e300, -1e300], [1e300, -1e300], [1e300, 1e300], [-1e300, -1e300]]] },
+    });
+    let (status, problem) = json_of(daemon.send("PUT", "/v1/zones", "", &collection(vec![huge])));
+    assert!(
+        status == 422 && problem["detail"].as_str().unwrap().contains("expected"),
+        "{problem}"
+    );
+    let (_, kept) = json_of(daemon.get("/v1/zones"));
+    assert_eq!(kept["features"].as_array().map(Vec::len), Some(1000));
+}
+
+#[test]
 fn during_maintenance_an_alert_is_recorded_and_sent_when_it_ends() {
     let dir = tempfile::tempdir().unwrap();
     scene(dir.path());

@@ -93,6 +93,25 @@ impl Daemon {
         request(&self.url, "POST", path, "", body).expect("an answer")
     }
 
+    /// A header of an answer.
+    pub fn header(&self, path: &str, name: &str) -> String {
+        let (_, head, _) = whole(&self.url, "GET", path, "", "").expect("an answer");
+        let line = head
+            .lines()
+            .find_map(|l| l.split_once(": ").filter(|(n, _)| n.eq_ignore_ascii_case(name)));
+        line.unwrap_or_else(|| panic!("no {name} in {head}")).1.to_owned()
+    }
+
+    /// As [`Daemon::send`], where it may be gone.
+    pub fn ask(&self, method: &str, path: &str) -> Option<(u16, String)> {
+        request(&self.url, method, path, "", "")
+    }
+
+    /// Time on a processor so far, s.
+    pub fn cpu_s(&self) -> f64 {
+        cpu_s(self.child.id())
+    }
+
     /// Any request; `header` lines end with CRLF.
     pub fn send(&self, method: &str, path: &str, header: &str, body: &str) -> (u16, String) {
         request(&self.url, method, path, header, body).expect("an answer")
@@ -118,8 +137,22 @@ impl Drop for Daemon {
     }
 }
 
+/// Time that a process has spent on a processor, s; a second of `/proc` has 100 ticks.
+pub fn cpu_s(process: u32) -> f64 {
+    let stat = std::fs::read_to_string(format!("/proc/{process}/stat")).unwrap();
+    // The second field, the name in brackets, may hold spaces.
+    let fields: Vec<&str> = stat.rsplit(')').next().unwrap().split_whitespace().collect();
+    let ticks = |k: usize| fields[k].parse::<f64>().unwrap();
+    (ticks(11) + ticks(12)) / 100.0
+}
+
 /// Status and body of an answer.
 fn request(url: &str, method: &str, path: &str, header: &str, body: &str) -> Option<(u16, String)> {
+    whole(url, method, path, header, body).map(|(status, _, body)| (status, body))
+}
+
+/// Status, head and body of an answer.
+fn whole(url: &str, method: &str, path: &str, header: &str, body: &str) -> Option<(u16, String, String)> {
     let address = url.strip_prefix("http://")?;
     let mut stream = TcpStream::connect(address).ok()?;
     stream.set_read_timeout(Some(Duration::from_secs(10))).ok()?;
@@ -132,7 +165,7 @@ fn request(url: &str, method: &str, path: &str, header: &str, body: &str) -> Opt
     let mut answer = String::new();
     stream.read_to_string(&mut answer).ok()?;
     let (head, body) = answer.split_once("\r\n\r\n")?;
-    Some((head.split(' ').nth(1)?.parse().ok()?, body.to_owned()))
+    Some((head.split(' ').nth(1)?.parse().ok()?, head.to_owned(), body.to_owned()))
 }
 
 pub fn alerts(value: &Value) -> &[Value] {

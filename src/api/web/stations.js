@@ -2,8 +2,8 @@
 
 import { clock, el, lasting, shown } from "./words.js";
 
-const ORDER = { lost: 0, blind: 1, good: 2 };
-const TONE = { lost: "bad", blind: "warn", good: "ok" };
+const ORDER = { lost: 0, refused: 1, blind: 2, good: 3 };
+const TONE = { lost: "bad", refused: "bad", blind: "warn", good: "ok" };
 const $ = (id) => document.getElementById(id);
 
 // The heading of a station's platform, and the age of its pose where it matters.
@@ -32,8 +32,10 @@ export function showStations(stations, isHub) {
   const lost = stations.filter((s) => s.state === "lost").length;
   $("station-count").textContent = `${stations.length} known${lost ? `, ${lost} lost` : ""}`;
   const behind = (s) => (s.lag_s === null ? "" : `${s.lag_s < 0 ? "−" : ""}${lasting(Math.abs(s.lag_s) * 1000)}`);
+  // What of its messages cannot be used, and why.
+  const refused = (s) => Object.entries(s.refused).map(([reason, n]) => `, ${n} ${reason.replaceAll("_", " ")}`).join("");
   $("station-rows").replaceChildren(...sorted.map((s) => {
-    const texts = [["", shown(name(s))], [TONE[s.state], s.state], ["n", `${s.emitters}`], ["n", behind(s)], ["n", `${s.alerts_waiting}`], [s.pose?.is_lost ? "bad" : "", poseWords(s.pose)], ["", clock(Date.parse(s.last_seen_at))]];
+    const texts = [["", shown(name(s))], [TONE[s.state], s.state + refused(s)], ["n", `${s.emitters}`], [s.is_compared ? "n" : "n bad", behind(s)], ["n", `${s.alerts_waiting}`], [s.pose?.is_lost ? "bad" : "", poseWords(s.pose)], ["", clock(Date.parse(s.last_seen_at))]];
     return el("tr", {}, ...texts.map(([className, text]) => el("td", { className }, text)));
   }));
 }

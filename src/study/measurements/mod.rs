@@ -7,12 +7,15 @@ mod calibration;
 mod flights;
 mod formats;
 mod handover;
+mod lamps;
 mod lens;
 mod light;
 mod measured;
 mod pixels;
+mod places;
 mod sequence;
 mod smear;
+mod zone_cost;
 mod zones;
 
 pub use measured::Measured;
@@ -49,6 +52,8 @@ pub const ALL: &[Measurement] = &[
     measurement("drift", 300, alone::drifts),
     measurement("handover", 1000, handover::walks),
     measurement("lamp-or-beam", 100, light::lamp_or_beam),
+    measurement("lamps", 40, lamps::lamps),
+    measurement("headlights", 40, lamps::headlights),
     measurement("zones", 40, zones::known_lights_and_zones),
     measurement("honest-pixels", 15, pixels::honest_users),
     measurement("honest-crowd", 15, pixels::honest_crowd),

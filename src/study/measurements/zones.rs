@@ -4,10 +4,11 @@ use std::fmt::Write;
 
 use rayon::prelude::*;
 
-use super::measured::{Measured, exceptions};
+use super::measured::Measured;
+use super::places::{in_force, known, zone};
+use super::zone_cost;
 use crate::monitor::AlertKind::{KnownLightChanged, UnclaimedEmitter, UserOutOfZone};
-use crate::monitor::zones::{self, Zone, ZoneKind};
-use crate::monitor::{AlertEvent, KnownLight, KnownLightConfig, Monitor, known_lights_of};
+use crate::monitor::zones::ZoneKind;
 use crate::study::stories::{Actor, Story, crowd, tell_with};
 
 /// Where the lamp of the stranger's stories is.
@@ -16,109 +17,23 @@ const LAMP: [f64; 2] = [30.0, 5.0];
 const COMES_S: f64 = 130.0;
 /// How long they stay.
 const STAYS_S: f64 = 60.0;
-/// Seconds of a story of twenty lamps.
-const LAMPS_S: f64 = 180.0;
 /// Time within which a restricted zone must be alerted, s.
 const RESTRICTED_S: f64 = 0.3;
 
-/// Twenty lamps raise nothing; a restricted zone is alerted at once; and the time to the alert of a stranger by a known light.
+/// A restricted zone is alerted at once; a frame costs little more with a thousand zones; and the time to the alert of a stranger by a
+/// known light.
 pub fn known_lights_and_zones(stories: u64, seed: u64) -> Measured {
-    let (lamps, lamps_hold) = lamps(stories, seed);
     let (restricted, restricted_holds) = restricted(stories, seed);
+    let (cost, cost_holds) = zone_cost::thousand_zones(seed);
     Measured {
-        text: format!("{lamps}\n{restricted}\n{}", strangers(stories, seed)),
-        holds: lamps_hold && restricted_holds,
+        text: format!("{restricted}\n{cost}\n{}", strangers(stories, seed)),
+        holds: restricted_holds && cost_holds,
     }
-}
-
-fn known(places: &[[f64; 2]]) -> Vec<KnownLight> {
-    let config = |[x_m, y_m]: &[f64; 2]| KnownLightConfig {
-        x_m: *x_m,
-        y_m: *y_m,
-        radius_m: 2.0,
-        note: None,
-        until: None,
-    };
-    let configs: Vec<_> = places.iter().map(config).collect();
-    known_lights_of(&configs).expect("places within the view")
-}
-
-type Operator = Box<dyn Fn(f64, &mut Monitor, &[AlertEvent])>;
-
-/// Puts these in force before the first frame.
-fn in_force(zones: Vec<Zone>, lights: Vec<KnownLight>) -> Operator {
-    Box::new(move |t, monitor, _| {
-        if t == 0.0 {
-            let put = monitor.set_fixed(zones.clone(), lights.clone(), Vec::new());
-            put.expect("one zone at most");
-        }
-    })
-}
-
-/// Six users, three of them standing with a reflection each, and twenty lamps: steady, with mains flicker, and swinging.
-fn lamp_story(seed: u64) -> Story {
-    let place = |k: u32| {
-        [
-            -110.0 + 11.5 * f64::from(k),
-            if k.is_multiple_of(2) { 5.0 } else { -8.0 },
-        ]
-    };
-    let mut actors = crowd();
-    let mut places: Vec<[f64; 2]> = (0..20).map(place).collect();
-    for k in 0..3 {
-        let stands = [-80.0 + 80.0 * f64::from(k as u32), -70.0];
-        actors[k] = Actor::new(&format!("u-{k}"), move |_| stands);
-        let ghost = [stands[0] + 25.0, stands[1] - 12.0];
-        let mut reflection = Actor::intruder(move |_| Some(ghost));
-        (reflection.reflects, reflection.energy_j) = (Some(k), 0.002);
-        actors.push(reflection);
-        places.push(ghost);
-    }
-    for k in 0..20u32 {
-        let [x, y] = place(k);
-        let phase = f64::from(k) + seed as f64;
-        let swings = if k % 3 == 2 { 0.8 } else { 0.0 };
-        let mut lamp = Actor::lamp(move |t| Some([x + swings * (1.7 * t + phase).sin(), y]));
-        if k % 3 == 1 {
-            // The beat of the mains with the frames.
-            lamp.glow = Box::new(move |t| 1.0 + 0.15 * (0.4 * t + phase).sin());
-        }
-        actors.push(lamp);
-    }
-    let mut story = Story::new(seed, actors);
-    story.seconds = LAMPS_S;
-    story.operator = in_force(Vec::new(), known(&places));
-    story
-}
-
-fn lamps(stories: u64, seed: u64) -> (String, bool) {
-    let raised: Vec<_> = (seed..seed + stories)
-        .into_par_iter()
-        .map(|k| (k, tell_with(&lamp_story(k), false).raised()))
-        .filter(|(_, raised)| !raised.is_empty())
-        .collect();
-    let frames = stories as f64 * LAMPS_S * 10.0;
-    let text = format!(
-        "{frames} frames of twenty known lamps, three known ghosts and six users: {} stories with alerts\n{}",
-        raised.len(),
-        exceptions(&raised)
-    );
-    (text, raised.is_empty())
 }
 
 fn restricted(stories: u64, seed: u64) -> (String, bool) {
-    let yard = zones::Config {
-        name: "yard".to_owned(),
-        kind: ZoneKind::Restricted,
-        polygon: Some(vec![[20.0, -10.0], [50.0, -10.0], [50.0, 20.0], [20.0, 20.0]]),
-        geojson: None,
-        coordinates: zones::Coordinates::Metres,
-        users: Vec::new(),
-        tolerated_distance_m: None,
-        severity: None,
-        webhooks: None,
-    };
-    let yard = zones::load(&[yard], None).expect("a square");
+    let corners = vec![[20.0, -10.0], [50.0, -10.0], [50.0, 20.0], [20.0, 20.0]];
+    let yard = zone("yard", ZoneKind::Restricted, corners);
     let mut late: Vec<f64> = Vec::new();
     let mut all = 0;
     for is_claimed in [false, true] {
