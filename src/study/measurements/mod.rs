@@ -4,6 +4,7 @@
 
 mod alone;
 mod calibration;
+mod crowds;
 mod flights;
 mod formats;
 mod handover;
@@ -51,6 +52,7 @@ pub const ALL: &[Measurement] = &[
     measurement("lens", 40, lens::lenses),
     measurement("sequence", 8, sequence::frames_together),
     measurement("formats", 200, formats::cost),
+    measurement("crowds", 40, crowds::crowds),
 ];
 
 const fn measurement(name: &'static str, stories: u64, run: fn(u64, u64) -> Measured) -> Measurement {
