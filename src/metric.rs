@@ -9,6 +9,8 @@ pub const FRAMES_DROPPED: &str = "oapwatch_frames_dropped_total";
 pub const FRAMES_UNUSABLE: &str = "oapwatch_frames_unusable_total";
 /// The time budget of the estimator ended before its search did.
 pub const FRAMES_CUT_SHORT: &str = "oapwatch_frames_cut_short_total";
+/// The search ended at the most emitters that it looks for.
+pub const FRAMES_LIMITED: &str = "oapwatch_frames_limited_total";
 /// Weighted squared residual per degree of freedom of the latest frame.
 pub const REDUCED_CHI2: &str = "oapwatch_frame_reduced_chi2";
 /// Share of a spot's light by which the spots of the latest frame were taken to differ from the model.
@@ -119,6 +121,10 @@ pub fn describe() {
     c!(
         FRAMES_CUT_SHORT,
         "Frames whose estimate was cut short by the time budget."
+    );
+    c!(
+        FRAMES_LIMITED,
+        "Frames in which the estimator found as many emitters as it looks for; there may be more."
     );
     g!(
         LAST_GOOD_FRAME,
@@ -244,6 +250,7 @@ pub fn describe() {
         FRAMES_DROPPED,
         FRAMES_UNUSABLE,
         FRAMES_CUT_SHORT,
+        FRAMES_LIMITED,
         CLAIMS_SKIPPED,
         STREAM_POSITIONS_MISSED,
         JOURNAL_FAILURES,

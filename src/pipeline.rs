@@ -219,6 +219,7 @@ impl Pipeline {
         Estimate {
             emitters: Vec::new(),
             is_cut_short: false,
+            is_limited: false,
             estimator: self.estimator.name(),
             reduced_chi2: f64::NAN,
             spot_error: 0.0,

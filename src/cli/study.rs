@@ -12,10 +12,10 @@ use crate::study::measurements::{ALL, Measurement};
 )]
 pub struct Args {
     /// What to measure: the monitor alone (honest to zones; handover with a hub), the program on the simulator's pixels (honest-pixels to
-    /// flights), or the optics and the estimator (calibration to formats)
+    /// flights), or the optics and the estimator (calibration to crowds)
     #[arg(required = true, value_parser = clap::builder::PossibleValuesParser::new(ALL.iter().map(|m| m.name)))]
     what: Vec<String>,
-    /// Stories of each, of 8 s to two minutes of frames (devices of the calibration, frames of a lens or a pixel format, walks of a cell of `sequence`)
+    /// Stories of each, of 8 s to two minutes of frames (devices of the calibration, frames of a lens, a pixel format or a crowd, walks of a cell of `sequence`)
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     stories: Option<u64>,
     /// Seed of the first story; the others follow

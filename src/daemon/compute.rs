@@ -155,6 +155,7 @@ impl Compute {
         match &estimate {
             Ok(estimate) => {
                 metrics::counter!(metric::FRAMES_CUT_SHORT).increment(u64::from(estimate.is_cut_short));
+                metrics::counter!(metric::FRAMES_LIMITED).increment(u64::from(estimate.is_limited));
                 metrics::gauge!(metric::REDUCED_CHI2).set(estimate.reduced_chi2);
                 metrics::gauge!(metric::SPOT_ERROR).set(estimate.spot_error);
                 s.explained(estimate, self.camera.spot_error.is_some());

@@ -24,6 +24,8 @@ bitflags::bitflags! {
         const ILL_CONDITIONED = 1 << 7;
         /// The likelihood is not quadratic: two standard deviations out it differs from the covariance's by a factor of two.
         const NON_GAUSSIAN = 1 << 8;
+        /// The search ended at the most emitters that it looks for: the frame may hold more.
+        const LIMIT_REACHED = 1 << 9;
     }
 }
 
@@ -88,6 +90,8 @@ pub struct Estimate {
     pub estimator: &'static str,
     /// Whether a budget of time or work ended the search early.
     pub is_cut_short: bool,
+    /// Whether the search ended at the most emitters that it looks for.
+    pub is_limited: bool,
     /// Weighted squared residual per degree of freedom; near 1 when the model explains the frame.
     pub reduced_chi2: f64,
     /// Share of a spot's light by which the spots were taken to differ from the PSF; 0 where it explains the frame.

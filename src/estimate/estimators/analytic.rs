@@ -2,6 +2,7 @@
 
 use crate::estimate::config::KnownPower;
 use crate::estimate::detect::matrix_pencil::PencilSampler;
+use crate::estimate::detect::segmentation::PixelSums;
 use crate::estimate::emitter::{Estimate, Flags};
 use crate::estimate::error::Error;
 use crate::estimate::estimator::Estimator;
@@ -98,7 +99,25 @@ struct Found {
 
 impl AnalyticEstimator {
     pub fn new(spec: &'static EstimatorSpec, camera: &Camera, known: Option<&KnownPower>, rules: Rules) -> Self {
-        let (bases, noise_bases) = bases(camera);
+        Self::with_bases(spec, camera, known, rules, bases(camera))
+    }
+
+    /// For windows of a larger sensor, in the pixel bases; `camera` is the window's, and a source has the whole sensor's `source_penalty`.
+    pub fn of_window(spec: &'static EstimatorSpec, camera: &Camera, rules: Rules, source_penalty: f64) -> Self {
+        let pixels = [&camera.x, &camera.y].map(|axis| Basis::pixels(axis, camera.spot_sigma_m));
+        let mut estimator = Self::with_bases(spec, camera, None, rules, (pixels, None));
+        estimator.space.source_penalty = source_penalty;
+        estimator.reweighting.space.source_penalty = source_penalty;
+        estimator
+    }
+
+    fn with_bases(
+        spec: &'static EstimatorSpec,
+        camera: &Camera,
+        known: Option<&KnownPower>,
+        rules: Rules,
+        (bases, noise_bases): ([Basis; 2], Option<[Basis; 2]>),
+    ) -> Self {
         let pencil = if rules.pencil_start && spec.chooses_order() && camera.spot_shape.is_none() {
             SearchSpace::for_pencil_start(noise_bases.as_ref().unwrap_or(&bases).clone(), rules)
         } else {
@@ -324,6 +343,45 @@ impl AnalyticEstimator {
         Ok(self.inspect())
     }
 
+    /// Loads a window of a frame whose pixels have this noise, without its foreign pixels, of which `exclude` lists those of one window.
+    /// `spare_excess`: see [`CompressedFrame`].
+    pub fn load_window(
+        &mut self,
+        frame: &Frame,
+        exclude: impl FnOnce(&mut dyn FnMut(usize, usize)),
+        noise_std_j: f64,
+        spare_excess: f64,
+    ) -> Result<PixelSums, Error> {
+        self.camera.noise_std_j = noise_std_j;
+        self.frame.load(frame, &self.camera)?;
+        let (nx, screened) = (self.camera.x.n, &mut self.frame);
+        exclude(&mut |x, y| screened.exclude(x, y, nx));
+        self.compressed.spare_excess = spare_excess;
+        self.reweighting.compressed.spare_excess = spare_excess;
+        self.inspect();
+        let mut sums = PixelSums::default();
+        let masked = self.frame.is_masked.iter();
+        for (p, _) in self
+            .frame
+            .pixels
+            .iter()
+            .zip(masked)
+            .filter(|(_, is_masked)| !**is_masked)
+        {
+            sums.usable += 1.0;
+            sums.square += p * p;
+        }
+        Ok(sums)
+    }
+
+    /// Whether the loaded window shows anything that may be an emitter.
+    pub fn has_peak(&mut self) -> bool {
+        let mut budget = WorkBudget::new(&|| false);
+        let mut search = self.space.search(&self.compressed, &self.frame, &mut budget);
+        let mut dark = Candidate::from(Hypothesis::empty(Nuisances::default()));
+        !search.residual_peaks(&mut dark).is_empty()
+    }
+
     /// The loaded frame, with the space to search it in.
     pub fn loaded(&mut self) -> (&mut SearchSpace, &CompressedFrame, &PreprocessedFrame) {
         (&mut self.space, &self.compressed, &self.frame)
@@ -416,15 +474,20 @@ impl AnalyticEstimator {
             moments.as_deref(),
             None,
         );
-        if is_cut_short {
-            for emitter in &mut found.emitters {
-                emitter.flags |= Flags::OUT_OF_TIME;
-            }
+        let is_limited = [&budgets.search, &budgets.pencil, &budgets.reweighting]
+            .iter()
+            .any(|b| b.is_limited);
+        let mut flags = Flags::empty();
+        flags.set(Flags::OUT_OF_TIME, is_cut_short);
+        flags.set(Flags::LIMIT_REACHED, is_limited);
+        for emitter in &mut found.emitters {
+            emitter.flags |= flags;
         }
         Estimate {
             emitters: found.emitters,
             estimator: self.spec.name,
             is_cut_short,
+            is_limited,
             reduced_chi2: found.reduced_chi2,
             spot_error,
             saturated_share: self.frame.saturated_share(),

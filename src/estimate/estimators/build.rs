@@ -3,9 +3,10 @@
 use crate::estimate::config::{Config, ConfigError};
 use crate::estimate::estimator::Estimator;
 use crate::estimate::estimators::analytic::AnalyticEstimator;
-use crate::estimate::estimators::list::{DEFAULT, Learned, find};
+use crate::estimate::estimators::list::{DEFAULT, Learned, Method, find};
 use crate::estimate::estimators::network::NetworkEstimator;
 use crate::estimate::estimators::pixel_correction::PixelCorrected;
+use crate::estimate::estimators::windowed::WindowedEstimator;
 use crate::estimate::sequence::SequenceEstimator;
 use crate::optics::Camera;
 
@@ -42,16 +43,19 @@ pub fn build(config: &Config, camera: &Camera) -> Result<Box<dyn Estimator>, Con
         )?),
         None => {
             let spec = find(name)?;
-            let single = AnalyticEstimator::new(spec, camera, config.known_power.as_ref(), config.rules);
-            match spec.remembers() {
-                true => Box::new(SequenceEstimator::new(
+            let single = || AnalyticEstimator::new(spec, camera, config.known_power.as_ref(), config.rules);
+            match spec.method {
+                Method::Sequence => Box::new(SequenceEstimator::new(
                     spec,
-                    single,
+                    single(),
                     camera,
                     config.memory_s(),
                     config.rules,
                 )),
-                false => Box::new(single),
+                Method::MaximumLikelihood if WindowedEstimator::suits(camera, config.rules) => {
+                    Box::new(WindowedEstimator::new(spec, camera, config.rules))
+                }
+                _ => Box::new(single()),
             }
         }
     };

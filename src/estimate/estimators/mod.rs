@@ -5,3 +5,4 @@ pub mod build;
 pub mod list;
 pub mod network;
 pub mod pixel_correction;
+pub mod windowed;

@@ -103,6 +103,7 @@ impl Estimator for NetworkEstimator {
             emitters: found.emitters,
             estimator: self.name(),
             is_cut_short: false,
+            is_limited: false,
             reduced_chi2: found.reduced_chi2,
             spot_error: 0.0,
             saturated_share: self.frame.saturated_share(),

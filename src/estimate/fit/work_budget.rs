@@ -28,6 +28,8 @@ pub(crate) struct WorkBudget<'a> {
     pub steps: u64,
     /// Whether a reserve has forgiven work.
     is_forgiven: bool,
+    /// Whether a search left light because it had as many sources as it may.
+    pub is_limited: bool,
     is_over: &'a dyn Fn() -> bool,
 }
 
@@ -41,6 +43,7 @@ impl<'a> WorkBudget<'a> {
             max_components: 0.0,
             steps: 0,
             is_forgiven: false,
+            is_limited: false,
             is_over,
         }
     }

@@ -18,7 +18,7 @@ const SMEAR_LOSS: f64 = 0.1;
 /// Most emitters of a frame: bounds time and memory whatever the frame shows.
 const MAX_SOURCES: usize = 80;
 /// Excess of the deviance up to which noise alone explains it. Larger leaves faint sources unfound, smaller searches frames again.
-pub(crate) const MOST_EXCESS: f64 = 2.5;
+const MOST_EXCESS: f64 = 2.5;
 
 /// Coefficients of a preprocessed frame and the statistics of the rest of it.
 #[derive(Clone, Default)]
@@ -50,6 +50,8 @@ pub(crate) struct CompressedFrame {
     pub mean_variance: f64,
     pub light_weighted_variance: f64,
     pub smear: Option<DisplacedSpots>,
+    /// Added to [`MOST_EXCESS`] where the frame is one of many windows: more of them have an excess by chance.
+    pub spare_excess: f64,
     rows: Vec<f64>,
 }
 
@@ -226,7 +228,12 @@ impl CompressedFrame {
 
     /// Whether the deviance of a hypothesis is that of noise alone.
     pub fn is_explained_by(&self, hypothesis: &Hypothesis) -> bool {
-        self.excess(hypothesis) < MOST_EXCESS
+        self.excess(hypothesis) < self.most_excess()
+    }
+
+    /// Excess up to which noise alone explains the frame.
+    pub fn most_excess(&self) -> f64 {
+        MOST_EXCESS + self.spare_excess
     }
 
     /// Deviance beyond its expectation, in units of about its standard deviation.

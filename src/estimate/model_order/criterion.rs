@@ -1,6 +1,5 @@
 //! The criterion that hypotheses are compared by: a penalised likelihood, or the evidence where users' powers are known.
 
-use crate::estimate::model::bases::Bases;
 use crate::estimate::model::hypothesis::{Hypothesis, Width};
 use crate::estimate::model_order::power_prior::PowerPrior;
 
@@ -23,8 +22,9 @@ pub(crate) struct Criterion<'a> {
 
 /// The matched filter has about area/σ² independent positions; the penalty keeps the probability that any of them exceeds it in an empty
 /// frame below 1e-3.
-pub(crate) fn source_penalty(bases: &Bases) -> f64 {
-    let [x, y] = bases.axes().map(|b| b.edges[b.n] - b.edges[0]);
+///
+/// The sensor's widths are in σ.
+pub(crate) fn source_penalty([x, y]: [f64; 2]) -> f64 {
     (10.0 + 2.0 * (x * y).ln()).max(14.0)
 }
 

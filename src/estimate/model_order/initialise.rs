@@ -35,7 +35,9 @@ pub(crate) fn initial_hypothesis(search: &mut Search) -> Hypothesis {
         width: Width::Known,
     }));
     let peaks = search.residual_peaks(&mut candidate);
-    candidate.sources = strong_sources(&peaks, search.compressed().max_sources()).collect();
+    let most = search.compressed().max_sources();
+    search.context.budget.is_limited |= peaks.len() > most;
+    candidate.sources = strong_sources(&peaks, most).collect();
     search.fit_trial(&mut candidate);
     candidate.into_hypothesis()
 }
@@ -66,6 +68,7 @@ pub(crate) fn add_residual_peaks(search: &mut Search, mut candidate: Candidate) 
     let most = search.compressed().max_sources();
     while candidate.sources.len() < most && (candidate.sources.is_empty() || !search.is_explained_by(&candidate)) {
         let peaks = search.residual_peaks(&mut candidate);
+        search.context.budget.is_limited |= candidate.sources.len() + peaks.len() > most;
         let mut next = candidate.clone();
         next.sources
             .extend(strong_sources(&peaks, most - candidate.sources.len()));
@@ -151,7 +154,12 @@ fn has_visible_background(frame: &PreprocessedFrame) -> bool {
         usable += 1.0;
         low += f64::from(u8::from(*p < -1.0));
     }
-    let expected: f64 = BELOW_ONE * usable;
+    is_background_visible(usable, low)
+}
+
+/// The same by the number of usable pixels and of those below −1.
+pub(crate) fn is_background_visible(usable: f64, low: f64) -> bool {
+    let expected = BELOW_ONE * usable;
     low < 0.25 * expected - 5.0 || low > expected + 5.0 * expected.sqrt()
 }
 

@@ -66,7 +66,7 @@ impl SearchSpace {
         Self {
             matched_filter: MatchedFilter::new(&bases.x, &bases.y),
             pencil,
-            source_penalty: source_penalty(&bases),
+            source_penalty: source_penalty(bases.axes().map(|b| b.edges[b.n] - b.edges[0])),
             rules,
             workspace: Workspace::default(),
             bases,
@@ -176,7 +176,11 @@ impl<'a> Search<'a, '_> {
 
     /// Fits `next` and keeps it if it scores better.
     pub fn try_accept(&mut self, candidate: &mut Candidate, mut next: Hypothesis) -> bool {
-        if next.sources.len() > self.compressed().max_sources() || self.is_exhausted() {
+        if next.sources.len() > self.compressed().max_sources() {
+            self.context.budget.is_limited = true;
+            return false;
+        }
+        if self.is_exhausted() {
             return false;
         }
         self.fit_against(candidate, &mut next);

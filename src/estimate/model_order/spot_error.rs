@@ -3,7 +3,7 @@
 
 use crate::estimate::fit::work_budget::WorkBudget;
 use crate::estimate::model::bases::Bases;
-use crate::estimate::model::compressed_frame::{CompressedFrame, MOST_EXCESS};
+use crate::estimate::model::compressed_frame::CompressedFrame;
 use crate::estimate::model::halo::{Halo, height, spot_norm};
 use crate::estimate::model::hypothesis::{Hypothesis, Nuisances, PointSource, Width};
 use crate::estimate::model_order::candidate::Candidate;
@@ -63,7 +63,7 @@ pub(crate) fn inspect_shape(
     excess: f64,
     budget: &mut WorkBudget,
 ) -> Shape {
-    let is_explained = excess < MOST_EXCESS;
+    let is_explained = excess < compressed.most_excess();
     let is_narrow = is_narrow(&space.bases);
     let has_width = hypothesis.nuisances.width != Width::Known;
     let (merged, separate) = (bright_spots(hypothesis, true), bright_spots(hypothesis, false));

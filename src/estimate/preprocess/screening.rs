@@ -7,6 +7,12 @@ use crate::optics::{Camera, DisplacedSpots};
 /// Values of this many standard deviations or more count as non-finite: their squares approach the range of f64.
 const OVERFLOWS: f64 = 1e100;
 
+/// Whether a fit may use a pixel's value, J: finite in units of the noise, 1/`scale`, and below saturation at `ceiling`.
+#[inline(always)]
+pub(crate) fn is_usable(value: f64, scale: f64, ceiling: f64) -> bool {
+    (value * scale).abs() < OVERFLOWS && value < ceiling
+}
+
 /// A frame in units of the noise's standard deviation, with its masked pixels listed and filled in.
 #[derive(Clone, Default)]
 pub(crate) struct PreprocessedFrame {
@@ -26,6 +32,8 @@ pub(crate) struct FlaggedPixel {
     pub x: usize,
     pub y: usize,
     pub is_saturated: bool,
+    /// It holds light that is searched for elsewhere: the emitters here lack nothing.
+    pub is_foreign: bool,
 }
 
 impl PreprocessedFrame {
@@ -49,7 +57,7 @@ impl PreprocessedFrame {
         let ceiling = camera.saturation_limit_j();
         self.pixels.extend(frame.pixels.iter().map(|value| value * scale));
         self.is_masked.resize(self.pixels.len(), false);
-        let is_sound = |value: f64| (value * scale).abs() < OVERFLOWS && value < ceiling;
+        let is_sound = |value: f64| is_usable(value, scale, ceiling);
         // The common case: without branches, so that the loop is vectorised.
         if frame.masked.is_none() && frame.pixels.iter().fold(true, |all, &value| all & is_sound(value)) {
             return Ok(());
@@ -64,7 +72,12 @@ impl PreprocessedFrame {
             nan += usize::from(!((value * scale).abs() < OVERFLOWS));
             masked += usize::from(is_masked);
             self.saturated += usize::from(is_saturated);
-            self.flagged.push(FlaggedPixel { x, y, is_saturated });
+            self.flagged.push(FlaggedPixel {
+                x,
+                y,
+                is_saturated,
+                is_foreign: false,
+            });
             self.is_masked[k] = true;
             self.pixels[k] = ceiling * scale;
         }
@@ -92,6 +105,21 @@ impl PreprocessedFrame {
                 x,
                 y,
                 is_saturated: false,
+                is_foreign: false,
+            });
+        }
+    }
+
+    /// Masks a pixel that holds light of emitters that are searched for elsewhere.
+    pub fn exclude(&mut self, x: usize, y: usize, nx: usize) {
+        let k = y * nx + x;
+        if !std::mem::replace(&mut self.is_masked[k], true) {
+            self.pixels[k] = 0.0;
+            self.flagged.push(FlaggedPixel {
+                x,
+                y,
+                is_saturated: false,
+                is_foreign: true,
             });
         }
     }

@@ -81,6 +81,7 @@ pub(crate) fn report(
         emitters: found.emitters,
         estimator: name,
         is_cut_short: is_over(),
+        is_limited: n >= compressed.max_sources(),
         reduced_chi2: found.reduced_chi2,
         spot_error: 0.0,
         saturated_share: frame.saturated_share(),

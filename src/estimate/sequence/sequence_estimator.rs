@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use jiff::Timestamp;
-use nalgebra::{DMatrix, DVector};
+use nalgebra::DVector;
 
 use crate::estimate::emitter::Estimate;
 use crate::estimate::error::Error;

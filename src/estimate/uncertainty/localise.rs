@@ -18,7 +18,7 @@ use crate::optics::Camera;
 /// A masked pixel within this distance, σ, sets a flag: 99 % of a spot's light lies within.
 const MASKED_DISTANCE: f64 = 3.0;
 /// A source within this distance of the edge, σ, is flagged: nearer, the edge cuts more than 2 % of its light.
-const EDGE_DISTANCE: f64 = 2.0;
+pub(crate) const EDGE_DISTANCE: f64 = 2.0;
 /// Condition number beyond which the ridge under the information matrix is no longer small against its least eigenvalue.
 const MAX_CONDITION: f64 = 0.01 / RIDGE;
 /// Sources this many standard deviations of their difference apart are resolved.
@@ -128,7 +128,7 @@ pub(crate) fn localise(
             let near_edge =
                 (0..2).any(|k| source.u[k] < low[k] + EDGE_DISTANCE || source.u[k] > high[k] - EDGE_DISTANCE);
             flags.set(Flags::NEAR_EDGE, near_edge);
-            for bad in &frame.flagged {
+            for bad in frame.flagged.iter().filter(|bad| !bad.is_foreign) {
                 let centre = [bad.x, bad.y].map(|k| k as f64 + 0.5);
                 let d2: f64 = (0..2)
                     .map(|k| (low[k] + centre[k] * pitch[k] - source.u[k]).powi(2))

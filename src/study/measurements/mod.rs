@@ -4,6 +4,7 @@
 
 mod alone;
 mod calibration;
+mod crowds;
 mod flights;
 mod formats;
 mod handover;
@@ -69,6 +70,7 @@ pub const ALL: &[Measurement] = &[
     measurement("sequence", 8, sequence::frames_together),
     measurement("smear", 100, smear::smears),
     measurement("formats", 200, formats::cost),
+    measurement("crowds", 40, crowds::crowds),
 ];
 
 const fn measurement(name: &'static str, stories: u64, run: fn(u64, u64) -> Measured) -> Measurement {

@@ -238,6 +238,7 @@ pub fn tell_with(story: &Story, keep: bool) -> Told {
         }
         let mut estimate = Estimate {
             is_cut_short: false,
+            is_limited: false,
             emitters: detect(story, t, &mut rng),
             estimator: "story",
             reduced_chi2: 1.0,
