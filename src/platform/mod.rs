@@ -57,7 +57,7 @@ pub enum Error {
 /// is little of them, and short against a sway.
 const RATES_OVER_S: f64 = 0.1;
 /// Rates within an exposure are taken over at least this time to either side of its middle, s: longer misses a sway's turning, shorter takes
-/// the poses' own noise for motion (3 mrad of noise a pose then smears a spot by 0.02 of an exposure of 10 ms at most).
+/// the poses' own noise for motion: 3 mrad a pose make 0.04 rad/s, or 0.4 mrad of smear in 10 ms.
 const SMEAR_OVER_S: f64 = 0.05;
 /// Frames that wait for the poses after them.
 const MOST_WAITING: usize = 64;
