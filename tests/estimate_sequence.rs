@@ -68,6 +68,7 @@ impl Scene {
             time: Timestamp::UNIX_EPOCH + SignedDuration::from_secs_f64(time_s),
             pixels,
             masked: None,
+            exposure_s: None,
         }
     }
 
