@@ -28,8 +28,6 @@ const MAX_LEFT: f64 = 0.35;
 const MAX_LEFT_OF_ONE: f64 = 0.5;
 /// Share of the spots that a misfit is common to, at an offset and in all. Half agree by chance where a crowd is not resolved yet.
 const COMMON: f64 = 0.75;
-/// Spots nearer to the sensor's middle than this share of the farthest one's distance show little of a misfit that grows with it.
-const LEAST_SCALE: f64 = 0.3;
 /// Other bright spots within [`NEAR`] σ of half of the spots, up to which these are no crowd.
 const MAX_NEAR: usize = 1;
 const NEAR: f64 = 5.0;
@@ -143,51 +141,28 @@ pub(crate) fn common_misfit(search: &mut Search, candidate: &mut Candidate, leas
     }
     let ends = bases.axes().map(|b| [b.edges[0], b.edges[b.n]]);
     let middle = ends.map(|[low, high]| 0.5 * (low + high));
-    let from_middle = |s: &PointSource| [0, 1].map(|k| s.u[k] - middle[k]);
-    let far = bright
-        .iter()
-        .map(|s| from_middle(s).map(|v| v * v).iter().sum::<f64>().sqrt())
-        .fold(f64::MIN_POSITIVE, f64::max);
-    let turned = |axis: [f64; 2]| {
-        bright
-            .iter()
-            .map(|s| View {
-                spot: s,
-                axis,
-                scale: 1.0,
-            })
-            .collect::<Vec<View>>()
+    let radial = |s: &&PointSource| {
+        let d = [0, 1].map(|k| s.u[k] - middle[k]);
+        let length = d[0].hypot(d[1]);
+        if length > 0.0 {
+            d.map(|v| v / length)
+        } else {
+            [1.0, 0.0]
+        }
     };
-    // Along the sensor's axes; along each spot's direction from the sensor's middle and growing with the distance from it, as coma does; and
-    // each spot with itself turned by half a turn, as few spots have little else to be compared with.
-    let along_axes = turned([1.0, 0.0]);
-    let radial = bright.iter().filter_map(|s| {
-        let [x, y] = from_middle(s);
-        let length = x.hypot(y);
-        let scale = length / far;
-        (scale > LEAST_SCALE).then(|| View {
-            spot: s,
-            axis: [x / length, y / length],
-            scale,
-        })
-    });
-    let radial: Vec<View> = radial.collect();
-    let mirrored = [along_axes.clone(), turned([-1.0, 0.0])].concat();
-    [along_axes, radial, mirrored]
+    let views = |turn: &dyn Fn(&&PointSource) -> [f64; 2]| bright.iter().map(|s| (*s, turn(s))).collect::<Vec<View>>();
+    // Along the sensor's axes; along each spot's direction from the sensor's middle, as for coma; and each spot with itself turned by half a
+    // turn, as few spots have little else to be compared with.
+    let along_axes = views(&|_| [1.0, 0.0]);
+    let mirrored = [along_axes.clone(), views(&|_| [-1.0, 0.0])].concat();
+    [along_axes, views(&radial), mirrored]
         .iter()
         .map(|views| compare(views, sources, norm, ends, |u| filter.response_at(u)))
         .fold(ring, f64::max)
 }
 
-/// A spot as it is compared.
-#[derive(Clone, Copy)]
-struct View<'a> {
-    spot: &'a PointSource,
-    /// The direction that its offsets are taken along.
-    axis: [f64; 2],
-    /// Its share of the common misfit, 1 of the spot that has most.
-    scale: f64,
-}
+/// A spot and the direction that its offsets are taken along.
+type View<'a> = (&'a PointSource, [f64; 2]);
 
 fn compare(
     views: &[View],
@@ -208,8 +183,7 @@ fn compare(
                 continue;
             }
             values.clear();
-            for (i, view) in views.iter().enumerate() {
-                let (spot, [c, s]) = (view.spot, view.axis);
+            for (i, (spot, [c, s])) in views.iter().enumerate() {
                 let u = [
                     spot.u[0] + c * offset[0] - s * offset[1],
                     spot.u[1] + s * offset[0] + c * offset[1],
@@ -220,9 +194,9 @@ fn compare(
                 let own = spot.a * halo::height(d2);
                 let is_own = sources
                     .iter()
-                    .all(|t| std::ptr::eq(t, spot) || t.a * halo::height(distance2(t.u, u)) < own);
+                    .all(|t| std::ptr::eq(t, *spot) || t.a * halo::height(distance2(t.u, u)) < own);
                 if let Some(r) = response(u).filter(|_| is_own) {
-                    values.push((r / (spot.a * norm * view.scale), r, i));
+                    values.push((r / (spot.a * norm), r, i));
                 }
             }
             // In a crowd few spots have an offset to themselves, and a few agree by chance.
@@ -246,7 +220,7 @@ fn compare(
             let is_visible = values.iter().any(|v| v.1.abs() > VISIBLE);
             for &(_, r, i) in &values {
                 if is_visible {
-                    let t = common * views[i].spot.a * norm * views[i].scale;
+                    let t = common * views[i].0.a * norm;
                     sums[i][0] += r * r - 1.0;
                     sums[i][1] += r * t;
                     sums[i][2] += t * t;
