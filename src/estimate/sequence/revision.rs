@@ -38,7 +38,7 @@ pub(crate) enum Revised {
     /// Nothing is better.
     Finished,
     /// A window that explains the frames better, as of the time when the search began.
-    Better(Window),
+    Better(Box<Window>),
 }
 
 /// A search in progress.
@@ -98,7 +98,7 @@ impl Revision {
                 continue;
             }
             if let Some(better) = self.conclude(search, trial) {
-                return Revised::Better(better);
+                return Revised::Better(Box::new(better));
             }
         }
         Revised::Unfinished

@@ -42,8 +42,11 @@ const SEARCH_GROWTH: f64 = 1.4;
 const SEARCH_AFTER: usize = 32;
 /// Work of a search that has to end with its frame, in frames' searches: where what is remembered explains nothing.
 const SEARCH_WORK: f64 = 0.5;
-/// Work of a search that goes on from frame to frame, a frame: less finds emitters later, more makes frames slower.
-const REVISION_WORK: f64 = 0.04;
+/// Work of a search that goes on from frame to frame, a frame: less finds emitters later, more makes frames slower. A window that is shorter
+/// than `SEARCH_AFTER` by some factor is given more by that factor, up to `YOUNG`: it is the first frames that make the number right.
+const REVISION_WORK: f64 = 0.06;
+/// Frames up to which what is remembered is likelier wrong than that somebody has turned.
+const YOUNG: usize = 8;
 
 /// An estimator that remembers.
 pub(crate) struct SequenceEstimator {
@@ -155,7 +158,11 @@ impl SequenceEstimator {
                 self.accept(fresh);
                 return None;
             }
-            // Somebody has turned or stopped: the same with a manoeuvre since the frame before.
+            // The first frames may have been misread; later it is likelier that somebody has turned or stopped: the same with a manoeuvre since
+            // the frame before.
+            if self.window.snapshots.len() <= YOUNG && self.search_again(time_s, is_over) {
+                return None;
+            }
             let unit = 1.0 / self.ground_m();
             let mut opened = self.window.total.clone();
             open(&mut opened, elapsed, unit);
@@ -167,7 +174,7 @@ impl SequenceEstimator {
                 return None;
             }
         }
-        if is_even && self.search_again(time_s, is_over) {
+        if is_even && self.window.snapshots.len() > YOUNG && self.search_again(time_s, is_over) {
             return None;
         }
         // What is remembered is wrong where this frame alone is explained and its prediction is not.
@@ -205,11 +212,8 @@ impl SequenceEstimator {
         if after == before {
             return Some(grown);
         }
-        let alone = self
-            .single
-            .estimate_loaded(scale, &|| budget.is_exhausted())
-            .emitters
-            .len();
+        let found = self.single.estimate_loaded(scale, &|| budget.is_exhausted());
+        let alone = found.emitters.len();
         if (before..after).contains(&alone) {
             self.fit_fresh(plain, false, budget)
         } else {
@@ -350,7 +354,9 @@ impl SequenceEstimator {
         }
         let left = std::mem::take(&mut self.left);
         let memory_s = self.memory_s;
-        let mut budget = WorkBudget::of_frames(REVISION_WORK, is_over);
+        let youth = SEARCH_AFTER as f64 / length.max(1) as f64;
+        let work = REVISION_WORK * youth.clamp(1.0, YOUNG as f64);
+        let mut budget = WorkBudget::of_frames(work, is_over);
         let (revision, has_changed) = self.with_search(&mut budget, |window, search| {
             let revision = revision.or_else(|| Revision::begin(window, search, search.births(window, &left)));
             let Some(mut revision) = revision else {
@@ -363,7 +369,7 @@ impl SequenceEstimator {
                     let newer = window.snapshots.iter().filter(|s| s.time_s > revision.time_s());
                     let newer: Vec<Snapshot> = newer.cloned().collect();
                     better.catch_up(search.engine, &newer, memory_s);
-                    *window = better;
+                    *window = *better;
                     (None, true)
                 }
             }
