@@ -42,7 +42,10 @@ fn alert(id: &str, kind: AlertKind, raised_s: i64) -> Alert {
 
 fn event(event: AlertEventKind, mut alert: Alert) -> AlertEvent {
     alert.state = match event {
-        AlertEventKind::Raised | AlertEventKind::Updated | AlertEventKind::Unacknowledged => AlertState::Open,
+        AlertEventKind::Raised
+        | AlertEventKind::Updated
+        | AlertEventKind::Unacknowledged
+        | AlertEventKind::Reported => AlertState::Open,
         AlertEventKind::Acknowledged => AlertState::Acknowledged,
         AlertEventKind::Cleared => AlertState::Cleared,
     };
