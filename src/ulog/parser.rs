@@ -2,8 +2,8 @@
 
 use std::collections::HashMap;
 
+use super::log::{Attitude, Axes, Log, Place};
 use super::message::{Basic, Data, Number};
-use super::{Attitude, Axes, Log, Place};
 
 /// Bits of the incompatibility flags that are understood: data may be appended, which is only read in order here.
 const KNOWN_FLAGS: u8 = 1;

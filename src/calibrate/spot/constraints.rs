@@ -1,9 +1,10 @@
 //! What a template keeps to whatever the frames say: a prior that fades at the edge, a centre, a support with all its light.
 
-use super::statistics::HALO;
 use super::template_model::TemplateModel;
 use crate::optics::Camera;
 
+/// The halo that a spot error is a share of: half-width at half its height, σ. That of the estimator's noise model.
+pub const HALO: f64 = 3.0;
 /// Width of the margin over which the prior fades out, share of the support.
 const TAPER: f64 = 0.2;
 

@@ -3,15 +3,13 @@
 use faer::Mat;
 use ndarray::Array2;
 
-use super::constraints::norm;
+use super::constraints::{HALO, norm};
 use super::learn::Learner;
 use crate::calibrate::exposure::ScaledCholesky;
 use crate::stats::median;
 
 /// Rings around spots, σ, within each of which the template's error is measured.
 const RINGS: [f64; 6] = [0.0, 1.5, 3.0, 5.0, 8.0, 12.0];
-/// The halo that a spot error is a share of: half-width at half its height, σ. That of the estimator's noise model.
-pub const HALO: f64 = 3.0;
 /// Standard deviations from which a figure counts.
 const SIGNIFICANT: f64 = 3.0;
 /// Residuals beyond this many σ are outliers, with what a template that is this wrong would add.
