@@ -40,7 +40,7 @@ pub async fn picture(Shared(state): Shared<State>, headers: HeaderMap) -> Result
 /// A tile of the map below
 #[utoipa::path(get, path = "/v1/background/tiles/{zoom}/{column}/{row}", tag = "positions",
     params(
-        ("zoom" = u8, Path, description = "Zoom of the XYZ scheme"),
+        ("zoom" = u32, Path, description = "Zoom of the XYZ scheme"),
         ("column" = u32, Path, description = "Column, from the west"),
         ("row" = u32, Path, description = "Row, from the north"),
     ),
@@ -51,12 +51,12 @@ pub async fn picture(Shared(state): Shared<State>, headers: HeaderMap) -> Result
     ))]
 pub async fn tile(
     Shared(state): Shared<State>,
-    Path((zoom, column, row)): Path<(u8, u32, u32)>,
+    Path((zoom, column, row)): Path<(u32, u32, u32)>,
 ) -> Result<Response, Problem> {
     let none = || Problem::not_found(format!("there is no tile {zoom}/{column}/{row}"));
     let background: Arc<Background> = state.background.ok_or_else(none)?;
     let read = move || match &background.source {
-        Source::Tiles(tiles) => tiles.read(zoom, column, row),
+        Source::Tiles(tiles) => tiles.read(u8::try_from(zoom).ok()?, column, row),
         Source::Picture { .. } => None,
     };
     let bytes = tokio::task::spawn_blocking(read).await.expect("reading does not panic");
