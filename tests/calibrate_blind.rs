@@ -78,7 +78,8 @@ fn an_airy_disc_is_learned_from_frames_of_unknown_positions() {
         1.0 - libm::j0(x).powi(2) - libm::j1(x).powi(2)
     };
     let reach = report["spot"]["reach_m"].as_f64().unwrap();
-    assert!((6e-3..9e-3).contains(&reach), "{report}");
+    // Where the light of the brightest spot sinks below a tenth of a pixel's noise.
+    assert!((6e-3..12e-3).contains(&reach), "{report}");
     for point in report["spot"]["encircled_energy"].as_array().unwrap() {
         let (r, energy) = (point[0].as_f64().unwrap(), point[1].as_f64().unwrap());
         let expected = share(r) / share(0.9 * reach);
