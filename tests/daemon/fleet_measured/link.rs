@@ -50,14 +50,13 @@ fn fill(port: u16, is_full: bool) {
         };
         let stream = context.get_or_create_stream(config).await.unwrap();
         stream.purge().await.unwrap();
-        while is_full {
+        let mut has_room = is_full;
+        while has_room {
             let sent = context
                 .publish("oapwatch.harbour.ap0.alert", vec![b'x'; 512].into())
                 .await
                 .unwrap();
-            if sent.await.is_err() {
-                break;
-            }
+            has_room = sent.await.is_ok();
         }
     };
     let runtime = tokio::runtime::Builder::new_current_thread()
