@@ -29,7 +29,7 @@ pub struct Args {
     /// Estimator to use instead of the configured one; `oapwatch tradeoff` compares them
     #[arg(long)]
     estimator: Option<String>,
-    /// FRAMES.npy, - for stdin, or a recording of [record] (a file of it or the folder), with its own times and poses
+    /// FRAMES.npy, - for stdin, or a recording that the daemon made (a file of it or the folder), with its own times and poses
     frames: PathBuf,
 }
 

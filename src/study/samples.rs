@@ -39,7 +39,7 @@ pub enum Error {
     Io(#[from] std::io::Error),
 }
 
-/// Writes samples `first .. first + samples`, [`BATCH`] of each device in turn. Any part of a stream can be made again from its number.
+/// Writes samples `first .. first + samples`, 64 of each device in turn. Any part of a stream can be made again from its number.
 ///
 /// `devices`: at least one, with cameras of one shape; the first is the one that the stream describes.
 pub fn write(devices: &[Plan], scene: &str, first: u64, samples: u64, out: &mut impl Write) -> Result<(), Error> {
