@@ -13,6 +13,7 @@ use crate::estimate::model::compressed_frame::CompressedFrame;
 use crate::estimate::model::hypothesis::{Hypothesis, Nuisances, PointSource};
 use crate::estimate::model::svd_basis::Basis;
 use crate::estimate::model_order::candidate::Candidate;
+use crate::estimate::model_order::common_misfit::is_narrow;
 use crate::estimate::model_order::initialise::{add_residual_peaks, initial_hypothesis, initialise};
 use crate::estimate::model_order::map_search::maximum_posterior;
 use crate::estimate::model_order::maximum_likelihood::maximum_likelihood;
@@ -211,9 +212,9 @@ impl AnalyticEstimator {
     }
 
     /// A search that ends early where the spots differ from the PSF in the same way: the frame is then searched again with that allowed for.
-    /// Every other frame is searched in full. Only where spots stand apart; elsewhere they show their shape in the end, if at all.
+    /// Every other frame is searched in full. Not where spots are all core: these show their shape in the end, if at all.
     fn search_unless_misfit(&mut self, initial: Hypothesis, budget: &mut WorkBudget) -> Found {
-        if self.camera.spot_error.is_some() || !self.space.bases.are_pixels() {
+        if self.camera.spot_error.is_some() || is_narrow(&self.space.bases) {
             return self.search_with_outliers(initial, budget);
         }
         let kept = (self.frame.clone(), self.compressed.clone());
