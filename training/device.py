@@ -4,6 +4,7 @@ another scene. Prints the width's relative scatter from device to device, σ_eff
 import argparse
 import hashlib
 import json
+import re
 import tomllib
 from pathlib import Path
 
@@ -35,6 +36,8 @@ def main() -> None:
     head, rest = light.split("[optics]")
     noise = tomllib.loads(light)["optics"]["noise_std_j"]
     rest = rest[rest.index("\n[") + 1 :]
+    view = [side / optics["plane_distance_m"] * optics["altitude_m"] for side in optics["sensor_size_m"]]
+    rest = re.sub(r"(?m)^area_m = .*$", f"area_m = {view}", rest)
     lines = [f"{key} = {json.dumps(optics[key])}" for key in GEOMETRY]
     lines += [f"spot_sigma_m = {spot['sigma_m']}", f"noise_std_j = {noise}"]
     scene = f"{head}[optics]\n" + "\n".join(lines) + f"\n\n{rest}gain = {{ std = {GAIN_STD['pixels' in calibration]} }}\n"
