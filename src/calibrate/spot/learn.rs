@@ -25,7 +25,7 @@ const MOST_SPLINES: usize = 97;
 /// Largest half of the support, half sensors: spots near an edge show their tails as far as the other edge.
 const WIDEST: f64 = 1.8;
 /// Light at the edge that matters: of the brightest spot, in standard deviations of one pixel. The tails of five spots at this height add
-/// up to a quarter of an emitter's threshold; more leaves them to the spot error, less takes longer.
+/// up to a quarter of an emitter's threshold, by estimate; more leaves them to the spot error, less takes longer. Not measured.
 const EDGE_LIGHT: f64 = 0.1;
 /// Support of what changes over the field, σ: aberrations that change widely are near the core.
 const FIELD_RADIUS: f64 = 7.0;

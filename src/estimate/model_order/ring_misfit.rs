@@ -15,6 +15,7 @@ use crate::estimate::model::svd_basis::Basis;
 const SPACING: f64 = 0.75;
 const KNOTS: usize = 17;
 /// Decrease of the deviance by the profile of the others, of all quadrants together; and standard deviations of a knot from which it counts.
+/// These and the thresholds below are estimates; none was varied.
 const SIGNIFICANT: f64 = 16.0;
 const SIGNIFICANT_KNOT: f64 = 3.0;
 /// Deviance that a quadrant keeps from which it holds light of its own.
