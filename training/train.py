@@ -91,6 +91,13 @@ def device_of(name: str) -> torch.device:
     return torch.device("cuda" if has_gpu else "cpu")
 
 
+def has_bf16(device: torch.device) -> bool:
+    if device.type == "cuda":
+        return torch.cuda.is_bf16_supported(including_emulation=False)
+    able = torch.cpu.get_capabilities()
+    return bool(able.get("avx512_bf16") or able.get("amx_bf16"))
+
+
 def machine_of(device: torch.device, threads: int) -> str:
     if device.type == "cuda":
         return f"one {torch.cuda.get_device_name(device)}"
@@ -118,8 +125,11 @@ def main() -> None:
     parser.add_argument("--devices", type=int, default=1, help="that samples are spread over, each with gains of its own")
     parser.add_argument("--width-std", type=float, default=0.0, help="relative scatter of the spot's width from device to device")
     parser.add_argument("--target-sigma-px", type=float, default=0.7)
+    parser.add_argument("--target-sigma-m", type=float, default=0.0, help="no narrower than this on the ground: a heatmap has no maximum where it is less certain")
     parser.add_argument("--from-run", type=Path, help="begin with the weights of another run of the same network")
-    parser.add_argument("--precision", choices=("bf16", "f32"), default="bf16", help="of the convolutions while training")
+    parser.add_argument(
+        "--precision", choices=("auto", "bf16", "f32"), default="auto", help="of the convolutions while training; bf16 where the device has instructions for it, which are emulated elsewhere at a ninth of the speed"
+    )
     parser.add_argument("--validations", type=int, default=10, help="how often to validate and keep a checkpoint")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto")
@@ -128,6 +138,7 @@ def main() -> None:
 
     device = device_of(args.device)
     processes = args.processes or (max(1, (os.cpu_count() or 2) - 2) if device.type == "cuda" else 1)
+    is_bf16 = args.precision == "bf16" or (args.precision == "auto" and has_bf16(device))
     torch.set_num_threads(args.threads)
     torch.manual_seed(0)
     args.out.mkdir(parents=True, exist_ok=True)
@@ -138,6 +149,7 @@ def main() -> None:
     validation = list(held_out.batches(32))
     held_out.close()
     metre_px = layout["ground_m_per_px"][0]
+    target_sigma_px = max(args.target_sigma_px, args.target_sigma_m / metre_px)
 
     network = build(args.network, layout["nx"], layout["ny"]).to(device, memory_format=torch.channels_last)
     optimiser = torch.optim.Adam(network.parameters(), lr=args.rate)
@@ -155,7 +167,7 @@ def main() -> None:
             first = Stream(args.program, args.scene, WHITENING, 0, TRAINING_SEED, scatter)
             network.front.learn(next(first.batches(WHITENING))[0].to(device))
             first.close()
-    about = {"name": args.network, "target_sigma_px": args.target_sigma_px, "layout": layout}
+    about = {"name": args.network, "target_sigma_px": target_sigma_px, "layout": layout}
     about["machine"] = machine_of(device, args.threads)
     # A processor's time leaves out what else the machine does; a GPU has no such clock.
     clock = time.monotonic if device.type == "cuda" else time.process_time
@@ -170,7 +182,7 @@ def main() -> None:
 
     def keep():
         at = seconds()
-        curve.append({"samples": seen, "seconds": round(at), **validate(network, validation, args.target_sigma_px, metre_px, device)})
+        curve.append({"samples": seen, "seconds": round(at), **validate(network, validation, target_sigma_px, metre_px, device)})
         bar.write(json.dumps(curve[-1]))
         state = {"network": network.state_dict(), "body": network.body.state_dict(), "optimiser": optimiser.state_dict()}
         save(checkpoint, {**state, "seen": seen, "curve": curve, "seconds": at, **about})
@@ -188,9 +200,9 @@ def main() -> None:
         for group in optimiser.param_groups:
             group["lr"] = args.rate * min(1.0, done / WARM_UP + 0.05) * 0.5 * (1 + math.cos(math.pi * done))
         optimiser.zero_grad()
-        with torch.autocast(device.type, torch.bfloat16, enabled=args.precision == "bf16"):
+        with torch.autocast(device.type, torch.bfloat16, enabled=is_bf16):
             output = network(normalise(frames).contiguous(memory_format=torch.channels_last))
-        loss = loss_of(output, frames, emitters, args.target_sigma_px)
+        loss = loss_of(output, frames, emitters, target_sigma_px)
         loss.backward()
         optimiser.step()
         seen += len(frames)

@@ -19,6 +19,7 @@ networks=${NETWORKS:-cnn16 cnn16-separable unet}
 python=${PYTHON:-training/.venv/bin/python}
 program=${PROGRAM:-target/release/oapwatch}
 device=${DEVICE:-auto}
+target_m=${TARGET_M:-0}
 if [ ! -x "$python" ]; then
   python3 -m venv training/.venv
   training/.venv/bin/pip install -r training/requirements.txt
@@ -52,7 +53,7 @@ for pixels in $sizes; do
       from=()
       if [ "$network" = unet ] && [ -n "${smaller[$name-$reading]:-}" ]; then from=(--from-run "${smaller[$name-$reading]}"); fi
       smaller[$name-$reading]=$run
-      "$python" training/train.py --program "$program" --network "$name" --scene "$scene" --out "$run" --samples "$samples" --minutes "$share" --device "$device" "${from[@]}"
+      "$python" training/train.py --program "$program" --network "$name" --scene "$scene" --out "$run" --samples "$samples" --minutes "$share" --device "$device" --target-sigma-m "$target_m" "${from[@]}"
       "$python" training/export.py --program "$program" --run "$run" --scene "$scene" --out "training/models/$name-$reading-$pixels.onnx"
     done
   done
