@@ -50,8 +50,9 @@ impl FrameContext {
         if self.zones.is_empty() {
             return self.config.tolerated_distance_m;
         }
-        let near = self.zones.near(self.unmoved(p));
-        let watched = near.filter(|i| i.zone.kind == ZoneKind::Watch && i.depth_m >= 0.0);
+        let watched = self
+            .zones
+            .near(self.unmoved(p), 0.0, |zone| zone.kind == ZoneKind::Watch);
         let own = watched.filter_map(|i| i.zone.tolerated_distance_m);
         own.reduce(f64::min).unwrap_or(self.config.tolerated_distance_m)
     }

@@ -9,7 +9,7 @@ use crate::monitor::finding::{Cause, Content, Finding};
 use crate::monitor::frame_context::FrameContext;
 use crate::monitor::stats::error_budget::TestFamily;
 use crate::monitor::track::beam_track::Track;
-use crate::monitor::zones::{Inside, ZoneKind};
+use crate::monitor::zones::{Inside, REACH_M, Zone, ZoneKind};
 
 /// Standard deviations of a position by which a user must be inside of a restricted zone. More let somebody in before the alert, fewer
 /// raise alerts for who walks along its edge.
@@ -64,7 +64,8 @@ pub fn evaluate(frame: &FrameContext) -> Vec<Finding> {
 fn breach(frame: &FrameContext, user: &str, track: &Track) -> Option<Breach> {
     let place = frame.world(track);
     let error_m = frame.position_error_m(track);
-    let near: Vec<Inside> = frame.zones.near(place).collect();
+    let is_of_interest = |zone: &Zone| zone.kind == ZoneKind::Restricted || zone.lists(user);
+    let near: Vec<Inside> = frame.zones.near(place, REACH_M, is_of_interest).collect();
     let forbidden = near
         .iter()
         .filter(|i| i.zone.kind == ZoneKind::Restricted && i.depth_m > INSIDE * error_m && !i.zone.lists(user));
@@ -87,7 +88,7 @@ fn breach(frame: &FrameContext, user: &str, track: &Track) -> Option<Breach> {
     (depth_m < -reach_m).then(|| Breach {
         zones: allowed.into_iter().take(20).map(|z| z.name.clone()).collect(),
         is_restricted: false,
-        // Nothing within ten metres has no depth that JSON could state.
-        depth_m: depth_m.max(-10.0),
+        // What is farther off has no depth that JSON could state.
+        depth_m: depth_m.max(-REACH_M),
     })
 }

@@ -10,7 +10,7 @@ use crate::hash::fnv1a;
 /// Cells of the grid along each axis. More make the lists of each cell shorter and the grid larger.
 const CELLS: usize = 32;
 /// How far outside of a zone a place is still asked about, m: larger than errors of positions.
-const REACH_M: f64 = 10.0;
+pub const REACH_M: f64 = 10.0;
 
 /// The zones in force. Cloning is cheap.
 #[derive(Clone, Debug, Default)]
@@ -93,9 +93,15 @@ impl ZoneMap {
         self.0.zones.is_empty()
     }
 
-    /// The zones that `p` is in or within 10 m of, in the order of their list.
-    pub fn near(&self, p: [f64; 2]) -> impl Iterator<Item = Inside<'_>> {
+    /// The zones of interest that `p` is in or within `reach_m` of, 10 m at most, in the order of their list.
+    pub fn near(
+        &self,
+        p: [f64; 2],
+        reach_m: f64,
+        is_of_interest: impl Fn(&Zone) -> bool,
+    ) -> impl Iterator<Item = Inside<'_>> {
         let all = &*self.0;
+        let reach_m = reach_m.min(REACH_M);
         let cell = |k: usize| ((p[k] - all.low[k]) / all.cell_m[k]).floor();
         let (column, row) = (cell(0), cell(1));
         let is_on = |c: f64| (0.0..CELLS as f64).contains(&c);
@@ -104,12 +110,13 @@ impl ZoneMap {
             false => &[],
         };
         here.iter().filter_map(move |z| {
-            let (zone, [near, far]) = (&all.zones[usize::from(*z)], all.bounds[usize::from(*z)]);
-            if (0..2).any(|k| p[k] < near[k] - REACH_M || p[k] > far[k] + REACH_M) {
+            let [near, far] = all.bounds[usize::from(*z)];
+            if (0..2).any(|k| p[k] < near[k] - reach_m || p[k] > far[k] + reach_m) {
                 return None;
             }
-            let depth_m = zone.shape.depth_m(p);
-            (depth_m > -REACH_M).then_some(Inside { zone, depth_m })
+            let zone = &all.zones[usize::from(*z)];
+            let depth_m = is_of_interest(zone).then(|| zone.shape.depth_m(p))?;
+            (depth_m >= -reach_m).then_some(Inside { zone, depth_m })
         })
     }
 
@@ -130,7 +137,9 @@ impl ZoneMap {
 
     /// The smallest zone of this kind that `p` is in, at least `depth_m` deep.
     pub fn within(&self, p: [f64; 2], kind: ZoneKind, depth_m: f64) -> Option<&Zone> {
-        let of_kind = self.near(p).filter(|i| i.zone.kind == kind && i.depth_m >= depth_m);
+        let of_kind = self
+            .near(p, (-depth_m).max(0.0), |zone| zone.kind == kind)
+            .filter(|i| i.depth_m >= depth_m);
         let area = |i: &Inside| i.zone.shape.area_m2();
         of_kind.min_by(|a, b| area(a).total_cmp(&area(b))).map(|i| i.zone)
     }
@@ -187,11 +196,12 @@ mod tests {
         let map = ZoneMap::new(zones.clone());
         for k in 0..2000 {
             let p = [f64::from(k % 50) * 9.1 - 230.0, f64::from(k / 50) * 8.3 - 170.0];
-            let searched = zones.iter().filter(|z| z.shape.depth_m(p) > -REACH_M);
-            let found: Vec<_> = map.near(p).map(|i| i.zone.name.clone()).collect();
+            let searched = zones.iter().filter(|z| z.shape.depth_m(p) >= -REACH_M);
+            let found: Vec<_> = map.near(p, REACH_M, |_| true).map(|i| i.zone.name.clone()).collect();
             assert_eq!(found, searched.map(|z| z.name.clone()).collect::<Vec<_>>(), "{p:?}");
         }
-        assert_eq!(map.near([f64::NAN, 0.0]).count() + map.near([1e300, 0.0]).count(), 0);
+        assert_eq!(map.near([f64::NAN, 0.0], REACH_M, |_| true).count(), 0);
+        assert_eq!(map.near([1e300, 0.0], REACH_M, |_| true).count(), 0);
     }
 
     #[test]

@@ -13,6 +13,6 @@ pub(in crate::monitor) use check::check_all;
 pub use config::{Config, load};
 pub use degrees::Coordinates;
 pub use geojson::{collection, parse};
-pub use index::{Inside, ZoneMap, ignored_share};
+pub use index::{Inside, REACH_M, ZoneMap, ignored_share};
 pub use shape::{MAX_COORDINATE_M, Shape, ShapeError};
 pub use zone::{MAX_ZONES, Zone, ZoneKind};
