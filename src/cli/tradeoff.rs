@@ -7,7 +7,7 @@ use super::progress::Steps;
 use super::{Failure, Outcome};
 use crate::estimate::Rules;
 use crate::study::ablation;
-use crate::study::tradeoff::{EXPOSURE_CELLS, Oracle, Plan, Trained, run as study, run_exposures};
+use crate::study::tradeoff::{Cell, EXPOSURE_CELLS, Oracle, Plan, Trained, run as study, run_exposures};
 
 #[derive(Debug, clap::Args)]
 #[command(
@@ -75,12 +75,8 @@ pub fn run(args: Args) -> Outcome {
     if let Some(seed) = args.seed {
         plan.seed = seed;
     }
-    if !args.cells.is_empty() {
-        plan.cells.retain(|c| args.cells.contains(&c.name()));
-    }
-    if !args.estimators.is_empty() {
-        plan.estimators.retain(|r| args.estimators.iter().any(|name| name == r));
-    }
+    plan.cells = only("--cells", &args.cells, plan.cells, Cell::name)?;
+    plan.estimators = only("--estimators", &args.estimators, plan.estimators, |e| e.to_string())?;
     if let Some(folder) = &args.networks {
         plan.networks = Trained::in_folder(folder).map_err(Failure::input)?;
     }
@@ -104,6 +100,22 @@ pub fn run(args: Args) -> Outcome {
     Ok(())
 }
 
+/// Those of `all` that are named, all of them where none is.
+fn only<T>(option: &str, named: &[String], all: Vec<T>, name: impl Fn(&T) -> String) -> Result<Vec<T>, Failure> {
+    let names: Vec<String> = all.iter().map(name).collect();
+    if let Some(unknown) = named.iter().find(|n| !names.contains(n)) {
+        return Err(Failure::input(anyhow::anyhow!(
+            "{option}: expected some of {}, found {unknown}",
+            names.join(", ")
+        )));
+    }
+    let kept = all
+        .into_iter()
+        .zip(&names)
+        .filter(|(_, n)| named.is_empty() || named.contains(n));
+    Ok(kept.map(|(one, _)| one).collect())
+}
+
 fn exposures(args: &Args) -> Outcome {
     let usual = match args.quick {
         true => EXPOSURE_QUICK_SCENES,
@@ -123,18 +135,7 @@ fn exposures(args: &Args) -> Outcome {
 
 /// Prints one row per cell as soon as it is measured.
 fn oracle(args: &Args) -> Outcome {
-    let mut cells = Oracle::cells();
-    if !args.cells.is_empty() {
-        cells.retain(|c| args.cells.contains(&c.name()));
-    }
-    if cells.is_empty() {
-        let names: Vec<String> = Oracle::cells().iter().map(|c| c.name()).collect();
-        return Err(Failure::input(anyhow::anyhow!(
-            "--cells: expected some of {}, found {}",
-            names.join(", "),
-            args.cells.join(", ")
-        )));
-    }
+    let cells = only("--cells", &args.cells, Oracle::cells(), Cell::name)?;
     let frames = args
         .frames
         .map_or(if args.quick { ORACLE_QUICK_FRAMES } else { ORACLE_FRAMES }, |n| {
