@@ -3,7 +3,7 @@
 use crate::estimate::config::KnownPower;
 use crate::estimate::emitter::Emitter;
 use crate::estimate::error::Error;
-use crate::estimate::estimators::analytic::bases;
+use crate::estimate::estimators::search_bases::bases;
 use crate::estimate::fit::levenberg_marquardt::fit;
 use crate::estimate::fit::work_budget::WorkBudget;
 use crate::estimate::model::compressed_frame::CompressedFrame;

@@ -2,7 +2,9 @@
 
 pub mod analytic;
 pub mod build;
+pub mod frame_search;
 pub mod list;
 pub mod network;
 pub mod pixel_correction;
+pub mod search_bases;
 pub mod windowed;

@@ -107,6 +107,28 @@ pub(crate) fn inspect_shape(
     Shape::AsModelled
 }
 
+/// The bright spots of `hypothesis` with another width, or elongated, where that explains the frame. Asked before spots are compared: those of
+/// another width have that in common.
+pub(crate) fn explained_by_width(search: &mut Search, hypothesis: &Hypothesis) -> Option<Hypothesis> {
+    [true, false].into_iter().find_map(|merge_core| {
+        let mut candidate = Candidate::from(Hypothesis {
+            sources: bright_spots(hypothesis, merge_core),
+            converged: false,
+            ..hypothesis.clone()
+        });
+        [Width::Common, Width::RotatedEllipse].into_iter().find_map(|width| {
+            candidate.nuisances = Nuisances {
+                background: true,
+                width,
+            };
+            search.fit_trial(&mut candidate);
+            search
+                .is_explained_by(&candidate)
+                .then(|| candidate.clone().into_hypothesis())
+        })
+    })
+}
+
 /// The highest peaks of the frame, whatever a hypothesis made of it.
 fn highest_peaks(search: &mut Search, hypothesis: &Hypothesis) -> Vec<PointSource> {
     let mut dark = Candidate::from(Hypothesis::empty(Nuisances {
