@@ -4,11 +4,11 @@ use crate::estimate::estimators::list::{EstimatorSpec, Method};
 use crate::estimate::fit::levenberg_marquardt::{evaluate, fit};
 use crate::estimate::fit::work_budget::WorkBudget;
 use crate::estimate::model::compressed_frame::CompressedFrame;
-use crate::estimate::model::hypothesis::{Hypothesis, Nuisances, PointSource};
+use crate::estimate::model::hypothesis::{Hypothesis, Nuisances};
 use crate::estimate::model::svd_basis::Basis;
 use crate::estimate::model_order::candidate::Candidate;
 use crate::estimate::model_order::common_misfit::is_narrow;
-use crate::estimate::model_order::initialise::{add_residual_peaks, initial_hypothesis, initialise};
+use crate::estimate::model_order::initialise::{add_residual_peaks, filter_peaks, initial_hypothesis, initialise};
 use crate::estimate::model_order::maximum_likelihood::maximum_likelihood;
 use crate::estimate::model_order::refine::shrink;
 use crate::estimate::model_order::reweighting::Reweighting;
@@ -256,7 +256,7 @@ impl FrameSearch {
         let mut search = self.space.search(&self.compressed, &self.frame, &mut budgets.search);
         let hypothesis = match self.spec.method {
             Method::Peak { steps } => {
-                let mut hypothesis = peaks(&mut search);
+                let mut hypothesis = filter_peaks(&mut search);
                 fit(&mut search.context, &mut hypothesis, steps);
                 hypothesis
             }
@@ -396,21 +396,4 @@ impl FrameSearch {
         }
         initial
     }
-}
-
-/// The matched filter's maxima as sources.
-fn peaks(search: &mut Search) -> Hypothesis {
-    let compressed = search.compressed();
-    let peaks = search.matched_filter.peaks(
-        &compressed.coefficients,
-        compressed.mx,
-        compressed.my,
-        search.criterion.source_penalty.sqrt(),
-        1.0,
-    );
-    let mut hypothesis = Hypothesis::empty(Nuisances::default());
-    hypothesis
-        .sources
-        .extend(peaks.iter().map(|p| PointSource::new(p.u, p.a)));
-    hypothesis
 }

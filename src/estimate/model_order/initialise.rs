@@ -192,3 +192,20 @@ fn test_variance_growth(
     let score = search.score(candidate) - candidate.deviance + cost + VarianceFunction::PENALTY;
     (score < search.score(rival)).then_some(variance)
 }
+
+/// The matched filter's maxima as sources.
+pub(crate) fn filter_peaks(search: &mut Search) -> Hypothesis {
+    let compressed = search.compressed();
+    let peaks = search.matched_filter.peaks(
+        &compressed.coefficients,
+        compressed.mx,
+        compressed.my,
+        search.criterion.source_penalty.sqrt(),
+        1.0,
+    );
+    let mut hypothesis = Hypothesis::empty(Nuisances::default());
+    hypothesis
+        .sources
+        .extend(peaks.iter().map(|p| PointSource::new(p.u, p.a)));
+    hypothesis
+}
