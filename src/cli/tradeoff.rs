@@ -82,7 +82,7 @@ pub fn run(args: Args) -> Outcome {
     }
     if plan.is_empty() {
         return Err(Failure::input(anyhow::anyhow!(
-            "nothing to measure: no such cell or estimator; a run without --cells and --estimators names them all"
+            "nothing to measure: expected a network that was trained for the cell (--networks), found none"
         )));
     }
     if !args.without.is_empty() {
@@ -183,4 +183,25 @@ fn ablate(plan: &Plan, args: &Args) -> Outcome {
     steps.finish();
     let table = ablation::markdown(&effects, &plan);
     std::io::stdout().write_all(table.as_bytes()).map_err(Failure::other)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_select_and_unknown_ones_are_named() {
+        let all = || vec!["E1/64", "P8/60"];
+        let select = |named: &[&str]| {
+            let named: Vec<String> = named.iter().map(ToString::to_string).collect();
+            only("--cells", &named, all(), ToString::to_string)
+        };
+        assert_eq!(select(&[]).unwrap(), all());
+        assert_eq!(select(&["P8/60"]).unwrap(), ["P8/60"]);
+        let error = select(&["P8/60", "P8/61"]).unwrap_err();
+        assert_eq!(
+            error.error.to_string(),
+            "--cells: expected some of E1/64, P8/60, found P8/61"
+        );
+    }
 }
