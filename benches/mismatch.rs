@@ -1,10 +1,12 @@
 //! Where learning helps: the pure network, the network in front of the joint fit, and the joint fit alone, on the same frames of
-//! a device that is not what its config says. Prints a Markdown table: `cargo bench --bench mismatch [FRAMES]`.
+//! a device that is not what its config says. Prints a Markdown table: `cargo bench --bench mismatch -- [FRAMES]`; or of one scene by one
+//! config, with its calibration and its network: `cargo bench --bench mismatch -- FRAMES SCENE CONFIG`.
 
 use std::time::Instant;
 
 use oapwatch::assign::ospa;
 use oapwatch::estimate::{Config, build};
+use oapwatch::optics::Camera;
 use oapwatch::scene::{Plan, Scene};
 
 const SCENE: &str = include_str!("../training/scenes/energy-1mm.toml");
@@ -69,57 +71,68 @@ const MISMATCHES: [Mismatch; 13] = [
 ];
 
 fn main() {
-    let frames = std::env::args().find_map(|a| a.parse().ok()).unwrap_or(200);
+    let args: Vec<String> = std::env::args().skip(1).filter(|a| !a.starts_with("--")).collect();
+    let frames = args.first().map_or(200, |a| a.parse().expect("a number of frames"));
+    let head = "| mismatch | estimator | median m² | mean m² | missed | invented | N right | OSPA m | median ms |\n|---|---|---|---|---|---|---|---|---|";
+    if let [_, scene, config] = &args[..] {
+        let text = std::fs::read_to_string(scene).expect("a scene file");
+        let config = oapwatch::config::Config::load(config.as_ref()).expect("a config");
+        let camera = config.camera().expect("valid optics");
+        println!("{frames} frames of {scene}, seed {SEED}.\n\n{head}");
+        let scene: Scene = toml::from_str(&text).expect("a valid scene");
+        return measure("the config's", &scene, frames, &camera, &config.estimator);
+    }
     let nominal: Scene = toml::from_str(SCENE).expect("the scene is part of the repository");
     let camera = nominal.optics.camera().expect("valid optics");
-    println!("{frames} frames of 5 to 9 emitters, σ_eff 1 mm, 1 µJ, 64 × 64 pixels, seed {SEED}.\n");
-    println!("| mismatch | estimator | median m² | mean m² | missed | invented | N right | OSPA m | median ms |");
-    println!("|---|---|---|---|---|---|---|---|---|");
+    println!("{frames} frames of 5 to 9 emitters, σ_eff 1 mm, 1 µJ, 64 × 64 pixels, seed {SEED}.\n\n{head}");
     for mismatch in &MISMATCHES {
         let mut scene: Scene = toml::from_str(&format!("{SCENE}\n{}", mismatch.effects)).expect("a valid scene");
         scene.optics.spot_sigma_m = Some(mismatch.spot_sigma_m);
-        let plan = Plan::compile(&scene, SEED).expect("a valid scene");
-        let frames = plan.frames(0, frames);
-        for name in ESTIMATORS {
-            let config = Config {
-                name: Some(name.to_owned()),
-                ..Default::default()
-            };
-            let mut estimator = build(&config, &camera).expect("an estimator of the list");
-            let (mut squared, mut times) = (Vec::new(), Vec::new());
-            let (mut missed, mut invented, mut right, mut emitters, mut distance) = (0, 0, 0, 0, 0.0);
-            for simulated in &frames {
-                let clock = Instant::now();
-                let found = estimator.estimate(&simulated.frame).expect("a usable frame");
-                times.push(clock.elapsed().as_secs_f64() * 1e3);
-                let truth: Vec<[f64; 2]> = simulated.truth.emitters.iter().map(|e| [e.x_m, e.y_m]).collect();
-                let at: Vec<[f64; 2]> = found.emitters.iter().map(|e| [e.x_m, e.y_m]).collect();
-                let score = ospa(&truth, &at, CUTOFF_M);
-                distance += score.distance_m;
-                missed += score.matching.unmatched_rows.len();
-                invented += score.matching.unmatched_columns.len();
-                emitters += truth.len();
-                right += usize::from(truth.len() == at.len());
-                let pairs = score.matching.pairs.iter();
-                squared.extend(pairs.map(|&(t, e)| {
-                    let (t, e) = (truth[t], at[e]);
-                    (t[0] - e[0]).powi(2) + (t[1] - e[1]).powi(2)
-                }));
-            }
-            squared.sort_by(f64::total_cmp);
-            times.sort_by(f64::total_cmp);
-            let share = |n: usize, of: usize| 100.0 * n as f64 / of as f64;
-            println!(
-                "| {} | {name} | {:.2e} | {:.2e} | {:.1} % | {:.1} % | {:.0} % | {:.3} | {:.1} |",
-                mismatch.name,
-                squared[squared.len() / 2],
-                squared.iter().sum::<f64>() / squared.len() as f64,
-                share(missed, emitters),
-                share(invented, emitters),
-                share(right, frames.len()),
-                distance / frames.len() as f64,
-                times[times.len() / 2],
-            );
+        measure(mismatch.name, &scene, frames, &camera, &Config::default());
+    }
+}
+
+/// Prints a row for each estimator.
+fn measure(name: &str, scene: &Scene, frames: usize, camera: &Camera, config: &Config) {
+    let frames = Plan::compile(scene, SEED).expect("a valid scene").frames(0, frames);
+    for estimator in ESTIMATORS {
+        let config = Config {
+            name: Some(estimator.to_owned()),
+            ..config.clone()
+        };
+        let mut measured = build(&config, camera).expect("an estimator of the list");
+        let (mut squared, mut times) = (Vec::new(), Vec::new());
+        let (mut missed, mut invented, mut right, mut emitters, mut distance) = (0, 0, 0, 0, 0.0);
+        for simulated in &frames {
+            let clock = Instant::now();
+            let found = measured.estimate(&simulated.frame).expect("a usable frame");
+            times.push(clock.elapsed().as_secs_f64() * 1e3);
+            let truth: Vec<[f64; 2]> = simulated.truth.emitters.iter().map(|e| [e.x_m, e.y_m]).collect();
+            let at: Vec<[f64; 2]> = found.emitters.iter().map(|e| [e.x_m, e.y_m]).collect();
+            let score = ospa(&truth, &at, CUTOFF_M);
+            distance += score.distance_m;
+            missed += score.matching.unmatched_rows.len();
+            invented += score.matching.unmatched_columns.len();
+            emitters += truth.len();
+            right += usize::from(truth.len() == at.len());
+            let pairs = score.matching.pairs.iter();
+            squared.extend(pairs.map(|&(t, e)| {
+                let (t, e) = (truth[t], at[e]);
+                (t[0] - e[0]).powi(2) + (t[1] - e[1]).powi(2)
+            }));
         }
+        squared.sort_by(f64::total_cmp);
+        times.sort_by(f64::total_cmp);
+        let share = |n: usize, of: usize| 100.0 * n as f64 / of as f64;
+        println!(
+            "| {name} | {estimator} | {:.2e} | {:.2e} | {:.1} % | {:.1} % | {:.0} % | {:.3} | {:.1} |",
+            squared[squared.len() / 2],
+            squared.iter().sum::<f64>() / squared.len() as f64,
+            share(missed, emitters),
+            share(invented, emitters),
+            share(right, frames.len()),
+            distance / frames.len() as f64,
+            times[times.len() / 2],
+        );
     }
 }

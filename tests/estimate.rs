@@ -489,40 +489,42 @@ fn a_measured_spot_reaches_its_bound_with_an_honest_covariance() {
     let template = Template::of_density(field, 2.5e-4, 9e-3, moffat(1e-3));
     camera.spot_shape = Some(Arc::new(SpotShape::from_template(&template, 1e-5).unwrap()));
     camera.spot_error = Some(0.0);
-    let mut estimator = estimator(None, &camera);
-    let mut rng = ChaCha8Rng::seed_from_u64(25);
-    let (mut ratio, mut inside, mut count) = (0.0, 0, 0.0);
-    for _ in 0..12 {
-        let spots: Vec<_> = FIVE
-            .iter()
-            .map(|at| (at.map(|v| v + rng.random_range(-1e-3..1e-3)), ENERGY_J))
-            .collect();
-        let noise = Normal::new(0.0, camera.noise_std_j).unwrap();
-        let mut pixels: Vec<f64> = (0..64 * 64).map(|_| noise.sample(&mut rng)).collect();
-        for &(at, energy) in &spots {
-            optics::add_spot(&camera, at, energy, &mut pixels);
+    for name in ["ml", "hybrid"] {
+        let mut estimator = estimator(Some(name), &camera);
+        let mut rng = ChaCha8Rng::seed_from_u64(25);
+        let (mut ratio, mut inside, mut count) = (0.0, 0, 0.0);
+        for _ in 0..12 {
+            let spots: Vec<_> = FIVE
+                .iter()
+                .map(|at| (at.map(|v| v + rng.random_range(-1e-3..1e-3)), ENERGY_J))
+                .collect();
+            let noise = Normal::new(0.0, camera.noise_std_j).unwrap();
+            let mut pixels: Vec<f64> = (0..64 * 64).map(|_| noise.sample(&mut rng)).collect();
+            for &(at, energy) in &spots {
+                optics::add_spot(&camera, at, energy, &mut pixels);
+            }
+            let frame = frame(Array2::from_shape_vec((64, 64), pixels).unwrap());
+            let estimate = estimator.estimate(&frame).unwrap();
+            assert_eq!(estimate.emitters.len(), 5, "{name}: {:?}", places(&estimate));
+            let ground: Vec<_> = spots.iter().map(|s| camera.to_ground(s.0)).collect();
+            let bounds = position_bound(&camera, &ground, &[ENERGY_J; 5]);
+            for (p, bound) in ground.iter().zip(bounds) {
+                let e = (estimate.emitters.iter())
+                    .min_by(|a, b| {
+                        let d = |e: &&oapwatch::estimate::Emitter| (e.x_m - p[0]).hypot(e.y_m - p[1]);
+                        d(a).total_cmp(&d(b))
+                    })
+                    .unwrap();
+                let d = [e.x_m - p[0], e.y_m - p[1]];
+                let [[a, b], [_, c]] = e.cov_m2;
+                let z = (c * d[0] * d[0] - 2.0 * b * d[0] * d[1] + a * d[1] * d[1]) / (a * c - b * b);
+                inside += u32::from(z < 5.99);
+                ratio += (d[0] * d[0] + d[1] * d[1]) / bound;
+                count += 1.0;
+            }
         }
-        let frame = frame(Array2::from_shape_vec((64, 64), pixels).unwrap());
-        let estimate = estimator.estimate(&frame).unwrap();
-        assert_eq!(estimate.emitters.len(), 5, "{:?}", places(&estimate));
-        let ground: Vec<_> = spots.iter().map(|s| camera.to_ground(s.0)).collect();
-        let bounds = position_bound(&camera, &ground, &[ENERGY_J; 5]);
-        for (p, bound) in ground.iter().zip(bounds) {
-            let e = (estimate.emitters.iter())
-                .min_by(|a, b| {
-                    let d = |e: &&oapwatch::estimate::Emitter| (e.x_m - p[0]).hypot(e.y_m - p[1]);
-                    d(a).total_cmp(&d(b))
-                })
-                .unwrap();
-            let d = [e.x_m - p[0], e.y_m - p[1]];
-            let [[a, b], [_, c]] = e.cov_m2;
-            let z = (c * d[0] * d[0] - 2.0 * b * d[0] * d[1] + a * d[1] * d[1]) / (a * c - b * b);
-            inside += u32::from(z < 5.99);
-            ratio += (d[0] * d[0] + d[1] * d[1]) / bound;
-            count += 1.0;
-        }
+        // Of 120 squared normal variates the mean is within 1 ± 0.13 two times in three.
+        assert!((0.6..1.5).contains(&(ratio / count)), "{name}: {}", ratio / count);
+        assert!(inside >= 52, "{name}: {inside} of 60 within the 95 % ellipse");
     }
-    // Of 120 squared normal variates the mean is within 1 ± 0.13 two times in three.
-    assert!((0.6..1.5).contains(&(ratio / count)), "{}", ratio / count);
-    assert!(inside >= 52, "{inside} of 60 within the 95 % ellipse");
 }

@@ -40,15 +40,18 @@ impl NetworkEstimator {
         camera: &Camera,
         rules: Rules,
     ) -> Result<Self, NetworkError> {
-        let bx = Basis::new(&camera.x, camera.spot_sigma_m);
-        let by = Basis::new(&camera.y, camera.spot_sigma_m);
+        let basis = match camera.spot_shape {
+            Some(_) => Basis::pixels,
+            None => Basis::new,
+        };
+        let bases = [&camera.x, &camera.y].map(|axis| basis(axis, camera.spot_sigma_m));
         Ok(Self {
             spec,
             network: Network::load(network, camera.shape())?,
             camera: camera.clone(),
             frame: PreprocessedFrame::default(),
-            compressed: CompressedFrame::default(),
-            space: SearchSpace::new([bx, by], rules),
+            compressed: CompressedFrame::of_camera(camera),
+            space: SearchSpace::new(bases, rules).with_shape(camera),
         })
     }
 }
