@@ -93,7 +93,7 @@ fn main() {
 }
 
 /// Prints a row for each estimator.
-fn measure(name: &str, scene: &Scene, frames: usize, camera: &Camera, config: &Config) {
+fn measure(name: &str, scene: &Scene, frames: u64, camera: &Camera, config: &Config) {
     let frames = Plan::compile(scene, SEED).expect("a valid scene").frames(0, frames);
     for estimator in ESTIMATORS {
         let config = Config {
