@@ -106,7 +106,7 @@ pub(crate) struct FrameSearch {
 }
 
 impl FrameSearch {
-    /// In these bases and those to measure the noise in; see [`bases`].
+    /// In these bases, and those to measure the noise in (`search_bases`).
     pub fn new(
         spec: &'static EstimatorSpec,
         camera: &Camera,
