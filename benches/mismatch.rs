@@ -75,11 +75,10 @@ fn main() {
     let frames = args.first().map_or(200, |a| a.parse().expect("a number of frames"));
     let head = "| mismatch | estimator | median m² | mean m² | missed | invented | N right | OSPA m | median ms |\n|---|---|---|---|---|---|---|---|---|";
     if let [_, scene, config] = &args[..] {
-        let text = std::fs::read_to_string(scene).expect("a scene file");
         let config = oapwatch::config::Config::load(config.as_ref()).expect("a config");
         let camera = config.camera().expect("valid optics");
         println!("{frames} frames of {scene}, seed {SEED}.\n\n{head}");
-        let scene: Scene = toml::from_str(&text).expect("a valid scene");
+        let scene = Scene::load(scene.as_ref()).expect("a valid scene");
         return measure("the config's", &scene, frames, &camera, &config.estimator);
     }
     let nominal: Scene = toml::from_str(SCENE).expect("the scene is part of the repository");

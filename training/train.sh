@@ -33,7 +33,7 @@ if [ -n "$config" ]; then
   network=${NETWORKS:-cnn16}$(awk "BEGIN { if ($sigma_px > 4) print \"-white\" }")
   run=training/runs/own-lens-$network-$lens
   "$python" training/train.py --program "$program" --network "$network" --scene "$scene" --out "$run" --samples "$samples" --minutes "$minutes" \
-    --device "$device" --devices 16 --width-std "$width_std"
+    --device "$device" --target-sigma-m "$target_m" --devices 16 --width-std "$width_std"
   "$python" training/export.py --program "$program" --run "$run" --scene "$scene" --out training/models/own-lens.onnx
   exit
 fi

@@ -110,6 +110,9 @@ pub(crate) fn inspect_shape(
 /// The bright spots of `hypothesis` with another width, or elongated, where that explains the frame. Asked before spots are compared: those of
 /// another width have that in common.
 pub(crate) fn explained_by_width(search: &mut Search, hypothesis: &Hypothesis) -> Option<Hypothesis> {
+    if search.is_measured() || !search.rules().select_nuisances {
+        return None;
+    }
     [true, false].into_iter().find_map(|merge_core| {
         let mut candidate = Candidate::from(Hypothesis {
             sources: bright_spots(hypothesis, merge_core),
