@@ -32,10 +32,13 @@ pub fn run(args: Args) -> Outcome {
     let mut steps = Steps::new(wanted.len() as u64);
     let mut broken = Vec::new();
     for measurement in wanted {
-        let measured = measurement.run(args.stories.unwrap_or(measurement.stories), args.seed, &args.only);
-        steps
-            .suspend(|| writeln!(std::io::stdout(), "## {}\n\n{}", measurement.name, measured.text))
-            .map_err(Failure::other)?;
+        let print = |text: &str| steps.suspend(|| writeln!(std::io::stdout(), "{text}"));
+        let mut printed = print(&format!("## {}\n", measurement.name));
+        let mut say = |line: &str| printed = std::mem::replace(&mut printed, Ok(())).and_then(|()| print(line));
+        let stories = args.stories.unwrap_or(measurement.stories);
+        let measured = measurement.run(stories, args.seed, &args.only, &mut say);
+        say(&measured.text);
+        printed.map_err(Failure::other)?;
         steps.next(measurement.name);
         if !measured.holds {
             broken.push(measurement.name);

@@ -42,7 +42,37 @@ pub(crate) fn dot(a: &[f64], b: &[f64]) -> f64 {
         (a, b) = (&a[4..], &b[4..]);
     }
     let rest: f64 = a.iter().zip(b).map(|(x, y)| x * y).sum();
-    rest + ((lanes[0] + lanes[4]) + (lanes[1] + lanes[5])) + ((lanes[2] + lanes[6]) + (lanes[3] + lanes[7]))
+    rest + sum_lanes(lanes)
+}
+
+/// One after another: summed in pairs, they would be kept in vectors of two.
+#[inline(always)]
+fn sum_lanes(lanes: [f64; 8]) -> f64 {
+    let mut sum = 0.0;
+    for lane in lanes {
+        sum += lane;
+    }
+    sum
+}
+
+/// Σ w a b over slices of equal length, a multiple of 4.
+#[inline(always)]
+pub(crate) fn weighted_dot(w: &[f64], a: &[f64], b: &[f64]) -> f64 {
+    let n = w.len();
+    let (a, b) = (&a[..n], &b[..n]);
+    let mut lanes = [0.0; 8];
+    let ((w8, w4), (a8, a4), (b8, b4)) = (w.as_chunks::<8>(), a.as_chunks::<8>(), b.as_chunks::<8>());
+    for ((w, a), b) in w8.iter().zip(a8).zip(b8) {
+        for l in 0..8 {
+            lanes[l] += w[l] * a[l] * b[l];
+        }
+    }
+    if n % 8 >= 4 {
+        for l in 0..4 {
+            lanes[l] += w4[l] * a4[l] * b4[l];
+        }
+    }
+    sum_lanes(lanes)
 }
 
 /// y += s x.

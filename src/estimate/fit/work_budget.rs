@@ -123,11 +123,6 @@ pub(crate) fn step_cost(bases: &Bases, compressed: &CompressedFrame, model: &Sep
     };
     let scattered = masked.scattered().len() as f64 * (2.0 * parameters + 0.5 * parameters * parameters);
     let unusable = runs + scattered + 2.0 * masked.project_out_cost(compressed.mx, compressed.my);
-    let pairs = if compressed.weights.is_empty() {
-        0.0
-    } else {
-        3.0 * components
-    };
     let terms = model.terms_per_source();
     let smears = if terms > 1.0 {
         8.0 * (terms * components).powi(2) * (compressed.mx + compressed.my) as f64
@@ -136,7 +131,7 @@ pub(crate) fn step_cost(bases: &Bases, compressed: &CompressedFrame, model: &Sep
     };
     unusable
         + smears
-        + (9.0 + pairs) * model.footprint()
+        + model.pass_cost(!compressed.weights.is_empty())
         + 40.0 * components * (compressed.mx + compressed.my) as f64
         + 9.0 * components.powi(3)
 }

@@ -2,12 +2,19 @@
 //!
 //! With K terms a pair of sources has K² pairs of products, but its patches overlap in a few hundred pixels: sums over pixels cost less from
 //! K = 3 on. Only in the pixel bases, where each pixel has a weight (zero where it is masked).
+//!
+//! A lens's rings and tails reach far: 50 pixels across where a core of 15 says all of where the spot is. The predicted light and its gradient
+//! are of the whole; what only shapes steps and covariances, of the core: second derivatives, and sources' products with each other.
 
 use std::sync::Arc;
 
-use crate::estimate::dense_linalg::axpy;
+use crate::estimate::dense_linalg::{axpy, combine, dot, weighted_dot};
+use crate::estimate::model::measured_terms::{MeasuredTerms, Part};
 use crate::estimate::model::svd_basis::Basis;
-use crate::optics::spot::{Profile, SpotShape};
+use crate::optics::spot::SpotShape;
+
+/// Share of what a spot says of its position and energy that lies outside its core: standard deviations are too large by half of it.
+const OUTSIDE_CORE: f64 = 1e-3;
 
 /// A measured PSF in the units of a fit.
 #[derive(Clone)]
@@ -15,39 +22,58 @@ pub(crate) struct MeasuredShape {
     shape: Arc<SpotShape>,
     /// The unit of length, m.
     sigma_m: f64,
+    /// Half-widths of the whole spot and of its core, σ.
+    radii: [f64; 2],
 }
 
-/// f, f_x, f_y, f_xx, f_xy, f_yy.
-const ARRAYS: usize = 6;
+/// f, f_y, f_x of the whole; f_xx, f_xy, f_yy of the core.
+const EACH: usize = 3;
 
 /// Index of the array that holds a derivative, by its orders along x and y.
 const fn array(a: usize, b: usize) -> usize {
     match (a, b) {
         (0, 0) => 0,
-        (1, 0) => 1,
-        (0, 1) => 2,
+        (0, 1) => 1,
+        (1, 0) => 2,
         (2, 0) => 3,
         (1, 1) => 4,
         _ => 5,
     }
 }
 
+/// An array that covers the core alone.
+const ARRAY_OF_CORE: usize = EACH;
+
+/// Columns and rows.
+pub(super) type Span = [[usize; 2]; 2];
+
+/// Where a component's arrays are: (rows, arrays, columns) of the whole, then of the core.
+struct Patch {
+    spans: [Span; 2],
+    starts: [usize; 2],
+    arrays: [usize; 2],
+}
+
 /// Patches in the order they were pushed.
 #[derive(Default)]
 pub(crate) struct MeasuredComponents {
     mx: usize,
-    /// Columns and rows that a component covers.
-    spans: Vec<[[usize; 2]; 2]>,
-    /// Where each component's arrays begin; each is (rows, columns), and there are six, or one without derivatives.
-    starts: Vec<usize>,
+    patches: Vec<Patch>,
+    /// As long as it ever was; beyond `used` it holds what was there before.
     values: Vec<f64>,
-    /// Profiles of one term along an axis: the values, first and second derivatives.
-    profiles: [[Vec<f64>; 3]; 2],
+    used: usize,
+    terms: MeasuredTerms,
+    parts: Vec<Part>,
 }
 
 impl MeasuredShape {
     pub fn new(shape: Arc<SpotShape>, sigma_m: f64) -> Self {
-        Self { shape, sigma_m }
+        let radii = [shape.radius_m(), shape.core_radius_m(OUTSIDE_CORE)];
+        Self {
+            radii: radii.map(|r| r / sigma_m),
+            shape,
+            sigma_m,
+        }
     }
 
     /// Separable terms.
@@ -55,32 +81,17 @@ impl MeasuredShape {
         self.shape.terms()
     }
 
-    /// Pixels that a spot at `u` reaches, moved by as much as `beyond` to either side.
-    fn span(&self, basis: &Basis, u: f64, beyond: f64) -> [usize; 2] {
-        let radius = self.shape.radius_m() / self.sigma_m + beyond;
+    /// Pixels within `radius` of `u`.
+    fn span(basis: &Basis, u: f64, radius: f64) -> [usize; 2] {
         let pixel = |edge: f64| ((edge - basis.edges[0]) / basis.pitch()).clamp(0.0, basis.n as f64);
         let [first, last] = [pixel(u - radius).floor() as usize, pixel(u + radius).ceil() as usize];
         [first, last.max(first)]
     }
 
-    /// Pixel fractions of a profile at `u` and their derivatives in u.
-    fn collect(&self, profile: &Profile, basis: &Basis, u: f64, [first, last]: [usize; 2], out: &mut [Vec<f64>; 3]) {
-        let s = self.sigma_m;
-        let value = |edge: f64| profile.value((edge - u) * s);
-        for o in &mut *out {
-            o.clear();
-        }
-        if first >= last {
-            return;
-        }
-        let mut low = value(basis.edges[first]);
-        for k in first..last {
-            let high = value(basis.edges[k + 1]);
-            out[0].push(high.cumulative - low.cumulative);
-            out[1].push(s * (low.density - high.density));
-            out[2].push(s * s * (high.slope - low.slope));
-            low = high;
-        }
+    /// The same in whole vectors of four; the last may be beyond the sensor.
+    fn wide_span(basis: &Basis, u: f64, radius: f64) -> [usize; 2] {
+        let [first, last] = Self::span(basis, u, radius);
+        [first & !3, last.next_multiple_of(4)]
     }
 }
 
@@ -88,12 +99,12 @@ impl MeasuredComponents {
     /// Removes all components; the pixel bases have `mx` numbers a row.
     pub fn clear(&mut self, mx: usize) {
         self.mx = mx;
-        self.spans.clear();
-        self.starts.clear();
-        self.values.clear();
+        self.patches.clear();
+        self.used = 0;
     }
 
     /// A spot of unit energy at `u`, σ, smeared over `displacement`, σ: by its parts and the shares of the light.
+    #[inline(always)]
     pub fn push(
         &mut self,
         shape: &MeasuredShape,
@@ -102,94 +113,170 @@ impl MeasuredComponents {
         displacement: [f64; 2],
         parts: &[(f64, f64)],
     ) {
-        let spans = [0, 1].map(|k| shape.span(axes[k], u[k], 0.5 * displacement[k].abs()));
-        let [columns, rows] = spans.map(|[low, high]| high - low);
-        let (start, area) = (self.values.len(), columns * rows);
-        self.spans.push(spans);
-        self.starts.push(start);
-        self.values.resize(start + ARRAYS * area, 0.0);
-        let mut profiles = std::mem::take(&mut self.profiles);
-        for (part, of) in parts {
-            let u = [0, 1].map(|k| u[k] + part * displacement[k]);
-            let [sx, sy] = u.map(|v| v * shape.sigma_m);
-            for (k, (w, du, dv)) in shape.shape.weights_at(sx, sy).enumerate() {
-                let (w, du, dv) = (of * w, of * du * shape.sigma_m, of * dv * shape.sigma_m);
-                let [along_x, along_y] = &mut profiles;
-                shape.collect(shape.shape.x_profile(k), axes[0], u[0], spans[0], along_x);
-                shape.collect(shape.shape.y_profile(k), axes[1], u[1], spans[1], along_y);
-                let [a, a1, a2] = &*along_x;
-                for row in 0..rows {
-                    let [b, b1, b2] = [along_y[0][row], along_y[1][row], along_y[2][row]];
-                    let mut add = |array: usize, factors: [f64; 3]| {
-                        let at = start + array * area + row * columns;
-                        let out = &mut self.values[at..at + columns];
-                        for (factor, profile) in factors.into_iter().zip([a, a1, a2]) {
-                            if factor != 0.0 {
-                                axpy(factor, profile, out);
-                            }
-                        }
-                    };
-                    add(0, [w * b, 0.0, 0.0]);
-                    add(1, [du * b, w * b, 0.0]);
-                    add(2, [w * b1 + dv * b, 0.0, 0.0]);
-                    // The weights' second derivatives are those of the field: far below the spot's.
-                    add(3, [0.0, 2.0 * du * b, w * b]);
-                    add(4, [du * b1, w * b1 + dv * b, 0.0]);
-                    add(5, [w * b2 + 2.0 * dv * b1, 0.0, 0.0]);
-                }
-            }
+        let spans = shape.radii.map(|radius| {
+            let reach = |k: usize| radius + 0.5 * displacement[k].abs();
+            [
+                MeasuredShape::wide_span(axes[0], u[0], reach(0)),
+                MeasuredShape::span(axes[1], u[1], reach(1)),
+            ]
+        });
+        self.start_patch(spans, [EACH; 2]);
+        let [whole, core] = spans;
+        let ([columns, rows], [core_columns, core_rows]) = (size(whole), size(core));
+        if columns * rows == 0 {
+            return;
         }
-        self.profiles = profiles;
+        self.parts.clear();
+        for (part, share) in parts {
+            self.parts.push(Part {
+                u: [u[0] + part * displacement[0], u[1] + part * displacement[1]],
+                share: *share,
+            });
+        }
+        let terms = &mut self.terms;
+        terms.collect(&shape.shape, shape.sigma_m, axes, &self.parts, whole);
+        let n = terms.count;
+        let reach = if terms.is_uniform { n } else { 2 * n };
+        let [of_f2, of_f1, of_f] = [0, 1, 2].map(|k| k * n * columns);
+        let Patch { starts, .. } = self.patches[self.patches.len() - 1];
+        let (first, second) = self.values.split_at_mut(starts[1]);
+        let x = &terms.along_x;
+        for row in 0..rows {
+            let out = &mut first[starts[0] + row * EACH * columns..starts[0] + (row + 1) * EACH * columns];
+            let (value_and_y, along_x) = out.split_at_mut(2 * columns);
+            let factors = [&terms.value[row..n * rows], &terms.slope[row..n * rows]];
+            combine(factors, rows, &x[of_f..], columns, columns, value_and_y);
+            combine(
+                [&terms.value[row..reach * rows]],
+                rows,
+                &x[of_f1..],
+                columns,
+                columns,
+                along_x,
+            );
+        }
+        let [left, top] = [core[0][0] - whole[0][0], core[1][0] - whole[1][0]];
+        for (k, out) in second
+            .chunks_exact_mut((EACH * core_columns).max(1))
+            .enumerate()
+            .take(core_rows)
+        {
+            let row = top + k;
+            let (xx, rest) = out.split_at_mut(core_columns);
+            let (xy, yy) = rest.split_at_mut(core_columns);
+            combine(
+                [&terms.xx[row..reach * rows]],
+                rows,
+                &x[of_f2 + left..],
+                columns,
+                core_columns,
+                xx,
+            );
+            combine(
+                [&terms.slope[row..reach * rows]],
+                rows,
+                &x[of_f1 + left..],
+                columns,
+                core_columns,
+                xy,
+            );
+            combine([&terms.yy[row..]], rows, &x[of_f + left..], columns, core_columns, yy);
+        }
     }
 
     /// A component of given profiles over all pixels, without derivatives.
     pub fn push_profiles(&mut self, axes: [&Basis; 2], profiles: [&[f64]; 2]) {
         let [nx, ny] = axes.map(|b| b.n);
-        self.spans.push([[0, nx], [0, ny]]);
-        self.starts.push(self.values.len());
-        for y in &profiles[1][..ny] {
-            self.values.extend(profiles[0][..nx].iter().map(|x| x * y));
+        let columns = nx.next_multiple_of(4);
+        self.start_patch([[[0, columns], [0, ny]]; 2], [1, 0]);
+        let start = self.used - columns * ny;
+        let rows = self.values[start..self.used].chunks_exact_mut(columns);
+        for (row, y) in rows.zip(&profiles[1][..ny]) {
+            row.fill(0.0);
+            axpy(*y, &profiles[0][..nx], row);
         }
     }
 
-    /// Numbers within all spans together.
-    pub fn footprint(&self) -> f64 {
-        let area = |s: &[[usize; 2]; 2]| ((s[0][1] - s[0][0]) * (s[1][1] - s[1][0])) as f64;
-        self.spans.iter().map(area).sum()
+    /// Makes room for a component of so many arrays over the whole and the core.
+    fn start_patch(&mut self, spans: [Span; 2], arrays: [usize; 2]) {
+        let [whole, core] = [0, 1].map(|k| arrays[k] * size(spans[k]).iter().product::<usize>());
+        let start = self.used;
+        self.patches.push(Patch {
+            spans,
+            starts: [start, start + whole],
+            arrays,
+        });
+        self.used = start + whole + core;
+        if self.values.len() < self.used {
+            self.values.resize(self.used, 0.0);
+        }
     }
 
-    /// A row of the array of component `i`'s derivative; `None` where it has none.
+    /// Numbers in all patches together.
+    pub fn footprint(&self) -> f64 {
+        self.used as f64
+    }
+
+    /// Numbers that a step multiplies in pairs of components.
+    pub fn pair_footprint(&self) -> f64 {
+        let mut sum = 0;
+        for i in 0..self.patches.len() {
+            for j in 0..=i {
+                let area = |array: usize| {
+                    size(overlap(self.span(i, array), self.span(j, array)))
+                        .iter()
+                        .product::<usize>()
+                };
+                sum += area(0) + 12 * area(ARRAY_OF_CORE);
+            }
+        }
+        sum as f64
+    }
+
+    /// What an array of component `i` covers: nothing where it has none.
     #[inline(always)]
-    fn row(&self, i: usize, array: usize, y: usize) -> Option<&[f64]> {
-        let [[x0, x1], [y0, y1]] = self.spans[i];
-        let columns = x1 - x0;
-        let start = self.starts[i] + (array * (y1 - y0) + y - y0) * columns;
-        let end = self.starts.get(i + 1).copied().unwrap_or(self.values.len());
-        (start + columns <= end).then(|| &self.values[start..start + columns])
+    fn span(&self, i: usize, array: usize) -> Span {
+        let patch = &self.patches[i];
+        let part = array / EACH;
+        if array % EACH < patch.arrays[part] {
+            patch.spans[part]
+        } else {
+            [[0; 2]; 2]
+        }
+    }
+
+    /// Columns of an array of component `i` in row `y`, both within its span.
+    #[inline(always)]
+    fn row(&self, i: usize, array: usize, y: usize, [x0, x1]: [usize; 2]) -> &[f64] {
+        let patch = &self.patches[i];
+        let part = array / EACH;
+        let [[first, last], [top, _]] = patch.spans[part];
+        let start = patch.starts[part] + ((y - top) * patch.arrays[part] + array % EACH) * (last - first);
+        &self.values[start + x0 - first..start + x1 - first]
     }
 
     /// Adds `scale` times the derivative of orders `a` and `b` along x and y of component `i` to a matrix (my, mx).
     #[inline(always)]
     pub fn accumulate(&self, i: usize, a: usize, b: usize, scale: f64, matrix: &mut [f64]) {
-        let [[x0, x1], [y0, y1]] = self.spans[i];
+        let [[x0, x1], [y0, y1]] = self.span(i, array(a, b));
         for y in y0..y1 {
-            if let Some(row) = self.row(i, array(a, b), y) {
-                axpy(scale, row, &mut matrix[y * self.mx + x0..y * self.mx + x1]);
-            }
+            let row = self.row(i, array(a, b), y, [x0, x1]);
+            axpy(scale, row, &mut matrix[y * self.mx + x0..y * self.mx + x1]);
         }
     }
 
     /// Inner products of a matrix (my, mx) with derivatives of component `i`.
     #[inline(always)]
     pub fn project<const N: usize>(&self, i: usize, derivatives: [[usize; 2]; N], matrix: &[f64]) -> [f64; N] {
-        let [[x0, x1], [y0, y1]] = self.spans[i];
         let mut sum = [0.0; N];
-        for y in y0..y1 {
-            let values = &matrix[y * self.mx + x0..y * self.mx + x1];
-            for (s, [a, b]) in sum.iter_mut().zip(derivatives) {
-                if let Some(row) = self.row(i, array(a, b), y) {
-                    *s += dot(row, values);
-                }
+        for k in 0..N {
+            let of = array(derivatives[k][0], derivatives[k][1]);
+            let [[x0, x1], [y0, y1]] = self.span(i, of);
+            for y in y0..y1 {
+                sum[k] += dot(
+                    self.row(i, of, y, [x0, x1]),
+                    &matrix[y * self.mx + x0..y * self.mx + x1],
+                );
             }
         }
         sum
@@ -198,75 +285,193 @@ impl MeasuredComponents {
     /// Inner product of a derivative of component `i` with one of component `j` under `weights` (my, mx), or none where that is empty.
     #[inline(always)]
     pub fn inner_product(&self, i: usize, a: [usize; 2], j: usize, b: [usize; 2], weights: &[f64]) -> f64 {
-        let [[x0, x1], [y0, y1]] = self.overlap(i, j);
-        let (mut sum, columns) = (0.0, x1.saturating_sub(x0));
-        for y in y0..if columns > 0 { y1 } else { y0 } {
-            let rows = (self.row(i, array(a[0], a[1]), y), self.row(j, array(b[0], b[1]), y));
-            if let (Some(p), Some(q)) = rows {
-                let (p, q) = (&p[x0 - self.spans[i][0][0]..], &q[x0 - self.spans[j][0][0]..]);
-                sum += if weights.is_empty() {
-                    dot(&p[..columns], &q[..columns])
-                } else {
-                    triple(
-                        &weights[y * self.mx + x0..y * self.mx + x1],
-                        &p[..columns],
-                        &q[..columns],
-                    )
-                };
-            }
+        let (a, b) = (array(a[0], a[1]), array(b[0], b[1]));
+        let [[x0, x1], [y0, y1]] = overlap(self.span(i, a), self.span(j, b));
+        let mut sum = 0.0;
+        for y in y0..y1 {
+            let (p, q) = (self.row(i, a, y, [x0, x1]), self.row(j, b, y, [x0, x1]));
+            sum += if weights.is_empty() {
+                dot(p, q)
+            } else {
+                weighted_dot(&weights[y * self.mx + x0..y * self.mx + x1], p, q)
+            };
         }
         sum
     }
 
-    /// Inner products of (f_x, f_y, f) of component `i` with those of component `j`, 3 × 3 row-major.
+    /// Inner products of (f_x, f_y, f) of component `i` with those of component `j`, 3 × 3 row-major: of two sources, over their cores.
     #[inline(always)]
     pub fn gram_block(&self, i: usize, j: usize, weights: &[f64]) -> [f64; 9] {
         const ORDERS: [[usize; 2]; 3] = [[1, 0], [0, 1], [0, 0]];
         let mut out = [0.0; 9];
-        for (r, a) in ORDERS.into_iter().enumerate() {
-            for (c, b) in ORDERS.into_iter().enumerate() {
-                // A component with itself is symmetric.
-                out[3 * r + c] = match i == j && c < r {
-                    true => out[3 * c + r],
-                    false => self.inner_product(i, a, j, b, weights),
-                };
+        let has_cores = self.patches[i].arrays[1] > 0 && self.patches[j].arrays[1] > 0;
+        if !has_cores || weights.is_empty() {
+            for r in 0..3 {
+                for c in 0..3 {
+                    out[3 * r + c] = self.inner_product(i, ORDERS[r], j, ORDERS[c], weights);
+                }
             }
+            return out;
+        }
+        let [columns, [y0, y1]] = overlap(self.span(i, ARRAY_OF_CORE), self.span(j, ARRAY_OF_CORE));
+        for y in y0..y1 {
+            let mut rows = [[&[][..]; 3]; 2];
+            for k in 0..3 {
+                let of = array(ORDERS[k][0], ORDERS[k][1]);
+                rows[0][k] = self.row(i, of, y, columns);
+                rows[1][k] = self.row(j, of, y, columns);
+            }
+            add_weighted_products(
+                &weights[y * self.mx + columns[0]..y * self.mx + columns[1]],
+                rows,
+                &mut out,
+            );
         }
         out
     }
+}
 
-    #[inline(always)]
-    fn overlap(&self, i: usize, j: usize) -> [[usize; 2]; 2] {
-        let (p, q) = (&self.spans[i], &self.spans[j]);
-        [0, 1].map(|k| [p[k][0].max(q[k][0]), p[k][1].min(q[k][1])])
+/// Columns and rows of a span.
+#[inline(always)]
+pub(super) fn size([[left, right], [top, bottom]]: Span) -> [usize; 2] {
+    [right - left, bottom - top]
+}
+
+/// What two spans share.
+#[inline(always)]
+fn overlap(p: Span, q: Span) -> Span {
+    let [left, right] = [p[0][0].max(q[0][0]), p[0][1].min(q[0][1])];
+    let [top, bottom] = [p[1][0].max(q[1][0]), p[1][1].min(q[1][1])];
+    if left < right && top < bottom {
+        [[left, right], [top, bottom]]
+    } else {
+        [[0; 2]; 2]
     }
 }
 
-/// Σ a b; any length.
+/// Adds Σ w pᵣ q꜀ of three rows p and three rows q to a 3 × 3 block; lengths are multiples of four.
 #[inline(always)]
-fn dot(a: &[f64], b: &[f64]) -> f64 {
-    let mut lanes = [0.0; 4];
-    let (ca, cb) = (a.chunks_exact(4), b.chunks_exact(4));
-    let rest: f64 = ca.remainder().iter().zip(cb.remainder()).map(|(x, y)| x * y).sum();
-    for (x, y) in ca.zip(cb) {
-        for l in 0..4 {
-            lanes[l] += x[l] * y[l];
+fn add_weighted_products(w: &[f64], [p, q]: [[&[f64]; 3]; 2], out: &mut [f64; 9]) {
+    let w = w.as_chunks::<4>().0;
+    let n = w.len();
+    let (mut a, mut b) = ([w; 3], [w; 3]);
+    for k in 0..3 {
+        (a[k], b[k]) = (&p[k].as_chunks::<4>().0[..n], &q[k].as_chunks::<4>().0[..n]);
+    }
+    let mut lanes = [[0.0; 4]; 9];
+    for k in 0..n {
+        for c in 0..3 {
+            let mut weighted = b[c][k];
+            for l in 0..4 {
+                weighted[l] *= w[k][l];
+            }
+            for r in 0..3 {
+                for l in 0..4 {
+                    lanes[3 * r + c][l] += a[r][k][l] * weighted[l];
+                }
+            }
         }
     }
-    rest + (lanes[0] + lanes[2]) + (lanes[1] + lanes[3])
+    for m in 0..9 {
+        let [a, b, c, d] = lanes[m];
+        out[m] += (a + c) + (b + d);
+    }
 }
 
-/// Σ w a b; any length.
-#[inline(always)]
-fn triple(w: &[f64], a: &[f64], b: &[f64]) -> f64 {
-    let mut lanes = [0.0; 4];
-    let (cw, ca, cb) = (w.chunks_exact(4), a.chunks_exact(4), b.chunks_exact(4));
-    let rest = cw.remainder().iter().zip(ca.remainder()).zip(cb.remainder());
-    let rest: f64 = rest.map(|((w, x), y)| w * x * y).sum();
-    for ((w, x), y) in cw.zip(ca).zip(cb) {
-        for l in 0..4 {
-            lanes[l] += w[l] * x[l] * y[l];
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::optics::Config;
+    use crate::optics::spot::{Component, Field, FieldPolynomial, Template};
+
+    /// A skewed spot of 7 σ, the config's σ, whose tail grows over the field, on 24 × 21 pixels.
+    fn lens() -> (MeasuredShape, [Basis; 2]) {
+        let camera = Config {
+            pixels: [24, 21],
+            ..Config::default()
+        }
+        .camera()
+        .unwrap();
+        let sigma = camera.spot_sigma_m;
+        let field = Field {
+            half_sensor_m: [camera.x.half_width(), camera.y.half_width()],
+        };
+        let gaussian = |x: f64, y: f64, width: f64| (-0.5 * (x * x + y * y) / (width * sigma).powi(2)).exp();
+        let skewed = |x: f64, y: f64| gaussian(x, y, 1.0) + 0.2 * gaussian(x - 0.8 * sigma, y + 0.5 * sigma, 1.5);
+        let mut template = Template::of_density(field, 0.2 * sigma, 7.0 * sigma, skewed);
+        let tail = Template::of_density(field, 0.2 * sigma, 7.0 * sigma, |x, y| x / sigma * gaussian(x, y, 1.2));
+        let [tail] = <[Component; 1]>::try_from(tail.components).unwrap();
+        template.components.push(Component {
+            field: FieldPolynomial(vec![0.0, 0.3, -0.2]),
+            ..tail
+        });
+        let shape = SpotShape::from_template(&template, 1e-7).unwrap();
+        assert!(shape.terms() > 1 && !shape.is_uniform());
+        let bases = [&camera.x, &camera.y].map(|axis| Basis::pixels(axis, sigma));
+        (MeasuredShape::new(Arc::new(shape), sigma), bases)
+    }
+
+    /// An array of the only component as a frame.
+    fn frame(shape: &MeasuredShape, [x, y]: &[Basis; 2], u: [f64; 2], [a, b]: [usize; 2]) -> Vec<f64> {
+        let mut components = MeasuredComponents::default();
+        components.clear(x.stride);
+        components.push(shape, [x, y], u, [0.3, -0.2], &[(-0.5, 0.4), (0.5, 0.6)]);
+        let mut matrix = vec![0.0; x.stride * y.n];
+        components.accumulate(0, a, b, 1.0, &mut matrix);
+        matrix
+    }
+
+    #[test]
+    fn derivatives_agree_with_finite_differences() {
+        let (shape, bases) = lens();
+        let h = 1e-4;
+        for u in [[0.3, -0.4], [-9.0, 6.5]] {
+            for (orders, along) in [([0, 0], 0), ([0, 0], 1), ([1, 0], 0), ([1, 0], 1), ([0, 1], 1)] {
+                let mut moved = [u; 2];
+                moved[0][along] += h;
+                moved[1][along] -= h;
+                let [after, before] = moved.map(|u| frame(&shape, &bases, u, orders));
+                let mut higher = orders;
+                higher[along] += 1;
+                let derivative = frame(&shape, &bases, u, higher);
+                let largest = derivative.iter().fold(0.0f64, |m, d| m.max(d.abs()));
+                for ((after, before), d) in after.iter().zip(&before).zip(&derivative) {
+                    // Second derivatives are zero outside the core, where the first hardly change.
+                    let slope = (after - before) / (2.0 * h);
+                    assert!(
+                        (slope - d).abs() < 0.02 * largest,
+                        "{u:?} {higher:?}: {slope} against {d}"
+                    );
+                }
+            }
         }
     }
-    rest + (lanes[0] + lanes[2]) + (lanes[1] + lanes[3])
+
+    #[test]
+    fn the_core_holds_all_but_a_thousandth_of_the_products() {
+        let (shape, bases) = lens();
+        let [x, y] = &bases;
+        assert!(shape.radii[1] < 0.8 * shape.radii[0], "{:?}", shape.radii);
+        let mut components = MeasuredComponents::default();
+        components.clear(x.stride);
+        for u in [[0.3, -0.4], [1.9, 0.8]] {
+            components.push(&shape, [x, y], u, [0.0; 2], &[(0.0, 1.0)]);
+        }
+        let weights: Vec<f64> = (0..x.stride * y.n).map(|k| 1.0 + 0.3 * (k as f64).sin()).collect();
+        const ORDERS: [[usize; 2]; 3] = [[1, 0], [0, 1], [0, 0]];
+        for (i, j) in [(0, 0), (0, 1), (1, 0)] {
+            let block = components.gram_block(i, j, &weights);
+            for r in 0..3 {
+                for c in 0..3 {
+                    let whole = components.inner_product(i, ORDERS[r], j, ORDERS[c], &weights);
+                    let own = |k: usize, a: [usize; 2]| components.inner_product(k, a, k, a, &weights);
+                    let scale = (own(i, ORDERS[r]) * own(j, ORDERS[c])).sqrt();
+                    assert!(
+                        (block[3 * r + c] - whole).abs() < 2.0 * OUTSIDE_CORE * scale,
+                        "{i} {j} {r} {c}"
+                    );
+                }
+            }
+        }
+    }
 }

@@ -5,6 +5,7 @@ pub mod compressed_frame;
 pub mod halo;
 pub mod hypothesis;
 pub mod measured_components;
+pub mod measured_terms;
 pub mod psf_table;
 pub mod separable_model;
 pub mod separable_terms;

@@ -70,7 +70,7 @@ pub(crate) struct SeparableModel {
     terms: SeparableTerms,
     /// Takes the place of `terms` where the PSF is measured.
     measured: Option<MeasuredComponents>,
-    terms_per_source: usize,
+    measured_terms: usize,
 }
 
 impl SeparableModel {
@@ -78,17 +78,23 @@ impl SeparableModel {
         self.components
     }
 
-    /// Numbers within all components' spans together: the cost of one pass over them.
-    pub fn footprint(&self) -> f64 {
+    /// Multiplications of placing all components and of their inner products with a frame and with each other.
+    pub fn pass_cost(&self, is_weighted: bool) -> f64 {
         match &self.measured {
-            None => self.terms.footprint(),
-            Some(m) => self.terms_per_source as f64 * m.footprint(),
+            None if is_weighted => (9.0 + 3.0 * self.components as f64) * self.terms.footprint(),
+            None => 9.0 * self.terms.footprint(),
+            Some(m) => (self.measured_terms as f64 + 3.0) * m.footprint() + m.pair_footprint(),
         }
     }
 
     /// Separable terms of a source.
     pub fn terms_per_source(&self) -> f64 {
         self.shares.len() as f64
+    }
+
+    /// Whether the PSF is measured.
+    pub fn is_measured(&self) -> bool {
+        self.measured.is_some()
     }
 
     /// Whether a source is one separable term.
@@ -123,7 +129,7 @@ impl SeparableModel {
         self.components = n + nuisances.background_terms();
         self.shares.clear();
         if let Some(shape) = &bases.shape {
-            self.terms_per_source = shape.terms();
+            self.measured_terms = shape.terms() * motion.len();
             let measured = self.measured.get_or_insert_default();
             measured.clear(compressed.mx);
             for s in &self.sources {
@@ -260,8 +266,9 @@ impl SeparableModel {
         }
     }
 
+    /// Sets what belongs to component `i` in a vector over the columns of J, from inner products with [`SLOPES`] of it.
     #[inline(always)]
-    fn set_jacobian(&self, i: usize, [value, along_x, along_y]: [f64; 3], out: &mut [f64]) {
+    pub fn set_jacobian(&self, i: usize, [value, along_x, along_y]: [f64; 3], out: &mut [f64]) {
         let n = self.sources.len();
         if i < n {
             let a = self.sources[i].a;

@@ -2,7 +2,7 @@
 
 use std::ops::Range;
 
-use crate::estimate::dense_linalg::{axpy, combine, dot};
+use crate::estimate::dense_linalg::{axpy, combine, dot, weighted_dot};
 use crate::estimate::model::svd_basis::Basis;
 use crate::estimate::preprocess::masked_pixels::Run;
 
@@ -246,7 +246,7 @@ impl SeparableTerms {
             let start = (y0 + c) * mx;
             axpy(v * w, &weights[start + x0..start + x1], scratch);
         }
-        triple(scratch, x(i, a[0]), x(j, b[0]))
+        weighted_dot(scratch, x(i, a[0]), x(j, b[0]))
     }
 
     /// Inner products along x and along y of term `i`'s f, f′ and f″ with term `j`'s f and f′; `None` where they share nothing.
@@ -313,7 +313,7 @@ impl SeparableTerms {
         let t: [&[f64]; 4] = [t00, t01, t10, t11];
         for k in 0..9 {
             let ([a, b], [c, d]) = (ALONG_X[k], ALONG_Y[k]);
-            out[k] = triple(t[2 * c + d], x(i, a), x(j, b));
+            out[k] = weighted_dot(t[2 * c + d], x(i, a), x(j, b));
         }
         out
     }
@@ -355,17 +355,4 @@ impl SeparableTerms {
         }
         out
     }
-}
-
-/// Σ w a b; lengths are multiples of 4.
-#[inline(always)]
-fn triple(w: &[f64], a: &[f64], b: &[f64]) -> f64 {
-    let mut lanes = [0.0; 4];
-    let chunks = w.chunks_exact(4).zip(a.chunks_exact(4)).zip(b.chunks_exact(4));
-    for ((w, a), b) in chunks {
-        for l in 0..4 {
-            lanes[l] += w[l] * a[l] * b[l];
-        }
-    }
-    (lanes[0] + lanes[2]) + (lanes[1] + lanes[3])
 }

@@ -179,13 +179,15 @@ pub(crate) fn search_with_spot_error(
     }
     set_weights(space, compressed, frame, spot_error, &candidate.sources);
     let mut search = space.search(compressed, frame, budget);
-    search.converge(&mut candidate);
     let refined = refit_reweighted(&mut search, candidate.clone().into_hypothesis(), ROUNDS);
     // A bright spot is never its own halo's.
     let is_kept = |spot: &PointSource| refined.sources.iter().any(|s| distance2(s.u, spot.u) < CORE * CORE);
     match bright.iter().all(is_kept) {
         true => refined,
-        false => candidate.into_hypothesis(),
+        false => {
+            search.converge(&mut candidate);
+            candidate.into_hypothesis()
+        }
     }
 }
 

@@ -6,7 +6,7 @@ use crate::estimate::emitter::SecondMomentScore;
 use crate::estimate::fit::levenberg_marquardt::Linearisation;
 use crate::estimate::fit::problem::Problem;
 use crate::estimate::fit::work_budget::WorkBudget;
-use crate::estimate::model::separable_model::SeparableModel;
+use crate::estimate::model::separable_model::{SLOPES, SeparableModel};
 use crate::estimate::uncertainty::covariance::Covariance;
 
 /// Orders and factors of the derivatives for the second moments xx, xy, yy: a source spread by M changes by
@@ -130,6 +130,21 @@ fn unprojected_score(
                 for c in 0..3 {
                     information[r][c] -= own[r] * values[r] * own[c] * values[c];
                 }
+            }
+        }
+    } else if model.is_measured() {
+        for (r, (second, _)) in SECOND.into_iter().enumerate() {
+            for (c, (other, _)) in SECOND.into_iter().enumerate() {
+                information[r][c] =
+                    own[r] * own[c] * model.inner_product(i, second, i, other, &compressed.weights, strip);
+            }
+            let row = &mut cross[r * p..(r + 1) * p];
+            for j in 0..model.components() {
+                let mut products = [0.0; 3];
+                for (k, slope) in SLOPES.into_iter().enumerate() {
+                    products[k] = own[r] * model.inner_product(i, second, j, slope, &compressed.weights, strip);
+                }
+                model.set_jacobian(j, products, row);
             }
         }
     } else {

@@ -12,6 +12,6 @@ mod template;
 
 pub use field::{Field, FieldPolynomial};
 pub use layout::{Layout, TermLayout};
-pub use profile::Profile;
+pub use profile::{KnotPlace, Profile};
 pub use shape::{LEGENDRE, SpotShape};
 pub use template::{Component, Template};

@@ -18,8 +18,17 @@ pub struct Profile {
     knot_m: f64,
     radius_m: f64,
     coefficients: Vec<f64>,
-    /// For each knot interval the cumulative as a quartic of s ∈ [0, 1], lowest power first.
+    per_knot: f64,
+    /// The cumulative as a quartic of s ∈ [0, 1], lowest power first: below the support, in each knot interval, and beyond.
     pieces: Vec<[f64; 5]>,
+}
+
+/// Where a coordinate lies between the knots, of every profile that has the same.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct KnotPlace {
+    piece: usize,
+    /// Share of the interval.
+    s: f64,
 }
 
 impl Profile {
@@ -31,7 +40,7 @@ impl Profile {
             _ => 0.0,
         };
         let mut below = 0.0;
-        let pieces = (0..n + 3)
+        let mut pieces: Vec<_> = (0..n + 3)
             .map(|j| {
                 let [c0, c1, c2, c3] = [0, 1, 2, 3].map(|back| at(j, back));
                 let piece = [
@@ -45,9 +54,12 @@ impl Profile {
                 piece
             })
             .collect();
+        pieces.insert(0, [0.0; 5]);
+        pieces.push([coefficients.iter().sum(), 0.0, 0.0, 0.0, 0.0]);
         Self {
             knot_m,
             radius_m: 0.5 * (n + 3) as f64 * knot_m,
+            per_knot: 1.0 / knot_m,
             coefficients,
             pieces,
         }
@@ -76,22 +88,38 @@ impl Profile {
     /// slope(hi − c) − slope(lo − c).
     #[inline(always)]
     pub fn value(&self, t: f64) -> Value {
-        let place = (t + self.radius_m) / self.knot_m;
-        if !(place > 0.0) {
-            return Value::default();
+        self.at(self.place(t))
+    }
+
+    /// Where `t`, m, lies between the knots.
+    #[inline(always)]
+    pub fn place(&self, t: f64) -> KnotPlace {
+        let from_edge = (t + self.radius_m) * self.per_knot;
+        if !(from_edge > 0.0) {
+            return KnotPlace::default();
         }
-        let j = place as usize;
-        let Some(p) = self.pieces.get(j) else {
-            return Value {
-                cumulative: self.total(),
-                ..Value::default()
+        let interval = from_edge as usize;
+        let beyond = self.pieces.len() - 2;
+        if interval >= beyond {
+            return KnotPlace {
+                piece: beyond + 1,
+                s: 0.0,
             };
-        };
-        let s = place - j as f64;
+        }
+        KnotPlace {
+            piece: interval + 1,
+            s: from_edge - interval as f64,
+        }
+    }
+
+    /// [`Self::value`] of a place by this profile's knots.
+    #[inline(always)]
+    pub fn at(&self, KnotPlace { piece, s }: KnotPlace) -> Value {
+        let p = &self.pieces[piece];
         Value {
             cumulative: p[0] + s * (p[1] + s * (p[2] + s * (p[3] + s * p[4]))),
-            density: (p[1] + s * (2.0 * p[2] + s * (3.0 * p[3] + s * 4.0 * p[4]))) / self.knot_m,
-            slope: (2.0 * p[2] + s * (6.0 * p[3] + s * 12.0 * p[4])) / (self.knot_m * self.knot_m),
+            density: (p[1] + s * (2.0 * p[2] + s * (3.0 * p[3] + s * 4.0 * p[4]))) * self.per_knot,
+            slope: (2.0 * p[2] + s * (6.0 * p[3] + s * 12.0 * p[4])) * (self.per_knot * self.per_knot),
         }
     }
 

@@ -114,6 +114,48 @@ impl SpotShape {
         sum
     }
 
+    /// Half the side of the square about the centre outside which lies at most `share` of Σ S² and of Σ |∇S|², which the energy and the position
+    /// are told from, at the sensor's middle and its corners, m.
+    pub fn core_radius_m(&self, share: f64) -> f64 {
+        let [u, v] = self.field.half_sensor_m;
+        let places = [[0.0, 0.0], [-u, -v], [u, -v], [-u, v], [u, v]];
+        let rings = self.terms[0].x.coefficients().len().div_ceil(2) + 2;
+        let knot = self.terms[0].x.knot_m();
+        let at = |profile: &Profile| -> Vec<[f64; 2]> {
+            (0..2 * rings)
+                .map(|k| (k as f64 - rings as f64 + 0.5) * knot)
+                .map(|t| [profile.density(t), profile.slope(t)])
+                .collect()
+        };
+        let profiles: Vec<_> = self.terms.iter().map(|term| (at(&term.x), at(&term.y))).collect();
+        let core = |[u, v]: [f64; 2]| {
+            let weights: Vec<f64> = self.weights_at(u, v).map(|(w, ..)| w).collect();
+            let mut of_ring = vec![[0.0; 2]; rings];
+            for j in 0..2 * rings {
+                for i in 0..2 * rings {
+                    let (mut value, mut slopes) = (0.0, [0.0; 2]);
+                    for ((x, y), w) in profiles.iter().zip(&weights) {
+                        value += w * x[i][0] * y[j][0];
+                        slopes[0] += w * x[i][1] * y[j][0];
+                        slopes[1] += w * x[i][0] * y[j][1];
+                    }
+                    let ring = |k: usize| k.max(2 * rings - 1 - k) - rings;
+                    let sums = &mut of_ring[ring(i).max(ring(j))];
+                    sums[0] += value * value;
+                    sums[1] += slopes[0] * slopes[0] + slopes[1] * slopes[1];
+                }
+            }
+            let total = of_ring.iter().fold([0.0; 2], |t, r| [t[0] + r[0], t[1] + r[1]]);
+            let mut outside = [0.0; 2];
+            let needed = of_ring.iter().rposition(|ring| {
+                outside = [outside[0] + ring[0], outside[1] + ring[1]];
+                (0..2).any(|k| outside[k] > share * total[k])
+            });
+            (needed.map_or(0, |k| k + 1)) as f64 * knot
+        };
+        places.into_iter().map(core).fold(0.0, f64::max).min(self.radius_m())
+    }
+
     /// Width of the Gaussian with the same noise-equivalent area 1/∫∫S² = 4πσ² (King, 1983), m, averaged over the sensor.
     pub fn sigma_equivalent_m(&self) -> f64 {
         const PLACES: [f64; 3] = [-0.8, 0.0, 0.8];

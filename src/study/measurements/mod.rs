@@ -31,16 +31,19 @@ pub struct Measurement {
 
 enum Run {
     Whole(fn(stories: u64, seed: u64) -> Measured),
-    /// Of the rows that are named.
-    Rows(fn(stories: u64, seed: u64, only: &[String]) -> Measured),
+    /// Of the rows that are named; each is said as soon as it is measured.
+    Rows(fn(stories: u64, seed: u64, only: &[String], say: Say) -> Measured),
 }
 
+/// Takes a line of a table.
+pub type Say<'a> = &'a mut dyn FnMut(&str);
+
 impl Measurement {
-    /// Measures `stories` stories, whose seeds begin with `seed`; where a measurement has rows, those that `only` names.
-    pub fn run(&self, stories: u64, seed: u64, only: &[String]) -> Measured {
+    /// Measures `stories` stories, whose seeds begin with `seed`; where a measurement has rows, those that `only` names, and says each.
+    pub fn run(&self, stories: u64, seed: u64, only: &[String], say: Say) -> Measured {
         match self.run {
             Run::Whole(run) => run(stories, seed),
-            Run::Rows(run) => run(stories, seed, only),
+            Run::Rows(run) => run(stories, seed, only, say),
         }
     }
 }
@@ -81,7 +84,7 @@ const fn measurement(name: &'static str, stories: u64, run: fn(u64, u64) -> Meas
     }
 }
 
-const fn rows(name: &'static str, stories: u64, run: fn(u64, u64, &[String]) -> Measured) -> Measurement {
+const fn rows(name: &'static str, stories: u64, run: fn(u64, u64, &[String], Say) -> Measured) -> Measurement {
     Measurement {
         name,
         stories,

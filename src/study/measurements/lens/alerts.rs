@@ -1,9 +1,8 @@
 //! Honest users through a lens that the config does not describe: nobody is to be alerted.
 
-use std::fmt::Write;
-
 use rayon::prelude::*;
 
+use super::super::Say;
 use super::super::measured::{Measured, exceptions};
 use crate::study::stories::pixels::{PixelStory, RATE_HZ, review};
 
@@ -26,8 +25,8 @@ const SPOTS: [(&str, &str); 6] = [
 const HONEST_S: f64 = 120.0;
 
 /// Four honest users through each lens, so many stories of two minutes: thirty make an hour.
-pub fn honest(stories: u64, seed: u64, only: &[String]) -> Measured {
-    let mut text = "| lens | honest frames | alerts |\n|---|---|---|\n".to_owned();
+pub fn honest(stories: u64, seed: u64, only: &[String], say: Say) -> Measured {
+    say("| lens | honest frames | alerts |\n|---|---|---|");
     let mut all = Vec::new();
     for (name, spot) in SPOTS.into_iter().filter(|(name, _)| super::is_named(name, only)) {
         let tell = |k| {
@@ -43,12 +42,12 @@ pub fn honest(stories: u64, seed: u64, only: &[String]) -> Measured {
         let mut raised: Vec<_> = (seed..seed + stories).into_par_iter().map(tell).collect();
         let count: usize = raised.iter().map(|(_, raised)| raised.len()).sum();
         let frames = stories as f64 * HONEST_S * RATE_HZ;
-        writeln!(text, "| {name} | {frames} | {count} |").expect("text takes all");
+        say(&format!("| {name} | {frames} | {count} |"));
         raised.retain(|(_, raised)| !raised.is_empty());
         all.extend(raised);
     }
     Measured {
-        text: format!("{text}\n{}", exceptions(&all)),
+        text: format!("\n{}", exceptions(&all)),
         holds: all.is_empty(),
     }
 }

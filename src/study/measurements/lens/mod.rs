@@ -5,9 +5,9 @@ mod bench;
 mod shapes;
 mod tally;
 
-use std::fmt::Write;
 use std::time::Instant;
 
+use super::Say;
 use super::measured::Measured;
 use crate::estimate;
 use crate::optics::Camera;
@@ -22,9 +22,10 @@ const MOST_INVENTED: f64 = 1.0;
 const FIGURES: &str = "number right %, invented %, missed %, in ellipse %, error over bound, median and longest ms";
 
 /// So many frames of each lens, peak SNR and layout, without a calibration; of the rows that `only` names.
-pub fn uncalibrated(frames: u64, seed: u64, only: &[String]) -> Measured {
-    let mut text =
-        format!("| lens | SNR | {FIGURES}: 64×64 apart | 64×64, pairs 2 σ apart | 20×20 |\n|---|---|---|---|---|\n");
+pub fn uncalibrated(frames: u64, seed: u64, only: &[String], say: Say) -> Measured {
+    say(&format!(
+        "| lens | SNR | {FIGURES}: 64×64 apart | 64×64, pairs 2 σ apart | 20×20 |\n|---|---|---|---|---|"
+    ));
     let mut holds = true;
     for (lens, snr) in rows(only) {
         let cells = [(64, Layout::Apart), (64, Layout::Pairs), (20, Layout::Apart)].map(|(pixels, layout)| {
@@ -34,16 +35,19 @@ pub fn uncalibrated(frames: u64, seed: u64, only: &[String]) -> Measured {
         });
         holds &= 100.0 * cells[0].invented as f64 <= MOST_INVENTED * cells[0].spots as f64;
         let cells = cells.map(Tally::cell);
-        writeln!(text, "| {} | {snr} | {} |", lens.name, cells.join(" | ")).expect("text takes all");
+        say(&format!("| {} | {snr} | {} |", lens.name, cells.join(" | ")));
     }
-    Measured { text, holds }
+    Measured {
+        text: String::new(),
+        holds,
+    }
 }
 
 /// The same with a calibration that was learned from other frames of the lens, whose positions it was not told.
-pub fn calibrated(frames: u64, seed: u64, only: &[String]) -> Measured {
-    let mut text = format!(
-        "| lens | SNR | 64×64: learned | {FIGURES}: apart | pairs 2 σ apart | 20×20: learned | apart |\n|---|---|---|---|---|---|---|\n"
-    );
+pub fn calibrated(frames: u64, seed: u64, only: &[String], say: Say) -> Measured {
+    say(&format!(
+        "| lens | SNR | 64×64: learned | {FIGURES}: apart | pairs 2 σ apart | 20×20: learned | apart |\n|---|---|---|---|---|---|---|"
+    ));
     for (lens, snr) in rows(only) {
         let mut cells = Vec::new();
         for (pixels, layouts) in [(64, &[Layout::Apart, Layout::Pairs][..]), (20, &[Layout::Apart])] {
@@ -59,9 +63,12 @@ pub fn calibrated(frames: u64, seed: u64, only: &[String]) -> Measured {
                 cells.push(tally.cell());
             }
         }
-        writeln!(text, "| {} | {snr} | {} |", lens.name, cells.join(" | ")).expect("text takes all");
+        say(&format!("| {} | {snr} | {} |", lens.name, cells.join(" | ")));
     }
-    Measured { text, holds: true }
+    Measured {
+        text: String::new(),
+        holds: true,
+    }
 }
 
 /// Lenses and peak SNRs of the rows, "Airy disc 300", that `only` names.
