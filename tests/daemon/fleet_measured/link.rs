@@ -1,7 +1,7 @@
 //! What a station's frames take while the server is there, gone, hanging and full.
 
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use async_nats::jetstream::{self, stream};
 use serde_json::Value;
@@ -11,8 +11,9 @@ use super::super::process::Daemon;
 use super::{QUIET, load, number, quantile, standing_alert};
 
 const RATE_HZ: f64 = 40.0;
-/// The status has the latency of the newest 128 frames.
 const SAMPLE: Duration = Duration::from_millis(3600);
+/// Between two looks at the newest frame's latency: each frame is seen.
+const LOOK: Duration = Duration::from_millis(8);
 /// Bytes that the full server's stream holds.
 const ROOM: i64 = 64 << 10;
 
@@ -22,18 +23,50 @@ enum Link {
     Gone,
     Hanging,
     Full,
+    /// As the first: what differs from it is the machine's doing.
+    GoodAgain,
 }
 
-/// Median and 99th percentile of a sample's frames, µs, and the time on a processor that each frame took, µs.
-fn sample(station: &Daemon) -> [f64; 3] {
-    let status = || -> Value { serde_json::from_str(&station.get("/v1/status").1).unwrap() };
-    let frames = |status: &Value| status["frames"]["captured"].as_f64().unwrap();
-    let (before, cpu) = (status(), station.cpu_s());
-    std::thread::sleep(SAMPLE);
-    let after = status();
-    let cost = 1e6 * (station.cpu_s() - cpu) / (frames(&after) - frames(&before));
-    let of = |name: &str| after["latency"][name].as_f64().unwrap();
-    [of("median_us"), of("p99_us"), cost]
+const LINKS: [(Link, &str); 5] = [
+    (Link::Good, "there"),
+    (Link::Gone, "gone"),
+    (Link::Hanging, "hanging"),
+    (Link::Full, "full"),
+    (Link::GoodAgain, "there, again"),
+];
+
+/// Frames under one state of the server.
+#[derive(Default)]
+struct Frames {
+    latencies_us: Vec<f64>,
+    cpu_s: f64,
+}
+
+impl Frames {
+    fn sample(&mut self, station: &Daemon) {
+        let (cpu_s, until) = (station.cpu_s(), Instant::now() + SAMPLE);
+        let mut last = None;
+        while Instant::now() < until {
+            let status: Value = serde_json::from_str(&station.get("/v1/status").1).unwrap();
+            let captured = status["frames"]["captured"].as_u64();
+            if last != captured {
+                last = captured;
+                self.latencies_us.push(status["latency"]["last_us"].as_f64().unwrap());
+            }
+            std::thread::sleep(LOOK);
+        }
+        self.cpu_s += station.cpu_s() - cpu_s;
+    }
+
+    /// Median and 99th percentile, µs, and the time on a processor that a frame took with all else that the station does, µs.
+    fn figures(&mut self) -> [f64; 3] {
+        let cpu_us = 1e6 * self.cpu_s / self.latencies_us.len() as f64;
+        [
+            quantile(&mut self.latencies_us, 0.5),
+            quantile(&mut self.latencies_us, 0.99),
+            cpu_us,
+        ]
+    }
 }
 
 /// The stream with room for little, filled to the brim or empty.
@@ -86,8 +119,7 @@ fn a_frame_s_latency_whatever_the_server_does() {
     let station = station_of(dir.path(), "ap7", &file, server.port, &more);
     let id = standing_alert(&station);
     let is_over = AtomicBool::new(false);
-    let links = [Link::Good, Link::Gone, Link::Hanging, Link::Full];
-    let mut samples: [Vec<[f64; 3]>; 4] = Default::default();
+    let mut frames: [Frames; 5] = Default::default();
     std::thread::scope(|scope| {
         scope.spawn(|| {
             let path = format!("/v1/alerts/{id}/acknowledge");
@@ -100,16 +132,16 @@ fn a_frame_s_latency_whatever_the_server_does() {
             }
         });
         for _ in 0..number("ROUNDS", 6) {
-            for (k, link) in links.into_iter().enumerate() {
+            for ((link, _), frames) in LINKS.into_iter().zip(&mut frames) {
                 match link {
-                    Link::Good => {}
+                    Link::Good | Link::GoodAgain => {}
                     Link::Gone => server.end(),
                     Link::Hanging => server.signal("-STOP"),
                     Link::Full => fill(server.port, true),
                 }
-                samples[k].push(sample(&station));
+                frames.sample(&station);
                 match link {
-                    Link::Good => {}
+                    Link::Good | Link::GoodAgain => {}
                     Link::Gone => server = Server::start(dir.path(), Some(server.port)).unwrap(),
                     Link::Hanging => server.signal("-CONT"),
                     Link::Full => fill(server.port, false),
@@ -119,13 +151,14 @@ fn a_frame_s_latency_whatever_the_server_does() {
         is_over.store(true, Ordering::Relaxed);
     });
     println!(
-        "| server, load {} | median, µs | p99, µs | processor, µs a frame | ratio of medians | of p99 | of processor time |\n|---|---|---|---|---|---|---|",
+        "| server, load {} | frames | median, µs | p99, µs | processor, µs a frame | ratio of medians | of p99 | of processor time |\n|---|---|---|---|---|---|---|---|",
         load()
     );
-    let median = |k: usize, what: usize| quantile(&mut samples[k].iter().map(|s| s[what]).collect::<Vec<_>>(), 0.5);
-    for (k, name) in ["there", "gone", "hanging", "full"].iter().enumerate() {
-        let [a, b, c] = [0, 1, 2].map(|what| median(k, what));
-        let [x, y, z] = [0, 1, 2].map(|what| median(k, what) / median(0, what));
-        println!("| {name} | {a:.0} | {b:.0} | {c:.0} | {x:.2} | {y:.2} | {z:.2} |");
+    let there = frames[0].figures();
+    for ((_, name), frames) in LINKS.into_iter().zip(&mut frames) {
+        let [a, b, c] = frames.figures();
+        let count = frames.latencies_us.len();
+        let [x, y, z] = [a / there[0], b / there[1], c / there[2]];
+        println!("| {name} | {count} | {a:.0} | {b:.0} | {c:.0} | {x:.2} | {y:.2} | {z:.2} |");
     }
 }
