@@ -2,8 +2,8 @@
 
 use std::ops::Range;
 
+use super::band::pixels_within;
 use super::patch::{Patch, Source};
-use super::template_model::pixels_within;
 use crate::optics::Camera;
 
 /// One frame prepared for learning, J, row by row.

@@ -1,5 +1,6 @@
 //! Learns the spot's shape over the field, the noise and the pixel maps from frames whose positions nobody knows.
 
+mod band;
 mod constraints;
 mod coverage;
 mod detection;

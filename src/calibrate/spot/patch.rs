@@ -4,7 +4,8 @@ use std::ops::Range;
 
 use faer::Mat;
 
-use super::template_model::{Band, Scratch, TemplateModel, adjoint, forward, pixels_within};
+use super::band::{Band, Scratch, adjoint, forward, pixels_within};
+use super::template_model::TemplateModel;
 use crate::calibrate::exposure::ScaledCholesky;
 use crate::optics::Camera;
 

@@ -3,9 +3,9 @@
 use ndarray::Array2;
 use rayon::prelude::*;
 
+use super::band::pixels_within;
 use super::learn::{Learner, Odd};
 use super::patch::Patch;
-use super::template_model::pixels_within;
 use crate::calibrate::maps::{self, Pixels};
 use crate::optics::PixelMaps;
 

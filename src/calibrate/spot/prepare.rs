@@ -2,9 +2,9 @@
 
 use ndarray::Array2;
 
+use super::band::pixels_within;
 use super::detection;
 use super::grouping::Image;
-use super::template_model::pixels_within;
 use crate::optics::{Camera, PixelMaps};
 use crate::stats::median;
 
