@@ -64,6 +64,8 @@ rules! {
     free_nuisances,
     /// A background or another width is tried in the place of more sources, once a search has ended. Needed most in P8/60 with a background.
     select_nuisances,
+    /// A frame that another width or an elongated spot explains is searched from there, before it is asked whether its lens is another.
+    explain_by_width,
     /// A rotated elliptical PSF is tried in the place of more sources. Needed with the condition `ellipse`.
     rotated_ellipse,
     /// Sources that do not exceed the misfit around them are removed. No cell of the trade-off needs it; the scene `hazy-noon` does: without

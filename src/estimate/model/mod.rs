@@ -5,6 +5,8 @@ pub mod compressed_frame;
 pub mod halo;
 pub mod hypothesis;
 pub mod measured_components;
+#[cfg(test)]
+mod measured_components_test;
 pub mod measured_terms;
 pub mod psf_table;
 pub mod separable_model;

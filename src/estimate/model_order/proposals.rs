@@ -58,6 +58,19 @@ pub(crate) fn split(search: &mut Search, candidate: &mut Candidate) -> bool {
     })
 }
 
+/// Two halves in the place of every source that the score test takes for two, all at once: where there is no pencil to begin with, a melted pair
+/// would otherwise be found by the peaks that one source in its place leaves on either side.
+pub(crate) fn split_all(search: &mut Search, candidate: &mut Candidate) -> bool {
+    if !search.rules().split {
+        return false;
+    }
+    let splits = candidate.split_proposals(&mut search.context);
+    let least = search.criterion.threshold();
+    let likely = splits.iter().take_while(|s| s.gain > least);
+    let next = likely.fold(Hypothesis::clone(candidate), |next, s| split_source(&next, s));
+    next.sources.len() > candidate.sources.len() && search.try_accept(candidate, next)
+}
+
 /// One source in the place of a close pair, where the quadratic prediction leaves hope.
 pub(crate) fn merge(search: &mut Search, candidate: &mut Candidate) -> bool {
     if !search.rules().merge {

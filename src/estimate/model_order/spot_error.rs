@@ -11,10 +11,11 @@ use crate::estimate::model_order::common_misfit::{
     CORE, MAX_SPOT_ERROR, are_pairs_alike, bright_spots, common_misfit, distance2, is_narrow,
 };
 use crate::estimate::model_order::maximum_likelihood::refit_reweighted;
+use crate::estimate::model_order::proposals::split_all;
 use crate::estimate::model_order::search::{Search, SearchSpace};
 use crate::estimate::preprocess::screening::PreprocessedFrame;
 
-/// Rounds of adding residual peaks, each under weights that follow the sources found so far.
+/// Rounds of splitting sources or adding residual peaks, each under weights that follow the sources found so far.
 const PASSES: usize = 6;
 /// Rounds of proposals under the last weights.
 const ROUNDS: usize = 3;
@@ -110,7 +111,7 @@ pub(crate) fn inspect_shape(
 /// The bright spots of `hypothesis` with another width, or elongated, where that explains the frame. Asked before spots are compared: those of
 /// another width have that in common.
 pub(crate) fn explained_by_width(search: &mut Search, hypothesis: &Hypothesis) -> Option<Hypothesis> {
-    if search.is_measured() || !search.rules().select_nuisances {
+    if search.is_measured() || !search.rules().explain_by_width {
         return None;
     }
     [true, false].into_iter().find_map(|merge_core| {
@@ -162,6 +163,9 @@ pub(crate) fn search_with_spot_error(
         set_weights(space, compressed, frame, spot_error, &candidate.sources);
         let mut search = space.search(compressed, frame, budget);
         search.fit_trial(&mut candidate);
+        if split_all(&mut search, &mut candidate) {
+            continue;
+        }
         let peaks = search.residual_peaks(&mut candidate);
         let least = peaks.first().map_or(0.0, |p| STRONG_PEAK * p.significance);
         let threshold = search.criterion.threshold().sqrt();

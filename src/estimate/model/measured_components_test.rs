@@ -1,0 +1,99 @@
+//! Patches of a skewed spot that changes over the field: derivatives, and what the core leaves out.
+
+use std::sync::Arc;
+
+use crate::estimate::model::measured_components::{MeasuredComponents, MeasuredShape, OUTSIDE_CORE};
+use crate::estimate::model::svd_basis::Basis;
+use crate::optics::Config;
+use crate::optics::spot::{Component, Field, FieldPolynomial, SpotShape, Template};
+
+/// A skewed spot of 7 σ, the config's σ, whose tail grows over the field, on 24 × 21 pixels.
+fn lens() -> (MeasuredShape, [Basis; 2]) {
+    let camera = Config {
+        pixels: [24, 21],
+        ..Config::default()
+    }
+    .camera()
+    .unwrap();
+    let sigma = camera.spot_sigma_m;
+    let field = Field {
+        half_sensor_m: [camera.x.half_width(), camera.y.half_width()],
+    };
+    let gaussian = |x: f64, y: f64, width: f64| (-0.5 * (x * x + y * y) / (width * sigma).powi(2)).exp();
+    let skewed = |x: f64, y: f64| gaussian(x, y, 1.0) + 0.2 * gaussian(x - 0.8 * sigma, y + 0.5 * sigma, 1.5);
+    let mut template = Template::of_density(field, 0.2 * sigma, 7.0 * sigma, skewed);
+    let tail = Template::of_density(field, 0.2 * sigma, 7.0 * sigma, |x, y| x / sigma * gaussian(x, y, 1.2));
+    let [tail] = <[Component; 1]>::try_from(tail.components).unwrap();
+    template.components.push(Component {
+        field: FieldPolynomial(vec![0.0, 0.3, -0.2]),
+        ..tail
+    });
+    let shape = SpotShape::from_template(&template, 1e-7).unwrap();
+    assert!(shape.terms() > 1 && !shape.is_uniform());
+    let bases = [&camera.x, &camera.y].map(|axis| Basis::pixels(axis, sigma));
+    (MeasuredShape::new(Arc::new(shape), sigma), bases)
+}
+
+/// An array of the only component as a frame.
+fn frame(shape: &MeasuredShape, [x, y]: &[Basis; 2], u: [f64; 2], [a, b]: [usize; 2]) -> Vec<f64> {
+    let mut components = MeasuredComponents::default();
+    components.clear(x.stride);
+    components.push(shape, [x, y], u, [0.3, -0.2], &[(-0.5, 0.4), (0.5, 0.6)]);
+    let mut matrix = vec![0.0; x.stride * y.n];
+    components.accumulate(0, a, b, 1.0, &mut matrix);
+    matrix
+}
+
+#[test]
+fn derivatives_agree_with_finite_differences() {
+    let (shape, bases) = lens();
+    let h = 1e-4;
+    for u in [[0.3, -0.4], [-9.0, 6.5]] {
+        for (orders, along) in [([0, 0], 0), ([0, 0], 1), ([1, 0], 0), ([1, 0], 1), ([0, 1], 1)] {
+            let mut moved = [u; 2];
+            moved[0][along] += h;
+            moved[1][along] -= h;
+            let [after, before] = moved.map(|u| frame(&shape, &bases, u, orders));
+            let mut higher = orders;
+            higher[along] += 1;
+            let derivative = frame(&shape, &bases, u, higher);
+            let largest = derivative.iter().fold(0.0f64, |m, d| m.max(d.abs()));
+            for ((after, before), d) in after.iter().zip(&before).zip(&derivative) {
+                // Second derivatives are zero outside the core, where the first hardly change.
+                let slope = (after - before) / (2.0 * h);
+                assert!(
+                    (slope - d).abs() < 0.02 * largest,
+                    "{u:?} {higher:?}: {slope} against {d}"
+                );
+            }
+        }
+    }
+}
+
+#[test]
+fn the_core_holds_all_but_a_thousandth_of_the_products() {
+    let (shape, bases) = lens();
+    let [x, y] = &bases;
+    assert!(shape.radii[1] < 0.8 * shape.radii[0], "{:?}", shape.radii);
+    let mut components = MeasuredComponents::default();
+    components.clear(x.stride);
+    for u in [[0.3, -0.4], [1.9, 0.8]] {
+        components.push(&shape, [x, y], u, [0.0; 2], &[(0.0, 1.0)]);
+    }
+    let weights: Vec<f64> = (0..x.stride * y.n).map(|k| 1.0 + 0.3 * (k as f64).sin()).collect();
+    const ORDERS: [[usize; 2]; 3] = [[1, 0], [0, 1], [0, 0]];
+    for (i, j) in [(0, 0), (0, 1), (1, 0)] {
+        let block = components.gram_block(i, j, &weights);
+        for r in 0..3 {
+            for c in 0..3 {
+                let whole = components.inner_product(i, ORDERS[r], j, ORDERS[c], &weights);
+                let own = |k: usize, a: [usize; 2]| components.inner_product(k, a, k, a, &weights);
+                let scale = (own(i, ORDERS[r]) * own(j, ORDERS[c])).sqrt();
+                assert!(
+                    (block[3 * r + c] - whole).abs() < 2.0 * OUTSIDE_CORE * scale,
+                    "{i} {j} {r} {c}"
+                );
+            }
+        }
+    }
+}
