@@ -59,10 +59,12 @@ fn derivatives_agree_with_finite_differences() {
             let derivative = frame(&shape, &bases, u, higher);
             let largest = derivative.iter().fold(0.0f64, |m, d| m.max(d.abs()));
             for ((after, before), d) in after.iter().zip(&before).zip(&derivative) {
-                // Second derivatives are zero outside the core, where the first hardly change.
+                // Second derivatives are taken for zero outside the core: the root of its thousandth, times how much steeper they are.
+                let is_outside = *d == 0.0 && higher[0] + higher[1] == 2;
+                let tolerance = if is_outside { 0.1 } else { 1e-3 };
                 let slope = (after - before) / (2.0 * h);
                 assert!(
-                    (slope - d).abs() < 0.02 * largest,
+                    (slope - d).abs() < tolerance * largest,
                     "{u:?} {higher:?}: {slope} against {d}"
                 );
             }
