@@ -9,7 +9,7 @@
 use std::sync::Arc;
 
 use crate::estimate::dense_linalg::{axpy, combine, dot, weighted_dot};
-use crate::estimate::model::measured_terms::{MeasuredTerms, Part};
+use crate::estimate::model::measured_terms::{MeasuredTerms, Part, Span, size};
 use crate::estimate::model::svd_basis::Basis;
 use crate::optics::spot::SpotShape;
 
@@ -43,9 +43,6 @@ const fn array(a: usize, b: usize) -> usize {
 
 /// An array that covers the core alone.
 const ARRAY_OF_CORE: usize = EACH;
-
-/// Columns and rows.
-pub(super) type Span = [[usize; 2]; 2];
 
 /// Where a component's arrays are: (rows, arrays, columns) of the whole, then of the core.
 struct Patch {
@@ -329,12 +326,6 @@ impl MeasuredComponents {
         }
         out
     }
-}
-
-/// Columns and rows of a span.
-#[inline(always)]
-pub(super) fn size([[left, right], [top, bottom]]: Span) -> [usize; 2] {
-    [right - left, bottom - top]
 }
 
 /// What two spans share.

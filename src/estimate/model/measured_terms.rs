@@ -1,8 +1,16 @@
 //! The separable terms of a measured spot at one place: profiles along x, and factors along y with the weights that vary over the field.
 
-use crate::estimate::model::measured_components::{Span, size};
 use crate::estimate::model::svd_basis::Basis;
 use crate::optics::spot::{KnotPlace, SpotShape};
+
+/// The first and last columns and rows of a patch of pixels, the last left out.
+pub(crate) type Span = [[usize; 2]; 2];
+
+/// Columns and rows of a span.
+#[inline(always)]
+pub(crate) fn size([[left, right], [top, bottom]]: Span) -> [usize; 2] {
+    [right - left, bottom - top]
+}
 
 /// A part of a spot that motion smears.
 pub(crate) struct Part {
