@@ -10,6 +10,9 @@ pub struct Measured {
     pub holds: bool,
 }
 
+/// Takes a line of a table as soon as it is measured.
+pub type Say<'a> = &'a mut dyn FnMut(&str);
+
 /// Of alerts in the order in which they were raised: the kinds, users and times, s.
 pub type Raised = Vec<(AlertKind, Option<String>, f64)>;
 

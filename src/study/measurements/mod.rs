@@ -19,7 +19,7 @@ mod smear;
 mod zone_cost;
 mod zones;
 
-pub use measured::Measured;
+pub use measured::{Measured, Say};
 
 /// Something to measure.
 pub struct Measurement {
@@ -34,9 +34,6 @@ enum Run {
     /// Of the rows that are named; each is said as soon as it is measured.
     Rows(fn(stories: u64, seed: u64, only: &[String], say: Say) -> Measured),
 }
-
-/// Takes a line of a table.
-pub type Say<'a> = &'a mut dyn FnMut(&str);
 
 impl Measurement {
     /// Measures `stories` stories, whose seeds begin with `seed`; where a measurement has rows, those that `only` names, and says each.

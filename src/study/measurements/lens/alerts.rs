@@ -2,8 +2,7 @@
 
 use rayon::prelude::*;
 
-use super::super::Say;
-use super::super::measured::{Measured, exceptions};
+use super::super::measured::{Measured, Say, exceptions};
 use crate::study::stories::pixels::{PixelStory, RATE_HZ, review};
 
 /// Spots on the story's pixels of 0.75 mm, as wide as its Gaussian of 1 mm.

@@ -7,8 +7,7 @@ mod tally;
 
 use std::time::Instant;
 
-use super::Say;
-use super::measured::Measured;
+use super::measured::{Measured, Say};
 use crate::estimate;
 use crate::optics::Camera;
 pub use alerts::honest;
