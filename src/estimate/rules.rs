@@ -64,7 +64,8 @@ rules! {
     free_nuisances,
     /// A background or another width is tried in the place of more sources, once a search has ended. Needed most in P8/60 with a background.
     select_nuisances,
-    /// A frame that another width or an elongated spot explains is searched from there, before it is asked whether its lens is another.
+    /// A frame that another width or an elongated spot explains is searched from there, before it is asked whether its lens is another. Needed
+    /// most in E2/64 with the condition `ellipse`.
     explain_by_width,
     /// A rotated elliptical PSF is tried in the place of more sources. Needed with the condition `ellipse`.
     rotated_ellipse,
