@@ -72,6 +72,22 @@ pub struct HealthMessage {
     pub alerts_waiting: u64,
 }
 
+/// Who a message says it is from, and the version of its words.
+pub trait Signed {
+    fn signature(&self) -> (u32, &StationName);
+}
+
+macro_rules! signed {
+    ($($message:ty),*) => {
+        $(impl Signed for $message {
+            fn signature(&self) -> (u32, &StationName) {
+                (self.version, &self.name)
+            }
+        })*
+    };
+}
+signed!(AlertMessage, PositionsMessage, PoseMessage, HealthMessage);
+
 impl AlertMessage {
     pub fn new(name: StationName, journal: &str, recorded: Recorded) -> Self {
         Self {

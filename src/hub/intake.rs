@@ -6,7 +6,7 @@ use async_nats::Message;
 use metrics::counter;
 use serde::de::DeserializeOwned;
 
-use crate::fleet::message::VERSION;
+use crate::fleet::message::{Signed, VERSION};
 use crate::fleet::{Subject, Topic};
 use crate::metric;
 use crate::monitor::StationName;
@@ -14,7 +14,7 @@ use crate::monitor::StationName;
 /// Largest message, bytes: what a server takes by default.
 const LARGEST: usize = 1 << 20;
 
-/// What every message holds.
+/// What every message holds, read where the rest of one cannot be.
 ///
 /// `site` and `station` one by one: a flattened [`StationName`] would have all of the message kept to search it.
 #[derive(serde::Deserialize)]
@@ -28,7 +28,7 @@ struct Head<'a> {
 
 /// Reads a message of this topic, and counts it. The error says why it cannot be used: it is another version, malformed, too large, or in
 /// the name of another station than its subject's, which is the one that the server lets its sender use.
-pub fn read<T: DeserializeOwned>(message: &Message, topic: Topic) -> Result<T, &'static str> {
+pub fn read<T: DeserializeOwned + Signed>(message: &Message, topic: Topic) -> Result<T, &'static str> {
     let outcome = parse(message, topic);
     let word = match &outcome {
         Ok(_) => "taken",
@@ -47,20 +47,25 @@ pub fn count(topic: Topic, outcome: &'static str) {
     counter!(metric::FLEET_MESSAGES, "topic" => topic.name(), "outcome" => outcome).increment(1);
 }
 
-fn parse<T: DeserializeOwned>(message: &Message, topic: Topic) -> Result<T, &'static str> {
+fn parse<T: DeserializeOwned + Signed>(message: &Message, topic: Topic) -> Result<T, &'static str> {
     let subject = Subject::parse(&message.subject).filter(|subject| subject.topic == topic);
     let subject = subject.ok_or("wrong_subject")?;
     if message.payload.len() > LARGEST {
         return Err("too_large");
     }
-    let head: Head = serde_json::from_slice(&message.payload).map_err(|_| "malformed")?;
-    if head.version != VERSION {
-        return Err("other_version");
-    }
-    if (&*head.site, &*head.station) != (&*subject.name.site, &*subject.name.station) {
-        return Err("other_station");
-    }
-    serde_json::from_slice(&message.payload).map_err(|_| "malformed")
+    let check = |version, site: &str, station: &str| match version {
+        VERSION if (site, station) == (&*subject.name.site, &*subject.name.station) => Ok(()),
+        VERSION => Err("other_station"),
+        _ => Err("other_version"),
+    };
+    let Ok(read) = serde_json::from_slice::<T>(&message.payload) else {
+        let head: Head = serde_json::from_slice(&message.payload).map_err(|_| "malformed")?;
+        check(head.version, &head.site, &head.station)?;
+        return Err("malformed");
+    };
+    let (version, name) = read.signature();
+    check(version, &name.site, &name.station)?;
+    Ok(read)
 }
 
 #[cfg(test)]

@@ -1,6 +1,6 @@
 //! The beams of all stations as one picture, and the hub's own numbers of their tracks.
 
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 
 use jiff::Timestamp;
 use nalgebra::{Matrix2, Vector2};
@@ -94,8 +94,15 @@ fn fuse(into: &mut TrackedPosition, other: &TrackedPosition, name: &StationName)
 #[derive(Debug, Default)]
 pub struct Tracks {
     last: u64,
-    of_station: HashMap<(StationName, u64), (u64, bool)>,
+    of_station: BTreeMap<StationName, HashMap<u64, OfStation>>,
     of_user: HashMap<String, u64>,
+}
+
+/// The hub's number of a station's track.
+#[derive(Debug)]
+struct OfStation {
+    number: u64,
+    is_used: bool,
 }
 
 /// Users whose number is kept after they are gone from every view.
@@ -103,24 +110,36 @@ const USERS_KEPT: usize = 100_000;
 
 impl Tracks {
     fn number(&mut self, name: &StationName, emitter: &TrackedPosition) -> u64 {
-        let key = (name.clone(), emitter.track);
         let of_user = emitter.user.as_ref().and_then(|user| self.of_user.get(user).copied());
-        let known = of_user.or_else(|| self.of_station.get(&key).map(|(number, _)| *number));
+        let of_station = self.of_station.get(name).and_then(|tracks| tracks.get(&emitter.track));
+        let known = of_user.or_else(|| of_station.map(|track| track.number));
         let number = known.unwrap_or_else(|| {
             self.last += 1;
             self.last
         });
-        if let Some(user) = &emitter.user {
+        if let Some(user) = &emitter.user
+            && of_user.is_none()
+        {
             if self.of_user.len() >= USERS_KEPT {
                 self.of_user.clear();
             }
             self.of_user.insert(user.clone(), number);
         }
-        self.of_station.insert(key, (number, true));
+        let used = OfStation { number, is_used: true };
+        match self.of_station.get_mut(name) {
+            Some(tracks) => drop(tracks.insert(emitter.track, used)),
+            None => drop(
+                self.of_station
+                    .insert(name.clone(), HashMap::from([(emitter.track, used)])),
+            ),
+        }
         number
     }
 
     fn forget_unused(&mut self) {
-        self.of_station.retain(|_, (_, is_used)| std::mem::take(is_used));
+        self.of_station.retain(|_, tracks| {
+            tracks.retain(|_, track| std::mem::take(&mut track.is_used));
+            !tracks.is_empty()
+        });
     }
 }

@@ -20,7 +20,7 @@ use super::stream::{BATCH, Delivered, consume};
 use crate::api::{Acknowledged, Command, Feed, ZonesRefused};
 use crate::config::Config;
 use crate::fleet::Topic;
-use crate::fleet::message::{HealthMessage, PositionsMessage};
+use crate::fleet::message::{HealthMessage, PositionsMessage, Signed};
 use crate::journal::Journal;
 use crate::monitor::zones::ZoneMap;
 use crate::monitor::{Acknowledgement, LightError, MaintenanceError, StationName, Withdrawal};
@@ -141,9 +141,9 @@ impl Run {
     fn take_latest(&mut self, topic: Topic, message: &Message) {
         let heard = match topic {
             Topic::Health => self.read::<HealthMessage>(message, topic).map(Heard::Health),
-            Topic::Pose => self.read(message, topic).map(Heard::Pose),
+            Topic::Pose => self.read(message, topic).map(Box::new).map(Heard::Pose),
             Topic::Positions => self.read::<PositionsMessage>(message, topic).map(Heard::Positions),
-            Topic::Alert => self.read(message, topic).map(Heard::Alert),
+            Topic::Alert => self.read(message, topic).map(Box::new).map(Heard::Alert),
         };
         if let Some(heard) = heard {
             self.take(heard, Timestamp::now());
@@ -151,7 +151,7 @@ impl Run {
     }
 
     /// `None` where it cannot be used, which its station's status then shows.
-    fn read<T: DeserializeOwned>(&mut self, message: &Message, topic: Topic) -> Option<T> {
+    fn read<T: DeserializeOwned + Signed>(&mut self, message: &Message, topic: Topic) -> Option<T> {
         let read = intake::read(message, topic);
         if let Err(reason) = read {
             self.refuse(intake::sender(message), topic, reason);
@@ -175,7 +175,7 @@ impl Run {
         let mut taken = Vec::new();
         for Delivered { message, .. } in &messages {
             if let Some(read) = self.read(message, Topic::Alert) {
-                taken.extend(self.take(Heard::Alert(read), now));
+                taken.extend(self.take(Heard::Alert(Box::new(read)), now));
             }
         }
         if !self.record(taken).await {

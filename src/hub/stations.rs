@@ -193,7 +193,7 @@ impl Stations {
     /// Users that are claimed or seen at two places, with one sighting of each: places that differ by more than `tolerated_m`, by what
     /// both covariances allow, and by the way that a user can have gone between the two times.
     pub fn conflicts(&self, now: Timestamp, tolerated_m: f64) -> BTreeMap<String, [Sighting; 2]> {
-        let mut places: HashMap<&str, Vec<Place>> = HashMap::new();
+        let mut places: HashMap<&str, Vec<Place<'_>>> = HashMap::new();
         for message in self.fresh(now).filter(|message| is_of(message, now)) {
             for emitter in &message.emitters {
                 if let Some(user) = &emitter.user {
@@ -218,7 +218,7 @@ impl Stations {
                 .enumerate()
                 .flat_map(|(k, a)| places[k + 1..].iter().map(move |b| (a, b)));
             // Two claims alone are the network's own business until a beam answers one of them.
-            let apart = |(a, b): &(&Place, &Place)| (a.is_seen || b.is_seen) && a.is_apart_from(b, tolerated_m);
+            let apart = |(a, b): &(&Place<'_>, &Place<'_>)| (a.is_seen || b.is_seen) && a.is_apart_from(b, tolerated_m);
             if let Some((a, b)) = pairs.into_iter().find(apart) {
                 conflicts.insert(user.to_owned(), [a.sighting(), b.sighting()]);
             }
@@ -300,8 +300,8 @@ fn footprint(message: &PositionsMessage) -> Vec<[f64; 2]> {
     if is_outline { points.clone() } else { Vec::new() }
 }
 
-struct Place {
-    name: StationName,
+struct Place<'a> {
+    name: &'a StationName,
     time: Timestamp,
     at: Vector2<f64>,
     z_m: f64,
@@ -310,10 +310,10 @@ struct Place {
     is_seen: bool,
 }
 
-impl Place {
-    fn seen(message: &PositionsMessage, emitter: &TrackedPosition) -> Self {
+impl<'a> Place<'a> {
+    fn seen(message: &'a PositionsMessage, emitter: &TrackedPosition) -> Self {
         Self {
-            name: message.name.clone(),
+            name: &message.name,
             time: message.time,
             at: Vector2::new(emitter.x_m, emitter.y_m),
             z_m: emitter.z_m,
@@ -323,9 +323,9 @@ impl Place {
         }
     }
 
-    fn claimed(message: &PositionsMessage, claim: &Claim) -> Self {
+    fn claimed(message: &'a PositionsMessage, claim: &Claim) -> Self {
         Self {
-            name: message.name.clone(),
+            name: &message.name,
             time: claim.time,
             at: Vector2::new(claim.x_m, claim.y_m),
             z_m: claim.z_m.unwrap_or(0.0),
