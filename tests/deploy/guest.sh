@@ -196,6 +196,16 @@ check "the hub of a fleet does not start by itself" bash -c '! systemctl is-acti
 check "it starts with the config that is shipped" systemctl start oapwatch-fleet
 check "and answers, without a server" within 60 curl -fsS -m 5 http://127.0.0.1:8788/readyz
 check "its journal is its own" test -s /var/lib/private/oapwatch-fleet/hub.db
+systemctl stop oapwatch-fleet
+echo "127.0.0.1 hub.example" >>/etc/hosts
+for commands in /fleet/*.sh; do
+    check "as the fleet's guide says: $(head -n 1 "$commands")" bash -e "$commands"
+done
+station_runs() { curl -fsS -m 5 http://127.0.0.1:8788/v1/stations | grep -q '"station":"ap7".*"state":"good"'; }
+told() { curl -fsS -m 5 "http://127.0.0.1:8788/v1/alerts?limit=100" | grep -q '"station":"ap7"'; }
+check "the access point is known at the hub" within 60 station_runs
+check "and its alerts are" within 60 told
+old=$(pid)
 check "apt upgrades the package" apt-get install -qq -y --no-install-recommends -o Dpkg::Options::=--force-confold /upgrade.deb
 check "the new version runs" within 60 restarted "$old"
 check "upgrade keeps the config" grep -q 9100 $config
@@ -204,6 +214,6 @@ check "upgrade keeps the journal" within 60 kept "$before"
 
 check "removal stops the service" bash -c 'apt-get remove -qq -y oapwatch && ! systemctl is-active oapwatch && ! systemctl is-active oapwatch-fleet && test -s /etc/oapwatch/oapwatch.toml && test -s /var/lib/private/oapwatch/oapwatch.db'
 check "purge ends well" dpkg --purge oapwatch
-check "purge removes everything" bash -c '! ls -d /etc/oapwatch /var/lib/private/oapwatch /var/lib/oapwatch /var/lib/private/oapwatch-fleet /var/lib/oapwatch-fleet /usr/share/oapwatch /usr/lib/systemd/system/oapwatch.service /usr/lib/systemd/system/oapwatch-fleet.service /etc/systemd/system/multi-user.target.wants/oapwatch.service /etc/systemd/system/oapwatch.service.d 2>/dev/null | grep .'
+check "purge removes everything" bash -c '! ls -d /etc/oapwatch /var/lib/private/oapwatch /var/lib/oapwatch /var/lib/private/oapwatch-fleet /var/lib/oapwatch-fleet /usr/share/oapwatch /usr/lib/systemd/system/oapwatch.service /usr/lib/systemd/system/oapwatch-fleet.service /etc/systemd/system/multi-user.target.wants/oapwatch{,-fleet}.service /etc/systemd/system/oapwatch.service.d 2>/dev/null | grep .'
 echo "# all $n checks were made"
 finish

@@ -15,7 +15,7 @@ done
 [ -f "$deb" ] || { echo "tests/deploy: target/oapwatch.deb is missing; run make deb"; exit 1; }
 
 suite=$(. /etc/os-release && echo "$VERSION_CODENAME")
-packages=systemd-sysv,udev,kmod,curl,python3-minimal,ca-certificates,sqlite3
+packages=systemd-sysv,udev,kmod,curl,python3-minimal,ca-certificates,sqlite3,nats-server,openssl
 base=$work/root-$(echo "$suite $packages" | cksum | cut -d' ' -f1).tar
 if [ ! -f "$base" ]; then
     echo "Making a minimal Debian $suite (about a minute)"
@@ -61,9 +61,11 @@ root_image() {
     cp "$deb" "$dir/oapwatch.deb"
     cp "$work/upgrade.deb" "$dir/upgrade.deb"
     install -m 755 tests/deploy/guest.sh "$dir/guest.sh"
-    mkdir "$dir/guide"
-    # Each block of commands of the operator's guide, in order.
-    awk -v dir="$dir/guide" '/^```sh$/ { n++; on = 1; next } /^```$/ { on = 0 } on { print > sprintf("%s/%02d.sh", dir, n) }' docs/operator.md
+    mkdir "$dir/guide" "$dir/fleet"
+    # Each block of commands of the operator's guide, and of a fleet's set-up, in order.
+    blocks() { awk -v dir="$1" '/^```sh$/ { n++; on = 1; next } /^```$/ { on = 0 } on { print > sprintf("%s/%02d.sh", dir, n) }'; }
+    blocks "$dir/guide" < docs/operator.md
+    sed -n '/^## Set-up$/,/^## What is published$/p' docs/fleet.md | blocks "$dir/fleet"
     install -m 644 tests/deploy/receiver.py "$dir/receiver.py"
     cat > "$dir/etc/systemd/system/guest.service" <<'UNIT'
 [Unit]
