@@ -1,13 +1,16 @@
-//! What the light of a beam says of its source: whether it scintillates as a beam through the air does, flickers as a lamp on the mains
-//! does, fades with another beam as a reflection of that does, or stays on the sensor while the camera moves, as a glint does. Evidence in alerts; it decides nothing.
+//! What the light of a beam says of its source: whether it scintillates as a beam through the air does, comes from a point as a beam does,
+//! flickers as a lamp on the mains does, fades with another beam as a reflection of that does, or stays on the sensor while the camera
+//! moves, as a glint does. Evidence in alerts; it decides nothing.
 
 use std::collections::{BTreeMap, VecDeque};
 
-use nalgebra::Vector2;
+use nalgebra::{Vector2, Vector3};
 use serde_json::{Value, json};
 
 use crate::estimate::Flags;
 use crate::geo::View;
+use crate::monitor::stats::moment_score::MomentScore;
+use crate::monitor::stats::second_moment::{LENS_SCATTER, middle};
 use crate::monitor::track::beam_track::Track;
 use crate::monitor::track::tracker::Tracker;
 
@@ -18,6 +21,8 @@ const MIN_FRAMES: usize = 30;
 /// ten coherence times a frame has 0.3, at weak turbulence and slow frames less. Assumed.
 const LAMP_STD: [f64; 4] = [0.01, 0.02, 0.04, 0.08];
 const BEAM_STD: [f64; 4] = [0.12, 0.2, 0.3, 0.45];
+/// Traces of the second moments of a lamp that is not a point, σ², each as likely as the others; half of the lamps are points. Assumed.
+const LAMP_TRACES: [f64; 4] = [0.1, 0.3, 1.0, 3.0];
 /// Share of the frames that count as independent.
 const INDEPENDENT: f64 = 0.5;
 /// Largest likelihood ratio that is stated: the models are no better.
@@ -39,6 +44,7 @@ struct Shown {
     ln_energy: f64,
     /// Of ln energy, by the detector's noise.
     noise: f64,
+    moments: MomentScore,
     position: Vector2<f64>,
     /// Where a level camera would have it, m, where the camera moves: the place on the sensor.
     on_sensor: Option<Vector2<f64>>,
@@ -76,6 +82,7 @@ impl LightHistory {
                 frame: self.frame,
                 ln_energy: detection.energy_j.ln(),
                 noise: 1.0 / detection.snr.max(1.0),
+                moments: detection.moments,
                 position: detection.position,
                 on_sensor: view.sight.is_some().then(|| {
                     let sensor = Vector2::from(view.to_sensor(detection.position.into()));
@@ -90,26 +97,56 @@ impl LightHistory {
         }
     }
 
-    /// Scintillation and flicker, with the likelihood of a beam's light over a lamp's.
+    /// Scintillation, extent and flicker, with the likelihood of a beam's light over a lamp's.
     pub fn lamp_or_beam(&self, track: &Track, rate_hz: f64) -> Option<Value> {
         let shown = self.tracks.get(&track.id).filter(|s| s.len() >= MIN_FRAMES)?;
         let n = shown.len() as f64;
         let mean = shown.iter().map(|s| s.ln_energy).sum::<f64>() / n;
         let variance = shown.iter().map(|s| (s.ln_energy - mean).powi(2)).sum::<f64>() / (n - 1.0);
         let noise = shown.iter().map(|s| s.noise * s.noise).sum::<f64>() / n;
-        let flicker: Vec<Value> = FLICKER_HZ
-            .into_iter()
-            .filter_map(|hz| {
-                let neg_log_p = line(shown, mean, variance, hz, rate_hz)?;
-                (neg_log_p > NAMED).then(|| json!({ "mains_hz": 0.5 * hz, "surprise": neg_log_p }))
-            })
-            .collect();
+        let lines = FLICKER_HZ.map(|hz| Some((hz, line(shown, mean, variance, hz, rate_hz)?)));
+        let lines: Vec<(f64, f64)> = lines.into_iter().flatten().collect();
+        let named = lines.iter().filter(|(_, neg_log_p)| *neg_log_p > NAMED);
+        // A line has 2/n of its −ln p of the variance.
+        let flickers: f64 = named.clone().map(|(_, neg_log_p)| 2.0 * neg_log_p / n).sum();
+        let scintillates = variance * (1.0 - flickers).max(0.0);
+        let strongest = lines.iter().map(|(_, neg_log_p)| *neg_log_p).max_by(f64::total_cmp);
+        let extent = self.trace(track.id);
+        let ratios = [
+            Some(("scintillation", beam_over_lamp(scintillates, noise, INDEPENDENT * n))),
+            extent.map(|(trace, variance)| ("extent", point_over_lamp(trace, variance))),
+            strongest.map(|neg_log_p| ("mains_flicker", steady_over_flicker(neg_log_p, n))),
+        ];
+        let ratios: BTreeMap<&str, f64> = ratios.into_iter().flatten().collect();
         Some(json!({
             "frames": shown.len(),
-            "scintillation_index": (variance - noise).max(0.0),
-            "likelihood_ratio": beam_over_lamp(variance, noise, INDEPENDENT * n),
-            "mains_flicker": flicker,
+            "scintillation_index": (scintillates - noise).max(0.0),
+            "trace_sigma2": extent.map(|(trace, _)| trace),
+            "mains_flicker": named.map(|(hz, neg_log_p)| json!({ "mains_hz": 0.5 * hz, "surprise": neg_log_p })).collect::<Vec<_>>(),
+            "likelihood_ratio": stated(ratios.values().product()),
+            "likelihood_ratios": ratios,
         }))
+    }
+
+    /// Trace of the second moments beyond what the other beams' spots show, and its variance, σ² and σ⁴.
+    fn trace(&self, id: u64) -> Option<(f64, f64)> {
+        let moments = |id: &u64| {
+            let mut sum = MomentScore::default();
+            self.tracks[id].iter().for_each(|s| sum.add(&s.moments));
+            sum.solved()
+        };
+        let (own, cov) = self.tracks.contains_key(&id).then(|| moments(&id))??;
+        let others = self
+            .tracks
+            .iter()
+            .filter(|(other, s)| **other != id && s.len() >= MIN_FRAMES);
+        let (usual, usual_cov) = middle(others.filter_map(|(other, _)| Some(moments(other)?.0)).collect());
+        let along = Vector3::new(1.0, 0.0, 1.0);
+        let lens = 2.0 * LENS_SCATTER * LENS_SCATTER;
+        Some((
+            along.dot(&(own - usual)),
+            along.dot(&((cov + usual_cov) * along)) + lens,
+        ))
     }
 
     /// Whether the light rests on the ground or on the sensor, where the camera moves: the likelihood of the first over the second.
@@ -127,7 +164,7 @@ impl LightHistory {
             "frames": on_sensor.len(),
             "on_ground_std_m": in_world.sqrt(),
             "on_sensor_std_m": on_sensor_m2.sqrt(),
-            "likelihood_ratio": ln_ratio.clamp(-LARGEST_RATIO.ln(), LARGEST_RATIO.ln()).exp(),
+            "likelihood_ratio": stated(ln_ratio.exp()),
         }))
     }
 
@@ -148,6 +185,25 @@ fn variance_m2(places: impl Iterator<Item = Vector2<f64>> + Clone) -> f64 {
     0.5 * places.map(|p| (p - mean).norm_squared()).sum::<f64>() / n
 }
 
+/// A likelihood ratio within what is stated.
+fn stated(ratio: f64) -> f64 {
+    ratio.clamp(1.0 / LARGEST_RATIO, LARGEST_RATIO)
+}
+
+/// Likelihood of a trace of the second moments for a point over that for a lamp.
+fn point_over_lamp(trace: f64, variance: f64) -> f64 {
+    // Over the likelihood for a point.
+    let extended = LAMP_TRACES.iter().map(|t| (t * (trace - 0.5 * t) / variance).exp());
+    stated(2.0 / (1.0 + extended.sum::<f64>() / LAMP_TRACES.len() as f64))
+}
+
+/// Likelihood of the strongest line's −ln p in `n` frames for light that is steady or scintillates over that for a lamp: half of the lamps
+/// flicker, and of those whose frames show it the line has half of the variance in the mean.
+fn steady_over_flicker(neg_log_p: f64, n: f64) -> f64 {
+    let usual = 0.25 * n;
+    stated(2.0 / (1.0 + (neg_log_p * (1.0 - 1.0 / usual)).exp() / usual))
+}
+
 /// Likelihood of a sample variance of `n` normal deviates under a beam's over a lamp's standard deviations.
 fn beam_over_lamp(variance: f64, noise: f64, n: f64) -> f64 {
     let ln_likelihood = |std: &f64| {
@@ -161,7 +217,7 @@ fn beam_over_lamp(variance: f64, noise: f64, n: f64) -> f64 {
         .map(ln_likelihood)
         .fold(f64::NEG_INFINITY, f64::max);
     let (beam, lamp) = (mean(&BEAM_STD, most), mean(&LAMP_STD, most));
-    (beam / lamp.max(1e-300)).clamp(1.0 / LARGEST_RATIO, LARGEST_RATIO)
+    stated(beam / lamp.max(1e-300))
 }
 
 /// −ln p of the line that light at `hz` makes in frames of `rate_hz`; none where it cannot be told from slow changes. White noise's
@@ -220,7 +276,7 @@ fn reflection(own: &VecDeque<Shown>, other: &VecDeque<Shown>, of: u64) -> Option
 #[cfg(test)]
 mod tests {
     use jiff::Timestamp;
-    use nalgebra::UnitQuaternion;
+    use nalgebra::{Matrix2, UnitQuaternion};
     use rand::SeedableRng;
     use rand_chacha::ChaCha8Rng;
     use rand_distr::{Distribution, StandardNormal};
@@ -271,15 +327,54 @@ mod tests {
     }
 
     #[test]
+    fn a_light_of_some_extent_is_no_beam() {
+        let extents_sigma2 = [0.0, 0.0, 0.0, 0.5];
+        let (mut history, mut tracker) = (LightHistory::default(), Tracker::new(50.0));
+        for k in 0..40i64 {
+            let beams = extents_sigma2.iter().zip(0u8..).map(|(extent, place)| {
+                let mut beam = detection(50.0 * f64::from(place), 0.0);
+                // What all spots show is the lens's.
+                beam.moments = MomentScore::of_spread(Matrix2::identity() * (extent + 0.3), 100.0);
+                beam
+            });
+            let beams: Vec<_> = beams.collect();
+            tracker.step(Timestamp::from_millisecond(100 * k).unwrap(), &beams, 0.1);
+            history.update(&tracker, &View::level(&camera()));
+        }
+        let said = |k: usize| {
+            let said = history.lamp_or_beam(&tracker.tracks[k], 10.0).unwrap();
+            let of = |value: &Value| value.as_f64().unwrap();
+            (of(&said["trace_sigma2"]), of(&said["likelihood_ratios"]["extent"]))
+        };
+        let ((point, point_ratio), (wide, wide_ratio)) = (said(0), said(3));
+        assert!(point.abs() < 1e-9 && (wide - 1.0).abs() < 1e-9, "{point} {wide}");
+        // A lamp may be a point, so a point speaks for a beam by less than two.
+        assert!(
+            (1.0..2.0).contains(&point_ratio) && wide_ratio < 1e-5,
+            "{point_ratio} {wide_ratio}"
+        );
+    }
+
+    #[test]
     fn flicker_shows_where_the_frame_rate_does_not_hide_it() {
         let shows = |rate_hz: f64| {
             let flicker = |t: f64, z: &[f64]| vec![0.05 * (std::f64::consts::TAU * 100.0 * t).sin() + 0.02 * z[0]];
             let (history, tracker) = watched(&[0.0], rate_hz, flicker);
-            history.lamp_or_beam(&tracker.tracks[0], rate_hz).unwrap()["mains_flicker"].clone()
+            let said = history.lamp_or_beam(&tracker.tracks[0], rate_hz).unwrap();
+            let ratio = said["likelihood_ratio"].as_f64().unwrap();
+            assert!(ratio < 1e-4, "{rate_hz}: {said}");
+            said["mains_flicker"].clone()
         };
         assert_eq!(shows(70.0)[0]["mains_hz"], 50.0);
         assert_eq!(shows(330.0)[0]["mains_hz"], 50.0);
         assert_eq!(shows(100.0), json!([]));
+        // All of the light's changes are the mains'.
+        let (history, tracker) = watched(&[0.0], 70.0, |t, _| {
+            vec![0.3 * (std::f64::consts::TAU * 100.0 * t).sin()]
+        });
+        let said = history.lamp_or_beam(&tracker.tracks[0], 70.0).unwrap();
+        assert!(said["scintillation_index"].as_f64().unwrap() < 1e-3, "{said}");
+        assert!(said["likelihood_ratio"].as_f64().unwrap() < 1e-5, "{said}");
     }
 
     #[test]

@@ -102,7 +102,7 @@ function ofLight(e) {
   const times = (ratio) => (Math.max(ratio, 1 / ratio) > 1e4 ? "more than ten thousand times" : `${+Math.max(ratio, 1 / ratio).toPrecision(2)} times`);
   const decided = (ratio) => isNumber(ratio) && ratio > 0 && Math.max(ratio, 1 / ratio) > 3;
   return [
-    decided(light?.likelihood_ratio) && [`Its light is ${times(light.likelihood_ratio)} likelier ${light.likelihood_ratio > 1 ? "a beam's than a lamp's" : "a lamp's than a beam's"}, by how it scintillates.`],
+    decided(light?.likelihood_ratio) && [`Its light is ${times(light.likelihood_ratio)} likelier ${light.likelihood_ratio > 1 ? "a beam's than a lamp's" : "a lamp's than a beam's"}, by how it scintillates, whether it is a point, and how it flickers.`],
     light?.mains_flicker?.length && [`It flickers with the mains (${light.mains_flicker[0].mains_hz} Hz), as a lamp does.`],
     decided(e.rests_in?.likelihood_ratio) && [e.rests_in.likelihood_ratio > 1 ? "It rests on the ground while the camera moves." : "It moves with the camera, as a glint or a faulty pixel does."],
     e.ghost_of && ["It fades with ", e.ghost_of.user ? named(e.ghost_of.user) : `track ${e.ghost_of.track}`, `, ${roughly(e.ghost_of.offset_m)} away: perhaps a reflection of that beam.`],

@@ -19,7 +19,7 @@ const ASSUMED_DRIFT: f64 = 0.004;
 const MIN_DRIFT: f64 = 0.002;
 /// Standard deviation of honest moments about what all beams show, σ²: a lens is not the same everywhere. Larger hides a second
 /// beam that was there from the start. Not measured.
-const LENS_SCATTER: f64 = 0.1;
+pub const LENS_SCATTER: f64 = 0.1;
 /// Age in frames from which a frame counts for the scatter of frames: a second beam that has just come on is no scatter. Longer
 /// learns later, shorter takes a second beam for scatter. Not measured.
 const SETTLED: usize = 20;
@@ -183,7 +183,7 @@ impl CommonMode {
 }
 
 /// Component-wise median of three or more, and its variance from their scatter (1.4826·MAD, π/2 for a median).
-fn middle(of: Vec<Vector3<f64>>) -> (Vector3<f64>, Matrix3<f64>) {
+pub fn middle(of: Vec<Vector3<f64>>) -> (Vector3<f64>, Matrix3<f64>) {
     if of.len() < MIN_OTHERS {
         return (Vector3::zeros(), Matrix3::zeros());
     }

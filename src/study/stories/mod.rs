@@ -32,6 +32,8 @@ pub struct Actor {
     pub glow: Box<dyn Fn(f64) -> f64>,
     /// Standard deviation of a frame's energy over its mean. A beam has 25 %.
     pub fading: f64,
+    /// Second moment per axis of the light on the ground, m²: zero for a point.
+    pub extent_m2: f64,
     /// The actor before this one that it is a reflection of: it fades with that.
     pub reflects: Option<usize>,
     /// Power that the claims state.
@@ -53,6 +55,7 @@ impl Actor {
             energy_j: 0.007,
             glow: Box::new(|_| 1.0),
             fading: 0.25,
+            extent_m2: 0.0,
             reflects: None,
             reports_w: None,
         }

@@ -85,7 +85,7 @@ fn detect(story: &Story, t: f64, rng: &mut ChaCha8Rng) -> Vec<Emitter> {
     let camera = camera();
     let shift = (story.shift)(t);
     let [s, a] = (story.turn)(t);
-    let mut spots: Vec<([f64; 2], f64)> = Vec::new();
+    let mut spots: Vec<([f64; 2], f64, f64)> = Vec::new();
     let mut fadings = vec![1.0; story.actors.len()];
     for (k, actor) in story.actors.iter().enumerate() {
         let Some([x, y]) = (actor.beam)(t) else { continue };
@@ -100,13 +100,17 @@ fn detect(story: &Story, t: f64, rng: &mut ChaCha8Rng) -> Vec<Emitter> {
             None => own().sample(rng).clamp(0.3, 2.5),
         };
         let fading = fadings[k];
-        spots.push((p, actor.energy_j * fading * (actor.glow)(t)));
+        spots.push((p, actor.energy_j * fading * (actor.glow)(t), actor.extent_m2));
     }
     if rng.random::<f64>() < story.ghosts {
-        spots.push(([rng.random_range(-120.0..120.0), rng.random_range(-120.0..120.0)], 1e-3));
+        spots.push((
+            [rng.random_range(-120.0..120.0), rng.random_range(-120.0..120.0)],
+            1e-3,
+            0.0,
+        ));
     }
     let mut merged: Vec<Blob> = Vec::new();
-    'spots: for (p, energy) in spots {
+    'spots: for (p, energy, extent_m2) in spots {
         for blob in &mut merged {
             let [x, y] = [p[0] - blob.place[0], p[1] - blob.place[1]];
             if x.hypot(y) < story.resolution_m {
@@ -114,8 +118,9 @@ fn detect(story: &Story, t: f64, rng: &mut ChaCha8Rng) -> Vec<Emitter> {
                 blob.place = [blob.place[0] + share * x, blob.place[1] + share * y];
                 blob.energy_j += energy;
                 blob.brightest_j = blob.brightest_j.max(energy);
-                for (m, d) in blob.moments_m2.iter_mut().zip([x * x, x * y, y * y]) {
-                    *m = (1.0 - share) * *m + share * (1.0 - share) * d;
+                let theirs = [extent_m2, 0.0, extent_m2];
+                for ((m, own), d) in blob.moments_m2.iter_mut().zip(theirs).zip([x * x, x * y, y * y]) {
+                    *m = (1.0 - share) * *m + share * own + share * (1.0 - share) * d;
                 }
                 continue 'spots;
             }
@@ -124,7 +129,7 @@ fn detect(story: &Story, t: f64, rng: &mut ChaCha8Rng) -> Vec<Emitter> {
             place: p,
             energy_j: energy,
             brightest_j: energy,
-            moments_m2: [0.0; 3],
+            moments_m2: [extent_m2, 0.0, extent_m2],
         });
     }
     // A stream of its own: the other draws stay what they are without it.
