@@ -37,6 +37,7 @@ fn frame(camera: &optics::Camera) -> (Frame, Vec<[f64; 2]>) {
         pixels,
         masked: None,
         exposure_s: None,
+        energy_scale: 1.0,
     };
     (frame, places)
 }

@@ -17,6 +17,9 @@ pub struct Frame {
     pub masked: Option<Array2<bool>>,
     /// How long light was collected, s, where that is known: a camera that moves smears spots by it.
     pub exposure_s: Option<f64>,
+    /// What energies are multiplied by to be those of the configured exposure, where a source changes its exposure. `pixels`, as the
+    /// noise in them, are of this one.
+    pub energy_scale: f64,
 }
 
 impl Frame {

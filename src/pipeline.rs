@@ -190,6 +190,7 @@ impl Pipeline {
             frame: frame.index,
             time: frame.time,
             result: estimate.as_ref(),
+            energy_scale: frame.energy_scale,
             digest,
             look,
         };

@@ -69,6 +69,7 @@ impl Scene {
             pixels,
             masked: None,
             exposure_s: None,
+            energy_scale: 1.0,
         }
     }
 

@@ -45,6 +45,7 @@ fn draw(camera: &Camera, places: &[[f64; 2]], smear: &Smear, rng: &mut ChaCha8Rn
         pixels: Array2::from_shape_vec((ny, nx), pixels).unwrap(),
         masked: None,
         exposure_s: None,
+        energy_scale: 1.0,
     }
 }
 

@@ -53,6 +53,7 @@ fn frame(camera: &Camera, spots: &[([f64; 2], f64)], seed: u64) -> Frame {
         pixels: pixels * camera.noise_std_j,
         masked: None,
         exposure_s: None,
+        energy_scale: 1.0,
     }
 }
 

@@ -26,6 +26,7 @@ fn frame(k: u64) -> Frame {
         }),
         masked: (k % 2 == 1).then(|| Array2::from_shape_fn((4, 5), |(y, x)| y == 1 && x as u64 == k % 5)),
         exposure_s: (k % 3 == 1).then_some(0.02),
+        energy_scale: if k % 3 == 1 { 16.0 } else { 1.0 },
     }
 }
 

@@ -44,6 +44,7 @@ pub fn score(estimator: &mut dyn Estimator, frames: &[(usize, &Array2<f64>)], be
             pixels: (*pixels).clone(),
             masked: None,
             exposure_s: None,
+            energy_scale: 1.0,
         };
         // All beacons of an unusable frame count as missed, with either calibration.
         let Ok(estimate) = estimator.estimate(&frame) else {

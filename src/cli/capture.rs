@@ -149,6 +149,7 @@ impl Recording {
             pixels: self.sum / self.times.len() as f64,
             masked: None,
             exposure_s: None,
+            energy_scale: 1.0,
         };
         replace(&out.with_extension("png"), &frame_png(&frame, camera, PICTURE_SIDE)?)
     }

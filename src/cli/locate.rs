@@ -92,16 +92,16 @@ impl Locator {
 
     /// Moves emitters from where a level camera would see them to where this one does, with its pose's uncertainty. One whose ray
     /// does not come down to the ground has no position and is left out. `None` while no pose is known.
-    fn locate(&mut self, emitters: &[Emitter], placement: Placement) -> Option<Vec<Located>> {
+    fn locate(&mut self, emitters: &[Emitter], energy_scale: f64, placement: Placement) -> Option<Vec<Located>> {
         self.view.sight = match placement {
             Placement::Level => None,
             Placement::At { sight, .. } => Some(sight),
             Placement::Unknown { .. } => return None,
         };
-        Some(emitters.iter().filter_map(|e| self.place(e)).collect())
+        Some(emitters.iter().filter_map(|e| self.place(e, energy_scale)).collect())
     }
 
-    fn place(&self, e: &Emitter) -> Option<Located> {
+    fn place(&self, e: &Emitter, energy_scale: f64) -> Option<Located> {
         let placed = self.view.place(e.sensor_m, [e.x_m, e.y_m], e.cov_m2)?;
         let [x_m, y_m] = placed.position_m.into();
         let mut cov_m2 = placed.cov_m2;
@@ -116,7 +116,7 @@ impl Locator {
             z_m: placed.z_m,
             geodetic: self.axes.map(|axes| axes.to_geodetic([x_m, y_m, placed.z_m])),
             cov_m2,
-            energy_j: e.energy_j,
+            energy_j: e.energy_j * energy_scale,
             velocity: e.velocity,
             flags: e.flags,
         })
@@ -169,13 +169,14 @@ pub fn run(args: Args) -> Outcome {
         let clock = Instant::now();
         let is_over = || budget.is_some_and(|budget| clock.elapsed() >= budget);
         let placement = locator.placement(poses, time);
+        let energy_scale = frame.as_ref().map_or(1.0, |frame| frame.energy_scale);
         let estimate = frame.and_then(|frame| {
             estimator.set_smear(locator.smear(&placement, &frame).as_ref());
             estimator.estimate_until(&frame, &is_over).map_err(|e| e.to_string())
         });
         let located = match &estimate {
             Ok(estimate) => locator
-                .locate(&estimate.emitters, placement)
+                .locate(&estimate.emitters, energy_scale, placement)
                 .ok_or_else(|| NO_POSE.to_owned()),
             Err(e) => Err(e.clone()),
         };

@@ -92,6 +92,7 @@ impl Iterator for Recorded {
                         pixels,
                         masked: None,
                         exposure_s: *exposure_s,
+                        energy_scale: 1.0,
                     }),
                     poses: Vec::new(),
                 }))

@@ -75,6 +75,7 @@ impl Shown<'_> {
             pixels,
             masked: None,
             exposure_s: None,
+            energy_scale: 1.0,
         };
         let mut preprocessed = PreprocessedFrame::default();
         preprocessed.load(&frame, &camera).expect("a usable frame");

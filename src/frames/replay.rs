@@ -170,6 +170,7 @@ impl FrameSource for Replay {
                     pixels,
                     masked: None,
                     exposure_s: self.exposure_s,
+                    energy_scale: 1.0,
                 };
                 Next::Frame(frame, Arrivals::default())
             }

@@ -165,6 +165,7 @@ mod tests {
             pixels: Array2::zeros((1, 1)),
             masked: None,
             exposure_s: None,
+            energy_scale: 1.0,
         };
         Captured::new(Next::Frame(frame, vec![claim].into()), None)
     }

@@ -86,7 +86,7 @@ impl Monitor {
             && self.frame.is_placed
         {
             self.frame.timing.saw_frame(now);
-            self.track(estimate, store, dt);
+            self.track(estimate, seen.energy_scale, store, dt);
             self.remember();
             self.associate_displaced();
             self.evaluate_beams();
@@ -211,9 +211,9 @@ impl Monitor {
     }
 
     /// Detections to tracks, our pose, and which track is associated with which claim.
-    fn track(&mut self, estimate: &Estimate, store: &Store, dt: f64) {
+    fn track(&mut self, estimate: &Estimate, energy_scale: f64, store: &Store, dt: f64) {
         let frame = &mut self.frame;
-        let mut detections = Detection::of(estimate, &frame.view);
+        let mut detections = Detection::of(estimate, energy_scale, &frame.view);
         frame.tracker.predict(frame.now);
         frame.register(&mut detections, dt);
         frame.tracker.take(frame.now, &detections, dt);

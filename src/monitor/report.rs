@@ -14,6 +14,8 @@ pub struct Observation<'a> {
     pub frame: u64,
     pub time: Timestamp,
     pub result: Result<&'a Estimate, &'a Error>,
+    /// As [`crate::frame::Frame::energy_scale`].
+    pub energy_scale: f64,
     /// Hash of the frame's pixels: an exact repeat is a frozen sensor.
     pub digest: u64,
     pub look: Look<'a>,

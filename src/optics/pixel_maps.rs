@@ -96,6 +96,7 @@ mod tests {
             pixels,
             masked: None,
             exposure_s: None,
+            energy_scale: 1.0,
         }
     }
 

@@ -269,6 +269,7 @@ impl Maker<'_> {
                 pixels,
                 masked: plan.detector.mask().cloned(),
                 exposure_s: plan.light.smears_over_s(),
+                energy_scale: 1.0,
             },
             truth: Truth {
                 frame: k,

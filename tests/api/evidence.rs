@@ -39,6 +39,7 @@ async fn evidence_is_served_as_frames_as_a_picture_and_with_claims() {
             pixels: Array2::from_elem((64, 64), k as f64),
             masked: None,
             exposure_s: None,
+            energy_scale: 1.0,
         };
         let arrivals = Arrivals {
             claims: vec![claim.clone()],

@@ -345,6 +345,7 @@ pub fn snapshot(number: u64) -> api::Snapshot {
         pixels: Array2::from_shape_fn(camera.shape(), |(y, x)| ((x * y) % 97) as f64 * 1e-6),
         masked: None,
         exposure_s: None,
+        energy_scale: 1.0,
     };
     let report = Report {
         time,

@@ -48,6 +48,7 @@ fn watch(axes: LocalAxes, [x_m, y_m]: [f64; 2]) -> (Report, Alert) {
             frame: k,
             time: at(0) + SignedDuration::from_millis(100 * k as i64),
             result: Ok(&estimate),
+            energy_scale: 1.0,
             digest: k,
             look: Look::Level,
         };

@@ -44,6 +44,7 @@ impl Estimator for PixelCorrected {
                 own.pixels.assign(&frame.pixels);
                 own.masked.clone_from(&frame.masked);
                 own.exposure_s = frame.exposure_s;
+                own.energy_scale = frame.energy_scale;
                 own
             }
             own => own.insert(frame.clone()),

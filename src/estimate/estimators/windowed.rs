@@ -238,6 +238,7 @@ impl WindowSearch {
                 pixels: Array2::zeros((ny, nx)),
                 masked: None,
                 exposure_s: None,
+                energy_scale: 1.0,
             },
         }
     }

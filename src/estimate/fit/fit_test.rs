@@ -54,7 +54,7 @@ proptest! {
             }
         }
         holes.iter().for_each(|&h| pixels[[h / 16, h % 16]] = f64::NAN);
-        let frame = Frame { index: 0, time: jiff::Timestamp::UNIX_EPOCH, pixels, masked: None, exposure_s: None };
+        let frame = Frame { index: 0, time: jiff::Timestamp::UNIX_EPOCH, pixels, masked: None, exposure_s: None, energy_scale: 1.0 };
         let mut preprocessed = PreprocessedFrame::default();
         preprocessed.load(&frame, &camera).expect("a usable frame");
         let bases = Bases::new([&camera.x, &camera.y].map(|axis| Basis::new(axis, sigma)));

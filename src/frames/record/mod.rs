@@ -153,6 +153,7 @@ impl Recorder {
             unusable: Some(reason.to_owned()),
             masked: None,
             exposure_s: None,
+            energy_scale: 1.0,
             arrivals: arrivals.clone(),
         };
         self.write(None, 0, Seen { entry, pixels: None })

@@ -36,8 +36,19 @@ pub(in crate::frames) struct Entry {
     pub masked: Option<Vec<[usize; 2]>>,
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub exposure_s: Option<f64>,
+    #[serde(default = "unchanged", skip_serializing_if = "is_unchanged")]
+    pub energy_scale: f64,
     #[serde(flatten)]
     pub arrivals: Arrivals,
+}
+
+/// [`Frame::energy_scale`] of a source that keeps its exposure.
+fn unchanged() -> f64 {
+    1.0
+}
+
+fn is_unchanged(energy_scale: &f64) -> bool {
+    *energy_scale == unchanged()
 }
 
 /// One event: an entry with its pixels.
@@ -59,6 +70,7 @@ impl Seen {
             unusable: None,
             masked,
             exposure_s: frame.exposure_s,
+            energy_scale: frame.energy_scale,
             arrivals: arrivals.clone(),
         };
         Self {
@@ -74,6 +86,7 @@ impl Seen {
             unusable,
             masked,
             exposure_s,
+            energy_scale,
             arrivals,
         } = self.entry;
         let Some(pixels) = self.pixels else {
@@ -100,6 +113,7 @@ impl Seen {
             pixels,
             masked,
             exposure_s,
+            energy_scale,
         };
         Next::Frame(frame, arrivals)
     }

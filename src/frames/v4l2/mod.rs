@@ -57,7 +57,6 @@ pub struct V4l2 {
     silence: Duration,
     stall: Duration,
     shape: (usize, usize),
-    /// At `config.exposure_us`.
     joules_per_count: f64,
     saturation_j: Option<f64>,
     control: Option<ExposureControl>,
@@ -90,11 +89,6 @@ impl V4l2 {
         let stall_s = positive("v4l2.stall_s", config.stall_s)?;
         if let Some(exposure) = config.exposure_us {
             positive("v4l2.exposure_us", exposure)?;
-        }
-        if let Some(level) = camera.saturation_j.filter(|_| config.auto_exposure) {
-            let expected =
-                "nothing with source.v4l2.auto_exposure = true, whose frames saturate at one energy and another";
-            return Err(Key::new("optics").at("saturation_j").refuse(expected, level).into());
         }
         metrics::gauge!(metric::SOURCE_CONNECTED).set(0.0);
         let now = Instant::now();
@@ -268,13 +262,13 @@ impl V4l2 {
                 };
             }
         };
-        let scale = self.exposure_scale(exposure);
+        let energy_scale = self.energy_scale(exposure);
         let frame = Brightness {
             share: brightest,
             is_saturated: saturated.is_some(),
         };
         self.control_exposure(index, frame);
-        let masked = to_joules(&mut pixels, saturated, self.joules_per_count * scale, self.saturation_j);
+        let masked = to_joules(&mut pixels, saturated, self.joules_per_count, self.saturation_j);
         self.last_usable = Instant::now();
         self.last_told = self.last_usable;
         self.retry = SHORTEST_RETRY;
@@ -284,12 +278,13 @@ impl V4l2 {
             pixels,
             masked,
             exposure_s: Some(exposure.as_secs_f64()).filter(|s| *s > 0.0),
+            energy_scale,
         };
         Next::Frame(frame, Arrivals::default())
     }
 
     /// Configured exposure over a frame's own.
-    fn exposure_scale(&self, exposure: Duration) -> f64 {
+    fn energy_scale(&self, exposure: Duration) -> f64 {
         match (&self.control, self.config.exposure_us) {
             (Some(_), Some(configured_us)) if !exposure.is_zero() => configured_us / (1e6 * exposure.as_secs_f64()),
             _ => 1.0,

@@ -123,6 +123,7 @@ mod tests {
             frame: 0,
             time: at(s),
             result: Ok(&estimate),
+            energy_scale: 1.0,
             digest,
             look: crate::monitor::Look::Level,
         };
@@ -183,6 +184,7 @@ mod tests {
             frame: 0,
             time: at(8),
             result: Err(&error),
+            energy_scale: 1.0,
             digest: 5,
             look: crate::monitor::Look::Level,
         };

@@ -38,8 +38,9 @@ pub struct Detection {
 }
 
 impl Detection {
-    /// The emitters of an estimate whose position and covariance are finite, each with its clutter probability.
-    pub fn of(estimate: &Estimate, view: &View) -> Vec<Self> {
+    /// The emitters of an estimate whose position and covariance are finite, each with its clutter probability; their energies times
+    /// `energy_scale`.
+    pub fn of(estimate: &Estimate, energy_scale: f64, view: &View) -> Vec<Self> {
         // A frame that the model explains badly has errors beyond its covariances.
         let inflation = if estimate.reduced_chi2.is_finite() {
             estimate.reduced_chi2.clamp(1.0, MAX_INFLATION)
@@ -54,6 +55,9 @@ impl Detection {
             .filter(is_finite)
             .filter_map(|e| Self::of_emitter(e, inflation, view))
             .collect();
+        for detection in &mut detections {
+            detection.energy_j *= energy_scale;
+        }
         for i in 0..detections.len() {
             detections[i].clutter_probability = clutter_probability(&detections, i, view);
         }
@@ -227,7 +231,7 @@ mod tests {
             reduced_chi2,
             ..Estimate::default()
         };
-        Detection::of(&estimate, &view())
+        Detection::of(&estimate, 1.0, &view())
     }
 
     #[test]
@@ -263,6 +267,18 @@ mod tests {
         let mut poor = detection(0.0, 0.0);
         poor.flags = Flags::POOR_FIT;
         assert_eq!(clutter_probability(&[poor], 0, &view()), 0.03);
+    }
+
+    #[test]
+    fn a_shorter_exposure_has_the_energies_of_the_configured_one_and_its_own_noise() {
+        let estimate = Estimate {
+            emitters: vec![emitter(0.0, [[0.01, 0.0], [0.0, 0.01]])],
+            reduced_chi2: 1.0,
+            ..Estimate::default()
+        };
+        let [usual, short] = [1.0, 16.0].map(|scale| Detection::of(&estimate, scale, &view()).remove(0));
+        assert_eq!(short.energy_j, 16.0 * usual.energy_j);
+        assert_eq!((short.snr, short.resolution_m), (usual.snr, usual.resolution_m));
     }
 
     #[test]

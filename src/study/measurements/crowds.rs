@@ -97,6 +97,7 @@ fn measure(pixels: [usize; 2], count: usize, frames: u64, seed: u64) -> Tally {
             pixels: render(&camera, &places, &energies, &mut rng),
             masked: None,
             exposure_s: None,
+            energy_scale: 1.0,
         };
         let (clock, start_ms) = (Instant::now(), cpu_ms());
         let found = estimator.estimate(&frame).expect("a frame that can be used").emitters;

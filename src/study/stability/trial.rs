@@ -100,6 +100,7 @@ pub fn frame(pixels: Array2<f64>) -> Frame {
         pixels,
         masked: None,
         exposure_s: None,
+        energy_scale: 1.0,
     }
 }
 

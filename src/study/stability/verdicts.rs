@@ -67,6 +67,7 @@ fn clock_step(by_s: f64) -> Case {
                     frame,
                     time,
                     result: Ok(&estimate),
+                    energy_scale: 1.0,
                     digest: frame + 1,
                     look: crate::monitor::Look::Level,
                 };
@@ -189,6 +190,7 @@ fn covariance(name: &str, hard: &'static str, cov_m2: [[f64; 2]; 2]) -> Case {
                     frame,
                     time,
                     result: Ok(&estimate),
+                    energy_scale: 1.0,
                     digest: frame + 1,
                     look: crate::monitor::Look::Level,
                 };

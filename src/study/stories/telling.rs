@@ -282,6 +282,7 @@ pub fn tell_with(story: &Story, keep: bool) -> Told {
             frame,
             time: at(t),
             result: error.as_ref().map_or(Ok(&estimate), Err),
+            energy_scale: 1.0,
             digest,
             look: crate::monitor::Look::Level,
         };

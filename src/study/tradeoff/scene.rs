@@ -205,6 +205,7 @@ impl Cell {
                 pixels,
                 masked: None,
                 exposure_s: None,
+                energy_scale: 1.0,
             },
             bound_m2,
             known_bound_m2,

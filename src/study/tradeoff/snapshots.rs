@@ -85,6 +85,7 @@ impl Snapshots {
             pixels,
             masked: None,
             exposure_s: None,
+            energy_scale: 1.0,
         }
     }
 

@@ -113,6 +113,7 @@ impl Bench {
             pixels,
             masked: None,
             exposure_s: None,
+            energy_scale: 1.0,
         };
         let places_m = places.iter().map(|p| p.map(|c| c * PITCH_M - half)).collect();
         (frame, Spots { places_m, energies })
