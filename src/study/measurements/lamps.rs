@@ -10,20 +10,19 @@ use rayon::prelude::*;
 use super::measured::{Measured, exceptions};
 use super::places::{in_force, known, zone};
 use crate::monitor::AlertKind::UnclaimedEmitter;
-use crate::monitor::zones::ZoneKind;
+use crate::monitor::zones::{Zone, ZoneKind};
 use crate::monitor::{AlertEventKind, AlertKind};
 use crate::study::stories::{Actor, Story, crowd, tell_with};
 
 /// Seconds of a story.
 const STORY_S: f64 = 180.0;
 
-/// Six users, three of them standing with a reflection each, and twenty lamps: steady, with mains flicker, and swinging.
+/// Six users, three of them standing with a reflection each, twenty lamps along both sides of a road (steady, with mains flicker, and
+/// swinging), and cars on it.
 fn lamp_story(seed: u64) -> Story {
     let place = |k: u32| {
-        [
-            -110.0 + 11.5 * f64::from(k),
-            if k.is_multiple_of(2) { 5.0 } else { -8.0 },
-        ]
+        let side = if k.is_multiple_of(2) { 1.0 } else { -1.0 };
+        [-110.0 + 11.5 * f64::from(k), ROAD_M[0] + side * (ROAD_M[1] + 0.5)]
     };
     let mut actors = crowd();
     let mut places: Vec<[f64; 2]> = (0..20).map(place).collect();
@@ -47,13 +46,14 @@ fn lamp_story(seed: u64) -> Story {
         }
         actors.push(lamp);
     }
+    actors.extend(cars(seed));
     let mut story = Story::new(seed, actors);
     story.seconds = STORY_S;
-    story.operator = in_force(Vec::new(), known(&places));
+    story.operator = in_force(road(), known(&places));
     story
 }
 
-/// Twenty known lamps, three known reflections and six users raise nothing.
+/// Twenty known lamps, three known reflections, cars on an ignored road and six users raise nothing.
 pub fn lamps(stories: u64, seed: u64) -> Measured {
     let raised: Vec<_> = (seed..seed + stories)
         .into_par_iter()
@@ -62,7 +62,7 @@ pub fn lamps(stories: u64, seed: u64) -> Measured {
         .collect();
     let frames = stories as f64 * STORY_S * 10.0;
     let text = format!(
-        "{frames} frames of twenty known lamps, three known ghosts and six users: {} stories with alerts\n{}",
+        "{frames} frames of twenty known lamps, three known ghosts, {CARS} cars in three minutes and six users: {} stories with alerts\n{}",
         raised.len(),
         exceptions(&raised)
     );
@@ -87,11 +87,10 @@ struct Setting {
     stranger: Option<[f64; 2]>,
 }
 
-/// Six users, and cars on a road: each is two lamps 1.4 m apart that an estimate has as one, three times as bright as a beam.
-fn road_story(seed: u64, set: Setting) -> Story {
+/// Cars on the road: each is two lamps 1.4 m apart that an estimate has as one, three times as bright as a beam.
+fn cars(seed: u64) -> Vec<Actor> {
     let mut rng = ChaCha8Rng::seed_from_u64(seed ^ 0xca55);
-    let mut actors = crowd();
-    for k in 0..CARS {
+    let car = |k| {
         let speed: f64 = rng.random_range(SPEED_M_S[0]..SPEED_M_S[1]);
         let from = STORY_S * (k as f64 + rng.random::<f64>()) / CARS as f64;
         let is_eastward = rng.random::<bool>();
@@ -100,9 +99,28 @@ fn road_story(seed: u64, set: Setting) -> Story {
         // Only what is within the view is a detection.
         let mut car =
             Actor::lamp(move |t| (t >= from).then_some([side * (speed * (t - from) - 130.0), ROAD_M[0] + lane]));
-        car.energy_j *= 3.0;
-        actors.push(car);
-    }
+        (car.energy_j, car.extent_m2) = (3.0 * car.energy_j, 0.25);
+        car
+    };
+    (0..CARS).map(car).collect()
+}
+
+/// The road as a zone of kind `ignore`.
+fn road() -> Vec<Zone> {
+    let [middle, half] = ROAD_M;
+    let corners = vec![
+        [-140.0, middle - half],
+        [140.0, middle - half],
+        [140.0, middle + half],
+        [-140.0, middle + half],
+    ];
+    zone("road", ZoneKind::Ignore, corners)
+}
+
+/// Six users, and cars on a road.
+fn road_story(seed: u64, set: Setting) -> Story {
+    let mut actors = crowd();
+    actors.extend(cars(seed));
     let lamps: Vec<[f64; 2]> = (0..8)
         .map(|k| [-105.0 + 30.0 * f64::from(k), ROAD_M[0] + 5.0])
         .collect();
@@ -115,18 +133,7 @@ fn road_story(seed: u64, set: Setting) -> Story {
     if let Some(place) = set.stranger {
         actors.push(Actor::intruder(move |t| (t >= STORY_S / 2.0).then_some(place)));
     }
-    let [middle, half] = ROAD_M;
-    let corners = vec![
-        [-140.0, middle - half],
-        [140.0, middle - half],
-        [140.0, middle + half],
-        [-140.0, middle + half],
-    ];
-    let zones = if set.has_zone {
-        zone("road", ZoneKind::Ignore, corners)
-    } else {
-        Vec::new()
-    };
+    let zones = if set.has_zone { road() } else { Vec::new() };
     let lights = if set.has_lamps { known(&lamps) } else { Vec::new() };
     let mut story = Story::new(seed, actors);
     story.seconds = STORY_S;
