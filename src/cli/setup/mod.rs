@@ -2,6 +2,7 @@
 
 mod new_config;
 mod questions;
+mod shape;
 mod view;
 
 use std::io::{ErrorKind, Write};
@@ -14,6 +15,7 @@ use crate::calibrate::file;
 use crate::config::Config;
 use new_config::NewConfig;
 use questions::Geometry;
+use shape::Shape;
 use view::View;
 
 #[derive(Debug, clap::Args)]
@@ -53,9 +55,12 @@ pub fn run(args: Args) -> Outcome {
     };
     let new = NewConfig::new(&view, &geometry);
     let calibration_path = args.out.with_extension("calibration.toml");
-    let calibration = new.calibration(&view).map_err(Failure::other)?;
+    let camera = new.camera();
+    let maps = new.calibration(&view, &camera).map_err(Failure::other)?;
+    let shape = Shape::learn(&view, &new, &camera);
+    let calibration = shape.calibration(&camera, maps)?;
     if let Some(calibration) = &calibration {
-        let remark = "Written by `oapwatch setup`: dark levels and bad pixels.".to_owned();
+        let remark = "Written by `oapwatch setup`: dark levels, bad pixels, the spot's shape.".to_owned();
         file::write(&calibration_path, &file::render(calibration, &[remark])).map_err(Failure::other)?;
     }
     let name = calibration
@@ -66,7 +71,7 @@ pub fn run(args: Args) -> Outcome {
     let written = Config::load(&args.out).map_err(Failure::config)?;
     written.camera().map_err(Failure::config)?;
     let mut out = std::io::stdout().lock();
-    for line in new.report(&view) {
+    for line in new.report(&view).into_iter().chain(shape.report()) {
         writeln!(out, "{line}").map_err(Failure::other)?;
     }
     let shown = args.out.display();

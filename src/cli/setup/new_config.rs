@@ -3,12 +3,12 @@
 use std::fmt::Write;
 use std::sync::Arc;
 
-use ndarray::Array2;
+use ndarray::{Array2, s};
 
 use super::questions::{Geometry, Lens};
 use super::view::{View, Viewed};
 use crate::frames::v4l2::{Light, Transfer};
-use crate::optics::{self, Calibration, CalibrationError, PixelMaps};
+use crate::optics::{self, Calibration, CalibrationError, Camera, PixelMaps};
 
 /// Widest array that is chosen, pixels a side: a frame of it takes some 15 ms.
 const MOST_SIDE: usize = 512;
@@ -76,7 +76,7 @@ impl NewConfig {
     }
 
     /// Pixel maps, where there is what a config cannot hold: dark levels that differ, or bad pixels.
-    pub fn calibration(&self, view: &View) -> Result<Option<Calibration>, CalibrationError> {
+    pub fn calibration(&self, view: &View, camera: &Camera) -> Result<Option<Calibration>, CalibrationError> {
         let area = (self.block * self.block) as f64;
         let [nx, ny] = self.pixels;
         let black = self.black_counts * (view.cell * view.cell) as f64;
@@ -111,12 +111,34 @@ impl NewConfig {
         if !is_needed {
             return Ok(None);
         }
-        let camera = self.optics().camera().expect("checked numbers make a camera");
         let calibration = Calibration {
             pixels: Some(Arc::new(maps)),
-            ..Calibration::of(&camera)
+            ..Calibration::of(camera)
         };
-        calibration.applied_to(&camera).map(|_| Some(calibration))
+        calibration.applied_to(camera).map(|_| Some(calibration))
+    }
+
+    /// The frames that were looked at as the array would have them.
+    pub fn array_frames(&self, view: &View) -> Vec<Array2<f64>> {
+        let [nx, ny] = self.pixels;
+        let [x0, y0] = self
+            .roi
+            .map_or([0, 0], |roi| [roi[0], roi[1]].map(|corner| corner / view.cell));
+        let block = self.block;
+        let of_array = |frame: &Array2<f64>| {
+            Array2::from_shape_fn((ny, nx), |(y, x)| {
+                let corner = (y0 + y * block, x0 + x * block);
+                let all = frame.slice(s![corner.0..corner.0 + block, corner.1..corner.1 + block]);
+                let is_saturated = all.iter().any(|v| *v >= view.saturation_counts);
+                self.saturation.filter(|_| is_saturated).unwrap_or_else(|| all.sum())
+            })
+        };
+        view.images.iter().map(of_array).collect()
+    }
+
+    /// As the config will describe it, without a calibration.
+    pub fn camera(&self) -> Camera {
+        self.optics().camera().expect("checked numbers make a camera")
     }
 
     fn optics(&self) -> optics::Config {
@@ -156,7 +178,7 @@ impl NewConfig {
              sensor_size_m = [{sx:e}, {sy:e}]\n\
              spot_sigma_m = {:e}   # {spot}\n\
              noise_std_j = {:e}   # {}\n",
-            view.frames,
+            view.images.len(),
             if is_counts { ": there is no scale to joules" } else { "" },
             geometry.altitude_m,
             self.plane_distance_m,
@@ -173,7 +195,10 @@ impl NewConfig {
             let _ = writeln!(text, "saturation_j = {saturation:?}");
         }
         if let Some(name) = calibration {
-            let _ = writeln!(text, "calibration = {name:?}   # dark levels and bad pixels");
+            let _ = writeln!(
+                text,
+                "calibration = {name:?}   # dark levels, bad pixels, the spot's shape"
+            );
         }
         self.source(&mut text, view);
         text.push_str(

@@ -41,9 +41,10 @@ pub struct View {
     /// Whether the curve was seen in the noise.
     pub response_seen: bool,
     pub look: FirstLook,
+    /// The frames, counts in proportion to light.
+    pub images: Vec<Array2<f64>>,
     /// Mean of the dark frames, where there are any.
     pub dark: Option<Array2<f64>>,
-    pub frames: usize,
     pub rate_hz: Option<f64>,
 }
 
@@ -102,7 +103,7 @@ impl View {
             response_seen,
             look,
             dark: (!dark.is_empty()).then(|| mean_of(&linear(&dark, response, white))),
-            frames: frames.len(),
+            images: linear(&frames, response, white),
             rate_hz,
         })
     }
@@ -129,7 +130,7 @@ impl View {
             response_seen: true,
             look: look(&frames, white, &dark, source.step()),
             dark: (!dark.is_empty()).then(|| mean_of(&dark)),
-            frames: frames.len(),
+            images: frames,
             rate_hz: captured_rate_hz(path),
             source,
         })

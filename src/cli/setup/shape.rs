@@ -1,0 +1,79 @@
+//! The spot's shape, learned from the frames that were looked at.
+
+use super::new_config::NewConfig;
+use super::view::View;
+use crate::calibrate::spot::{self, Learned};
+use crate::cli::Failure;
+use crate::cli::progress::Steps;
+use crate::optics::{Calibration, Camera};
+
+/// What became of the shape.
+pub enum Shape {
+    NoSpots,
+    Learned(Box<Learned>),
+    /// Why it could not be.
+    Unknown(String),
+}
+
+impl Shape {
+    pub fn learn(view: &View, new: &NewConfig, camera: &Camera) -> Self {
+        if view.look.spots.is_empty() {
+            return Self::NoSpots;
+        }
+        let frames = new.array_frames(view);
+        let list: Vec<_> = frames.iter().enumerate().collect();
+        let mut steps = Steps::unbounded();
+        let learned = spot::learn(camera, &list, &mut |p| {
+            steps.next(&format!("the spot's shape: {}, round {}", p.stage, p.round));
+        });
+        steps.finish();
+        match learned {
+            Ok(learned) => Self::Learned(Box::new(learned)),
+            Err(why) => Self::Unknown(why.to_string()),
+        }
+    }
+
+    fn better(&self) -> Option<&Learned> {
+        match self {
+            Self::Learned(learned) if learned.is_shape_better => Some(learned),
+            _ => None,
+        }
+    }
+
+    /// What a config cannot hold: `maps`, and a shape that explains the frames better than a Gaussian.
+    pub fn calibration(&self, camera: &Camera, maps: Option<Calibration>) -> Result<Option<Calibration>, Failure> {
+        let Some(learned) = self.better() else { return Ok(maps) };
+        let calibration = Calibration {
+            noise_std_j: camera.noise_std_j,
+            pixels: maps.and_then(|maps| maps.pixels),
+            ..learned.calibration.clone()
+        };
+        calibration.applied_to(camera).map_err(Failure::other)?;
+        Ok(Some(calibration))
+    }
+
+    pub fn report(&self) -> Option<String> {
+        match self {
+            Self::NoSpots => None,
+            Self::Unknown(why) => Some(format!(
+                "the spot's shape was not learned, it is taken for a Gaussian: {why}. `oapwatch calibrate` learns it later"
+            )),
+            Self::Learned(learned) => Some(format!(
+                "the spot's shape: {:.1} % of its light within 2 σ (a Gaussian: 86.5 %), from {} spots; held-out frames: reduced χ² {:.3} \
+                 with a Gaussian, {:.3} with it{}",
+                100.0
+                    * learned
+                        .shape
+                        .encircled_energy([0.0; 2], 2.0 * learned.shape.sigma_equivalent_m()),
+                learned.spots,
+                learned.before.reduced(),
+                learned.after.reduced(),
+                if learned.is_shape_better {
+                    ""
+                } else {
+                    ": a Gaussian it is"
+                }
+            )),
+        }
+    }
+}
