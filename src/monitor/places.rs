@@ -1,6 +1,7 @@
 //! What places mean to a frame: their height, where they are on the earth, and the zones that they are in.
 
 use nalgebra::{Vector2, Vector3};
+use serde_json::Value;
 
 use super::finding::Content;
 use super::frame_context::FrameContext;
@@ -61,6 +62,11 @@ impl FrameContext {
     pub fn mark(&self, content: &mut Content) {
         if let (Some(x), Some(y), Some(z)) = (content.x_m, content.y_m, content.z_m) {
             content.geodetic = self.geodetic(Vector3::new(x, y, z));
+        }
+        if self.sensor.is_alternating()
+            && let Value::Object(evidence) = &mut content.evidence
+        {
+            evidence.insert("exposures".into(), "alternating".into());
         }
         content.maintenance = self.maintenance.in_force(self.now).map(|window| window.id.clone());
         if content.maintenance.is_some() {

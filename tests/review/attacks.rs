@@ -3,7 +3,7 @@
 use oapwatch::monitor::AlertKind::*;
 use oapwatch::monitor::PositionStatus;
 
-use super::stage::{Expect, Story, review};
+use super::stage::{Expect, Story, expose_in_turns, review};
 
 #[test]
 fn an_eavesdropper_far_from_everybody_is_one_alert() {
@@ -24,6 +24,27 @@ fn an_eavesdropper_far_from_everybody_is_one_alert() {
         let cleared = told.cleared();
         assert!(cleared.len() == 1 && (15.5..17.0).contains(&cleared[0]), "{cleared:?}");
     }
+}
+
+/// A fortieth of its light saturates nothing.
+#[test]
+fn an_eavesdropper_that_dazzles_is_an_alert_that_says_so() {
+    let mut story = Story::with(
+        0,
+        r#"
+        [[intruder]]
+        name = "dazzler"
+        power_w = 40.0
+        motion.still = [0, 0]
+        present = { from_s = 10, until_s = 15 }
+        "#,
+    );
+    expose_in_turns(&mut story, 1.0 / 64.0, 2e-3);
+    let told = review(&story);
+    told.expect(&[(UnclaimedEmitter, None, 10.0, 11.0)]);
+    let alert = &told.events[0].alert;
+    assert_eq!(alert.evidence["exposures"], "alternating");
+    assert!(alert.x_m.unwrap().hypot(alert.y_m.unwrap()) < 3.0, "{alert:?}");
 }
 
 /// Nearer than the fit can tell two beams apart: the user's spot is brighter than it ever was, and restless.

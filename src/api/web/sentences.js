@@ -8,7 +8,7 @@ const isNumber = (v) => typeof v === "number" && Number.isFinite(v);
 // A list of sentences, each a list of text and nodes.
 export function sentences(alert) {
   const told = TELL[alert.kind]?.(alert.evidence ?? {}, alert) ?? [];
-  return told.filter(Boolean);
+  return [...told, alert.evidence?.exposures && ["A beam dazzles the camera: short and long exposures are taken in turns."]].filter(Boolean);
 }
 
 const TELL = {

@@ -26,8 +26,8 @@ pub struct Config {
     pub flip_y: bool,
     /// Exposure time; automatic exposure is switched off.
     pub exposure_us: Option<f64>,
-    /// Our own control of the exposure, between a sixteenth of `exposure_us` and all of it: the brightest beam stays below saturation.
-    /// Energies are those of `exposure_us`.
+    /// Our own control of the exposure, `exposure_us` at most: the brightest beam stays below saturation, and beside one that dazzles short
+    /// and long exposures are taken in turns. Energies are those of `exposure_us`.
     pub auto_exposure: bool,
     /// Gain in the driver's own unit; automatic gain is switched off.
     pub gain: Option<i64>,

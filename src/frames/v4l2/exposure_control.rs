@@ -7,13 +7,18 @@ pub struct Brightness {
     pub is_saturated: bool,
 }
 
-/// Decides on exposures. Between the thresholds nothing changes, so that fading does not make the exposure swing.
+/// Decides on exposures. Between the thresholds nothing changes, so that fading does not make the exposure swing. One exposure serves
+/// while it loses the others little; for a beam that needs a much shorter one, short and long exposures are taken in turns.
 #[derive(Clone, Debug)]
 pub struct ExposureControl {
-    /// In force, µs.
+    /// As configured, which is also the longest, µs.
+    longest_us: f64,
+    /// That follows the brightest beam, µs: the only one, or the short one of a pair.
     exposure_us: f64,
-    /// Shortest and longest, µs.
-    range_us: [f64; 2],
+    /// Whether frames of the longest exposure are taken between those.
+    is_pair: bool,
+    /// Whether the newest frame's is the longest of a pair.
+    is_long: bool,
     bright: u32,
     dim: u32,
 }
@@ -29,29 +34,56 @@ const BRIGHT_FRAMES: u32 = 2;
 const DIM_FRAMES: u32 = 30;
 /// Largest change at a time. What is saturated says nothing of how far it is above.
 const STEP: f64 = 2.0;
-/// The shortest exposure is this share of the configured one: a beam that dazzles even then does not make others, up to so many times
-/// fainter, disappear.
-const SHORTEST: f64 = 1.0 / 16.0;
+/// Shortest share of the configured exposure that is used alone. Shorter, fainter beams disappear for a dazzling one; longer, a pair
+/// costs its frames for little.
+const SHORTEST_ALONE: f64 = 0.25;
+/// And the shortest of a pair: a beam may be a thousand times as bright as what the configured exposure bears.
+const SHORTEST: f64 = 1.0 / 1024.0;
 
 impl ExposureControl {
     /// Begins at the configured exposure, which is also the longest.
     pub fn new(configured_us: f64) -> Self {
         Self {
+            longest_us: configured_us,
             exposure_us: configured_us,
-            range_us: [SHORTEST * configured_us, configured_us],
+            is_pair: false,
+            is_long: false,
             bright: 0,
             dim: 0,
         }
     }
 
-    /// The exposure that the device reports, µs.
+    pub fn is_pair(&self) -> bool {
+        self.is_pair
+    }
+
+    /// The exposure that the device reports after a change, µs.
     pub fn granted(&mut self, exposure_us: f64) {
-        self.exposure_us = exposure_us;
-        (self.bright, self.dim) = (0, 0);
+        if !self.is_long {
+            self.exposure_us = exposure_us;
+        }
     }
 
     /// The next exposure, µs, where it has to change after a frame.
     pub fn after(&mut self, frame: Brightness) -> Option<f64> {
+        if self.is_long {
+            self.is_long = false;
+            return Some(self.exposure_us);
+        }
+        let wanted_us = self.follow(frame);
+        let next_us = wanted_us.unwrap_or(self.exposure_us).max(SHORTEST * self.longest_us);
+        self.is_pair = next_us < SHORTEST_ALONE * self.longest_us;
+        if self.is_pair {
+            self.exposure_us = next_us;
+            self.is_long = true;
+            return Some(self.longest_us);
+        }
+        // A change below a tenth is not worth the frames that it costs.
+        ((next_us / self.exposure_us).ln().abs() > 0.1).then_some(next_us)
+    }
+
+    /// The exposure that the brightest beam needs, µs, where that has changed.
+    fn follow(&mut self, frame: Brightness) -> Option<f64> {
         let is_bright = frame.is_saturated || frame.share > TOO_BRIGHT;
         let is_dim = !is_bright && frame.share < TOO_DIM;
         self.bright = if is_bright { self.bright + 1 } else { 0 };
@@ -68,10 +100,7 @@ impl ExposureControl {
             return None;
         };
         (self.bright, self.dim) = (0, 0);
-        let [shortest, longest] = self.range_us;
-        let next = (factor * self.exposure_us).clamp(shortest, longest);
-        // A change below a tenth is not worth the frames that it costs.
-        ((next / self.exposure_us).ln().abs() > 0.1).then_some(next)
+        Some((factor * self.exposure_us).min(self.longest_us))
     }
 }
 
@@ -79,7 +108,7 @@ impl ExposureControl {
 mod tests {
     use super::*;
 
-    /// Runs the control on a beam of constant power: the exposure after each frame. `power` is the share of saturation at 1 µs.
+    /// Runs the control on a beam of constant power: the exposure of each frame. `power` is the share of saturation at 1 µs.
     fn exposures(power: impl Fn(usize) -> f64, frames: usize, start_us: f64) -> Vec<f64> {
         let mut control = ExposureControl::new(start_us);
         let mut exposure = start_us;
@@ -90,11 +119,12 @@ mod tests {
                     share: share.min(1.0),
                     is_saturated: share >= 1.0,
                 };
+                let seen = exposure;
                 if let Some(next) = control.after(frame) {
                     exposure = next;
                     control.granted(next);
                 }
-                exposure
+                seen
             })
             .collect()
     }
@@ -104,7 +134,10 @@ mod tests {
         let found = exposures(|_| 3.1 / 8000.0, 200, 8000.0);
         let share = found[199] * 3.1 / 8000.0;
         assert!((TOO_DIM..TOO_BRIGHT).contains(&share), "{share}");
-        assert!(found[20] == found[199], "settled within 20 frames: {found:?}");
+        assert!(
+            found[20..].iter().all(|e| *e == found[199]),
+            "settled within 20 frames: {found:?}"
+        );
     }
 
     #[test]
@@ -114,13 +147,30 @@ mod tests {
     }
 
     #[test]
-    fn a_dazzling_beam_shortens_it_only_so_far_and_when_it_is_gone_it_grows_again() {
-        let found = exposures(|k| if k < 100 { 1.0 } else { 0.2 / 1600.0 }, 400, 1600.0);
-        assert_eq!(found[99], 100.0, "a sixteenth");
-        assert_eq!(found[399], 1600.0);
-        let raised = found[100..]
-            .windows(2)
-            .all(|pair| pair[1] <= STEP * pair[0] && pair[1] >= pair[0]);
-        assert!(raised, "{found:?}");
+    fn beside_a_dazzling_beam_every_other_frame_is_a_long_one() {
+        // Forty times what the configured exposure bears.
+        let found = exposures(|_| 40.0 / 1600.0, 300, 1600.0);
+        let settled = &found[100..];
+        for pair in settled.chunks(2) {
+            let [short, long] = [pair[0].min(pair[1]), pair[0].max(pair[1])];
+            assert_eq!(long, 1600.0);
+            assert!((TOO_DIM..TOO_BRIGHT).contains(&(short * 40.0 / 1600.0)), "{short}");
+        }
+    }
+
+    #[test]
+    fn no_beam_is_so_bright_that_the_exposure_vanishes() {
+        let found = exposures(|_| 1e6, 300, 1600.0);
+        assert_eq!(found.iter().copied().fold(f64::INFINITY, f64::min), 1600.0 / 1024.0);
+        assert!(found[200..].contains(&1600.0));
+    }
+
+    #[test]
+    fn when_the_dazzling_beam_is_gone_the_pair_ends_and_the_exposure_grows_again() {
+        let found = exposures(|k| if k < 100 { 40.0 / 1600.0 } else { 0.2 / 1600.0 }, 1000, 1600.0);
+        let last_change = (1..1000).rev().find(|k| found[*k] != found[k - 1]).unwrap();
+        // Five doublings, of 30 frames each or twice as many in a pair.
+        assert!((200..500).contains(&last_change), "{last_change}");
+        assert_eq!(found[999], 1600.0);
     }
 }

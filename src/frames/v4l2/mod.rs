@@ -296,15 +296,31 @@ impl V4l2 {
         let State::Open { session, settling } = &mut self.state else {
             return;
         };
-        let Some((control, next_us)) = self.control.as_mut().and_then(|c| c.after(frame).map(|next| (c, next))) else {
-            return;
-        };
+        let Some(control) = &mut self.control else { return };
+        let was_pair = control.is_pair();
+        let Some(next_us) = control.after(frame) else { return };
         if let Some(granted) = session.set_exposure(next_us, &mut self.faults) {
             let exposure_us = 1e6 * granted.as_secs_f64();
             control.granted(exposure_us);
             *settling = self.config.settle_frames.max(1);
             let from_frame = index + 1 + u64::from(*settling);
-            tracing::info!(exposure_us, from_frame, brightest = frame.share, "the exposure changes");
+            let is_pair = control.is_pair();
+            if is_pair && was_pair {
+                tracing::debug!(
+                    exposure_us,
+                    from_frame,
+                    brightest = frame.share,
+                    "the other exposure of a pair"
+                );
+            } else {
+                tracing::info!(
+                    exposure_us,
+                    from_frame,
+                    brightest = frame.share,
+                    is_pair,
+                    "the exposure changes"
+                );
+            }
         }
     }
 

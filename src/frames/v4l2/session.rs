@@ -307,7 +307,7 @@ fn set_exposure(node: &Node, asked: f64, faults: &mut Faults) -> Option<Duration
     // Cameras without automatic exposure lack the switch.
     let manual = i64::from(c::v4l2_exposure_auto_type_V4L2_EXPOSURE_MANUAL);
     let _ = node.set_control(c::V4L2_CID_EXPOSURE_AUTO, manual);
-    match node.set_control(c::V4L2_CID_EXPOSURE_ABSOLUTE, (asked / UNIT_US).round() as i64) {
+    match node.set_control(c::V4L2_CID_EXPOSURE_ABSOLUTE, (asked / UNIT_US).round().max(1.0) as i64) {
         Ok(units) => Some(Duration::from_micros((units.max(0) as f64 * UNIT_US) as u64)),
         Err(error) => {
             faults.count(Fault::ControlRefused, format_args!("exposure_us = {asked}: {error}"));

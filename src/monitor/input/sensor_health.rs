@@ -15,6 +15,9 @@ pub const BLINDING_SHARE: f64 = 0.25;
 /// Frames among which exact repeats are looked for. No two noisy frames agree in every pixel, so that more would cost nothing but
 /// comparisons. Not tuned.
 const REMEMBERED_FRAMES: usize = 8;
+/// Frames in a row that each have another exposure than the one before, from which short and long ones are taken in turns: a control
+/// that follows a beam changes it every other frame at most.
+const TURNS: u32 = 4;
 /// Users who were seen a moment ago, from which on a frame without any beam is blind and not empty. With one, a user who switches
 /// off would be a lost sensor; with more, a capped lens would be users unseen.
 const MIN_VISIBLE_USERS: usize = 2;
@@ -27,6 +30,8 @@ pub struct SensorHealth {
     started: Option<Timestamp>,
     fault: Option<Fault>,
     unusable_frames: u64,
+    energy_scale: f64,
+    exposures_changed: u32,
 }
 
 /// Why a frame carries no information.
@@ -44,6 +49,12 @@ impl SensorHealth {
     /// The estimate if the frame carries information. `visible_users`: active users seen a moment ago.
     pub fn usable_estimate<'a>(&mut self, seen: &Observation<'a>, visible_users: usize) -> Option<&'a Estimate> {
         self.started.get_or_insert(seen.time);
+        let is_changed = std::mem::replace(&mut self.energy_scale, seen.energy_scale) != seen.energy_scale;
+        self.exposures_changed = if is_changed {
+            self.exposures_changed.saturating_add(1)
+        } else {
+            0
+        };
         let fault = match seen.result {
             Err(error) => Some(Fault::Unusable(error.to_string())),
             Ok(_) if self.digests.contains(&seen.digest) => Some(Fault::Repeated),
@@ -77,6 +88,11 @@ impl SensorHealth {
     pub fn no_frame(&mut self, now: Timestamp) {
         self.started.get_or_insert(now);
         self.fault.get_or_insert(Fault::NoFrame);
+    }
+
+    /// Whether short and long exposures are taken in turns, as beside a beam that dazzles.
+    pub fn is_alternating(&self) -> bool {
+        self.exposures_changed >= TURNS
     }
 
     /// Seconds since the last usable frame; zero while the newest frame is one.
@@ -145,6 +161,32 @@ mod tests {
         // The repeat took the place of the oldest: 1 is gone by the next but one.
         assert!(see(&mut health, 2, 8, 0.0, 0));
         assert!(see(&mut health, 2, 1, 0.0, 0));
+    }
+
+    #[test]
+    fn exposures_that_change_from_frame_to_frame_are_a_pair() {
+        let mut health = SensorHealth::default();
+        let estimate = Estimate::default();
+        let mut is_alternating_after = |scales: &[f64]| {
+            for (energy_scale, digest) in scales.iter().zip(0..) {
+                let seen = Observation {
+                    frame: 0,
+                    time: at(0),
+                    result: Ok(&estimate),
+                    energy_scale: *energy_scale,
+                    digest,
+                    look: crate::monitor::Look::Level,
+                };
+                health.usable_estimate(&seen, 0);
+            }
+            health.is_alternating()
+        };
+        assert!(
+            !is_alternating_after(&[1.0, 1.0, 2.0, 2.0, 4.0, 4.0]),
+            "one that follows a beam"
+        );
+        assert!(is_alternating_after(&[1.0, 8.0, 1.0, 8.0]));
+        assert!(!is_alternating_after(&[8.0]));
     }
 
     #[test]
