@@ -53,11 +53,14 @@ pub fn run(args: Args) -> Outcome {
         (None, Some(frames)) => View::of_recording(frames, args.dark.as_deref(), args.saturation_counts)?,
         (None, None) => return Err(Failure::Input(anyhow!("expected --device or --frames, found neither"))),
     };
-    let new = NewConfig::new(&view, &geometry);
+    let mut new = NewConfig::new(&view, &geometry);
+    let shape = Shape::learn(&view, &new);
+    if let Some(sigma_m) = shape.sigma_m() {
+        new.spot_sigma_m = sigma_m;
+    }
     let calibration_path = args.out.with_extension("calibration.toml");
     let camera = new.camera();
     let maps = new.calibration(&view, &camera).map_err(Failure::other)?;
-    let shape = Shape::learn(&view, &new, &camera);
     let calibration = shape.calibration(&camera, maps)?;
     if let Some(calibration) = &calibration {
         let remark = "Written by `oapwatch setup`: dark levels, bad pixels, the spot's shape.".to_owned();

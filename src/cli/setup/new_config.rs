@@ -29,7 +29,7 @@ pub struct NewConfig {
     plane_distance_m: f64,
     /// Of the array's pixels.
     pitch_m: f64,
-    spot_sigma_m: f64,
+    pub spot_sigma_m: f64,
     /// Of one pixel of the array, counts.
     noise: f64,
     saturation: Option<f64>,
@@ -166,7 +166,7 @@ impl NewConfig {
         };
         let spot = match view.look.spots.len() {
             0 => "a guess, one pixel: no spot was seen. Run setup again with a beam in view".to_owned(),
-            n => format!("median of {n} spots"),
+            n => format!("of {n} spots"),
         };
         let _ = write!(
             text,

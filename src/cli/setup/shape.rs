@@ -16,20 +16,39 @@ pub enum Shape {
 }
 
 impl Shape {
-    pub fn learn(view: &View, new: &NewConfig, camera: &Camera) -> Self {
+    pub fn learn(view: &View, new: &NewConfig) -> Self {
         if view.look.spots.is_empty() {
             return Self::NoSpots;
         }
         let frames = new.array_frames(view);
         let list: Vec<_> = frames.iter().enumerate().collect();
         let mut steps = Steps::unbounded();
-        let learned = spot::learn(camera, &list, &mut |p| {
-            steps.next(&format!("the spot's shape: {}, round {}", p.stage, p.round));
-        });
+        let mut learn = |camera: &Camera| {
+            spot::learn(camera, &list, &mut |p| {
+                steps.next(&format!("the spot's shape: {}, round {}", p.stage, p.round));
+            })
+        };
+        let mut camera = new.camera();
+        let mut learned = learn(&camera);
+        // The width seen so far is the mean frame's, in which a beam that moves is wider.
+        if let Ok(wider) = learned.as_ref()
+            && wider.is_shape_better
+        {
+            camera.spot_sigma_m = wider.shape.sigma_equivalent_m();
+            learned = learn(&camera);
+        }
         steps.finish();
         match learned {
             Ok(learned) => Self::Learned(Box::new(learned)),
             Err(why) => Self::Unknown(why.to_string()),
+        }
+    }
+
+    /// Width of the Gaussian that is nearest to the learned shape, m.
+    pub fn sigma_m(&self) -> Option<f64> {
+        match self {
+            Self::Learned(learned) => Some(learned.shape.sigma_equivalent_m()),
+            _ => None,
         }
     }
 
