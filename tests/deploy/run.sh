@@ -107,7 +107,7 @@ upgrade
 root_image
 echo "Booting (software emulation; a few minutes at most)"
 status=0
-timeout 900 qemu-system-x86_64 -accel tcg -cpu max -smp 1 -m 1024 -nodefaults -display none -no-reboot \
+timeout 1500 qemu-system-x86_64 -accel tcg -cpu max -smp 1 -m 1024 -nodefaults -display none -no-reboot \
     -kernel "$vmlinux" -initrd "$work/initramfs.cpio" \
     -append "console=ttyS0 quiet loglevel=2 panic=-1 nokaslr mitigations=off tsc=reliable no_timer_check random.trust_cpu=on cryptomgr.notests systemd.show_status=false rd.systemd.show_status=false" \
     -drive "file=$work/root.squashfs,format=raw,if=virtio,readonly=on" \

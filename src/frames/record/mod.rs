@@ -80,7 +80,7 @@ enum Order {
     Write {
         path: Arc<Path>,
         shape: (usize, usize),
-        seen: Seen,
+        seen: Box<Seen>,
     },
     Evidence {
         path: Arc<Path>,
@@ -212,7 +212,7 @@ impl Recorder {
         let sent = self.order(Order::Write {
             path: path.clone(),
             shape,
-            seen,
+            seen: Box::new(seen),
         });
         let file = (!is_failing).then_some(path);
         sent.then_some(Taken { file })
