@@ -9,6 +9,7 @@ use serde_json::{Value, json};
 
 use crate::estimate::Flags;
 use crate::geo::View;
+use crate::monitor::stats::lamp_or_beam::{beam_over_lamp, point_over_lamp, stated, steady_over_flicker};
 use crate::monitor::stats::moment_score::MomentScore;
 use crate::monitor::stats::second_moment::{LENS_SCATTER, middle};
 use crate::monitor::track::beam_track::Track;
@@ -17,16 +18,8 @@ use crate::monitor::track::tracker::Tracker;
 /// Frames that are kept of each track, and frames from which anything is said.
 const FRAMES: usize = 128;
 const MIN_FRAMES: usize = 30;
-/// Standard deviations of ln energy that lamps and beams have, each as likely as the other: a lamp is steady to a few per cent; a beam of
-/// ten coherence times a frame has 0.3, at weak turbulence and slow frames less. Assumed.
-const LAMP_STD: [f64; 4] = [0.01, 0.02, 0.04, 0.08];
-const BEAM_STD: [f64; 4] = [0.12, 0.2, 0.3, 0.45];
-/// Traces of the second moments of a lamp that is not a point, σ², each as likely as the others; half of the lamps are points. Assumed.
-const LAMP_TRACES: [f64; 4] = [0.1, 0.3, 1.0, 3.0];
 /// Share of the frames that count as independent.
 const INDEPENDENT: f64 = 0.5;
-/// Largest likelihood ratio that is stated: the models are no better.
-const LARGEST_RATIO: f64 = 1e6;
 /// Twice the mains' frequencies, Hz.
 const FLICKER_HZ: [f64; 2] = [100.0, 120.0];
 /// −ln p from which a line in the spectrum or a correlation is named: one in 10⁵ for each of the pairs that are looked at.
@@ -183,41 +176,6 @@ fn variance_m2(places: impl Iterator<Item = Vector2<f64>> + Clone) -> f64 {
     let n = places.clone().count() as f64;
     let mean = places.clone().sum::<Vector2<f64>>() / n;
     0.5 * places.map(|p| (p - mean).norm_squared()).sum::<f64>() / n
-}
-
-/// A likelihood ratio within what is stated.
-fn stated(ratio: f64) -> f64 {
-    ratio.clamp(1.0 / LARGEST_RATIO, LARGEST_RATIO)
-}
-
-/// Likelihood of a trace of the second moments for a point over that for a lamp.
-fn point_over_lamp(trace: f64, variance: f64) -> f64 {
-    // Over the likelihood for a point.
-    let extended = LAMP_TRACES.iter().map(|t| (t * (trace - 0.5 * t) / variance).exp());
-    stated(2.0 / (1.0 + extended.sum::<f64>() / LAMP_TRACES.len() as f64))
-}
-
-/// Likelihood of the strongest line's −ln p in `n` frames for light that is steady or scintillates over that for a lamp: half of the lamps
-/// flicker, and of those whose frames show it the line has half of the variance in the mean.
-fn steady_over_flicker(neg_log_p: f64, n: f64) -> f64 {
-    let usual = 0.25 * n;
-    stated(2.0 / (1.0 + (neg_log_p * (1.0 - 1.0 / usual)).exp() / usual))
-}
-
-/// Likelihood of a sample variance of `n` normal deviates under a beam's over a lamp's standard deviations.
-fn beam_over_lamp(variance: f64, noise: f64, n: f64) -> f64 {
-    let ln_likelihood = |std: &f64| {
-        let expected = std * std + noise;
-        -0.5 * (n - 1.0) * (expected.ln() + variance / expected)
-    };
-    let mean = |stds: &[f64], most: f64| stds.iter().map(|s| (ln_likelihood(s) - most).exp()).sum::<f64>();
-    let most = LAMP_STD
-        .iter()
-        .chain(&BEAM_STD)
-        .map(ln_likelihood)
-        .fold(f64::NEG_INFINITY, f64::max);
-    let (beam, lamp) = (mean(&BEAM_STD, most), mean(&LAMP_STD, most));
-    stated(beam / lamp.max(1e-300))
 }
 
 /// −ln p of the line that light at `hz` makes in frames of `rate_hz`; none where it cannot be told from slow changes. White noise's
