@@ -147,7 +147,7 @@ mount -t tmpfs -o size=4m tmpfs $small
 printf '[estimator]\nname = "subpixel-peak"\n[record]\nfolder = "ring"\nlimit_mb = 64.0\nsegment_s = 2.0\n[journal]\npath = "journal.db"\n' >$small/oapwatch.toml
 oapwatch run --config $small/oapwatch.toml 2>$small.log &
 recorder=$!
-made_way() { grep -q "oldest recordings made way" $small.log && grep -q "recording again" $small.log; }
+made_way() { grep -q "oldest recordings were removed" $small.log && grep -q "recording again" $small.log; }
 check "on a full disk the oldest recordings make way" within 120 made_way
 check "the journal has the room" within 60 is oapwatch_journal_writable 1
 kill $recorder
@@ -194,7 +194,7 @@ before=$(within 60 ids)
 old=$(pid)
 check "the hub of a fleet does not start by itself" bash -c '! systemctl is-active oapwatch-fleet && ! systemctl is-enabled oapwatch-fleet'
 check "it starts with the config that is shipped" systemctl start oapwatch-fleet
-check "and answers, without a server" within 60 curl -fsS -m 5 http://127.0.0.1:8788/readyz
+check "and answers, without a server" within 60 curl -fsS -m 5 http://127.0.0.1:8788/healthz
 check "its journal is its own" test -s /var/lib/private/oapwatch-fleet/hub.db
 systemctl stop oapwatch-fleet
 echo "127.0.0.1 hub.example" >>/etc/hosts

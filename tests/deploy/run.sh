@@ -16,11 +16,12 @@ done
 
 suite=$(. /etc/os-release && echo "$VERSION_CODENAME")
 packages=systemd-sysv,udev,kmod,curl,python3-minimal,ca-certificates,sqlite3,nats-server,openssl
-base=$work/root-$(echo "$suite $packages" | cksum | cut -d' ' -f1).tar
+base=$work/root-$(echo "$suite $packages, examples" | cksum | cut -d' ' -f1).tar
 if [ ! -f "$base" ]; then
     echo "Making a minimal Debian $suite (about a minute)"
     mmdebstrap --quiet --format=tar --variant=minbase --include=$packages \
-        --dpkgopt='path-exclude=/usr/share/doc/*' --dpkgopt='path-exclude=/usr/share/locale/*' \
+        --dpkgopt='path-exclude=/usr/share/doc/*' --dpkgopt='path-include=/usr/share/doc/oapwatch/*' \
+        --dpkgopt='path-exclude=/usr/share/locale/*' \
         "$suite" "$work/root.tar.part"
     mv "$work/root.tar.part" "$base"
 fi
