@@ -1,11 +1,19 @@
 //! The spot's shape, learned from the frames that were looked at.
 
+use ndarray::{Array2, s};
+
 use super::new_config::NewConfig;
 use super::view::View;
+use crate::calibrate::first_look::FoundSpot;
 use crate::calibrate::spot::{self, Learned};
 use crate::cli::Failure;
 use crate::cli::progress::Steps;
 use crate::optics::{Calibration, Camera};
+
+/// Fewest beams that stand still and may show a shape: one for each of the pixel phases that it takes.
+const FEWEST_STILL: usize = 8;
+/// Way of a spot from the first half of the frames to the second, pixels, from which it moves. Noise moves one by hundredths.
+const MOVES: f64 = 0.2;
 
 /// What became of the shape.
 pub enum Shape {
@@ -15,10 +23,45 @@ pub enum Shape {
     Unknown(String),
 }
 
+/// Whether a spot that was found moves.
+fn is_moving(view: &View) -> bool {
+    let halves = view.images.split_at(view.images.len() / 2);
+    view.look.spots.iter().any(|spot| {
+        let [first, second] = [halves.0, halves.1].map(|half| centre(half, spot));
+        (first[0] - second[0]).hypot(first[1] - second[1]) > MOVES
+    })
+}
+
+/// Centre of the light around a spot, over frames, pixels.
+fn centre(frames: &[Array2<f64>], spot: &FoundSpot) -> [f64; 2] {
+    let reach = (3.0 * spot.sigma).ceil();
+    let range = |at: f64, n: usize| (at - reach).max(0.0) as usize..((at + reach) as usize + 1).min(n);
+    let Some((ny, nx)) = frames.first().map(Array2::dim) else {
+        return [0.0; 2];
+    };
+    let (rows, columns) = (range(spot.y, ny), range(spot.x, nx));
+    let mut sum = Array2::<f64>::zeros((rows.len(), columns.len()));
+    for frame in frames {
+        sum += &frame.slice(s![rows.clone(), columns.clone()]);
+    }
+    let ground = sum.iter().copied().fold(f64::INFINITY, f64::min);
+    let (mut light, mut x, mut y) = (0.0, 0.0, 0.0);
+    for ((row, column), value) in sum.indexed_iter() {
+        let value = value - ground;
+        light += value;
+        x += value * column as f64;
+        y += value * row as f64;
+    }
+    [x / light, y / light]
+}
+
 impl Shape {
     pub fn learn(view: &View, new: &NewConfig) -> Self {
         if view.look.spots.is_empty() {
             return Self::NoSpots;
+        }
+        if view.look.spots.len() < FEWEST_STILL && !is_moving(view) {
+            return Self::Unknown("the beams stand still, on too few parts of a pixel".to_owned());
         }
         let frames = new.array_frames(view);
         let list: Vec<_> = frames.iter().enumerate().collect();

@@ -73,7 +73,11 @@ mod tests {
 
     #[test]
     fn no_ratio_is_beyond_what_the_models_are_good_for() {
-        for ratio in [beam_over_lamp(10.0, 0.0, 1e4), beam_over_lamp(0.0, 1e-9, 1e4), point_over_lamp(1e9, 1e-3)] {
+        for ratio in [
+            beam_over_lamp(10.0, 0.0, 1e4),
+            beam_over_lamp(0.0, 1e-9, 1e4),
+            point_over_lamp(1e9, 1e-3),
+        ] {
             assert!((1.0 / LARGEST_RATIO..=LARGEST_RATIO).contains(&ratio), "{ratio}");
         }
     }
