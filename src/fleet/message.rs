@@ -73,20 +73,20 @@ pub struct HealthMessage {
 }
 
 /// Who a message says it is from, and the version of its words.
-pub trait Signed {
-    fn signature(&self) -> (u32, &StationName);
+pub trait FromStation {
+    fn head(&self) -> (u32, &StationName);
 }
 
-macro_rules! signed {
+macro_rules! from_station {
     ($($message:ty),*) => {
-        $(impl Signed for $message {
-            fn signature(&self) -> (u32, &StationName) {
+        $(impl FromStation for $message {
+            fn head(&self) -> (u32, &StationName) {
                 (self.version, &self.name)
             }
         })*
     };
 }
-signed!(AlertMessage, PositionsMessage, PoseMessage, HealthMessage);
+from_station!(AlertMessage, PositionsMessage, PoseMessage, HealthMessage);
 
 impl AlertMessage {
     pub fn new(name: StationName, journal: &str, recorded: Recorded) -> Self {

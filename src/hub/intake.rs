@@ -6,7 +6,7 @@ use async_nats::Message;
 use metrics::counter;
 use serde::de::DeserializeOwned;
 
-use crate::fleet::message::{Signed, VERSION};
+use crate::fleet::message::{FromStation, VERSION};
 use crate::fleet::{Subject, Topic};
 use crate::metric;
 use crate::monitor::StationName;
@@ -28,7 +28,7 @@ struct Head<'a> {
 
 /// Reads a message of this topic, and counts it. The error says why it cannot be used: it is another version, malformed, too large, or in
 /// the name of another station than its subject's, which is the one that the server lets its sender use.
-pub fn read<T: DeserializeOwned + Signed>(message: &Message, topic: Topic) -> Result<T, &'static str> {
+pub fn read<T: DeserializeOwned + FromStation>(message: &Message, topic: Topic) -> Result<T, &'static str> {
     let outcome = parse(message, topic);
     let word = match &outcome {
         Ok(_) => "taken",
@@ -47,7 +47,7 @@ pub fn count(topic: Topic, outcome: &'static str) {
     counter!(metric::FLEET_MESSAGES, "topic" => topic.name(), "outcome" => outcome).increment(1);
 }
 
-fn parse<T: DeserializeOwned + Signed>(message: &Message, topic: Topic) -> Result<T, &'static str> {
+fn parse<T: DeserializeOwned + FromStation>(message: &Message, topic: Topic) -> Result<T, &'static str> {
     let subject = Subject::parse(&message.subject).filter(|subject| subject.topic == topic);
     let subject = subject.ok_or("wrong_subject")?;
     if message.payload.len() > LARGEST {
@@ -63,7 +63,7 @@ fn parse<T: DeserializeOwned + Signed>(message: &Message, topic: Topic) -> Resul
         check(head.version, &head.site, &head.station)?;
         return Err("malformed");
     };
-    let (version, name) = read.signature();
+    let (version, name) = read.head();
     check(version, &name.site, &name.station)?;
     Ok(read)
 }

@@ -20,7 +20,7 @@ use super::stream::{BATCH, Delivered, consume};
 use crate::api::{Acknowledged, Command, Feed, ZonesRefused};
 use crate::config::Config;
 use crate::fleet::Topic;
-use crate::fleet::message::{HealthMessage, PositionsMessage, Signed};
+use crate::fleet::message::{FromStation, HealthMessage, PositionsMessage};
 use crate::journal::Journal;
 use crate::monitor::zones::ZoneMap;
 use crate::monitor::{Acknowledgement, LightError, MaintenanceError, StationName, Withdrawal};
@@ -151,7 +151,7 @@ impl Run {
     }
 
     /// `None` where it cannot be used, which its station's status then shows.
-    fn read<T: DeserializeOwned + Signed>(&mut self, message: &Message, topic: Topic) -> Option<T> {
+    fn read<T: DeserializeOwned + FromStation>(&mut self, message: &Message, topic: Topic) -> Option<T> {
         let read = intake::read(message, topic);
         if let Err(reason) = read {
             self.refuse(intake::sender(message), topic, reason);
