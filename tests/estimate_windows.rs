@@ -1,9 +1,12 @@
 //! Large sensors from outside: windows of a frame give the answers of the whole frame, find all emitters, and say where they reach a limit.
 
+use std::sync::Arc;
+
 use ndarray::{Array2, s};
 use oapwatch::estimate::{Config, Emitter, Estimate, Estimator, Flags, Rules, build};
 use oapwatch::frame::Frame;
-use oapwatch::optics::{self, Axis, Camera, psf};
+use oapwatch::optics::spot::{Component, Field, FieldPolynomial, SpotShape, Template};
+use oapwatch::optics::{self, Axis, Camera, Smear, add_spot, psf};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
@@ -47,13 +50,62 @@ fn frame(camera: &Camera, spots: &[([f64; 2], f64)], seed: u64) -> Frame {
             *pixel += energy * fy[j] * fx[i];
         }
     }
+    of_pixels(pixels * camera.noise_std_j)
+}
+
+fn of_pixels(pixels: Array2<f64>) -> Frame {
     Frame {
         index: 0,
         time: jiff::Timestamp::UNIX_EPOCH,
-        pixels: pixels * camera.noise_std_j,
+        pixels,
         masked: None,
         exposure_s: None,
         energy_scale: 1.0,
+    }
+}
+
+/// Spots of the camera's own shape, smeared.
+fn smeared(camera: &Camera, spots: &[([f64; 2], f64)], smear: &Smear, seed: u64) -> Frame {
+    /// Moments of an exposure: the midpoint rule of smears of a σ is exact to 10⁻⁴ of the peak.
+    const MOMENTS: usize = 20;
+    let dark = frame(camera, &[], seed).pixels;
+    let (shape, mut pixels) = (dark.dim(), dark.into_raw_vec_and_offset().0);
+    for (place, energy) in spots {
+        let place = [(&camera.x, place[0]), (&camera.y, place[1])].map(|(axis, at)| axis.edge(0) + at * axis.pitch_m);
+        let moved = smear.displacement_m(place);
+        for k in 0..MOMENTS {
+            let t = (k as f64 + 0.5) / MOMENTS as f64 - 0.5;
+            let at = [0, 1].map(|i| place[i] + t * moved[i]);
+            add_spot(camera, at, energy * camera.noise_std_j / MOMENTS as f64, &mut pixels);
+        }
+    }
+    of_pixels(Array2::from_shape_vec(shape, pixels).unwrap())
+}
+
+/// A round spot with a tail that points away from the sensor's middle and grows towards its edges, as coma does.
+fn with_tails(camera: Camera) -> Camera {
+    let sigma = camera.spot_sigma_m;
+    let field = Field {
+        half_sensor_m: [camera.x.half_width(), camera.y.half_width()],
+    };
+    let gaussian = |x: f64, y: f64| (-0.5 * (x * x + y * y) / (sigma * sigma)).exp();
+    let tail = |along: f64, x: f64, y: f64| 0.1 * (along / sigma).powi(3) * gaussian(x, y);
+    let of = |density: &dyn Fn(f64, f64) -> f64, field_by: Vec<f64>| Component {
+        field: FieldPolynomial(field_by),
+        ..Template::of_density(field, 0.25 * sigma, 8.0 * sigma, density).components[0].clone()
+    };
+    let template = Template {
+        field,
+        knot_m: 0.25 * sigma,
+        components: vec![
+            of(&gaussian, vec![1.0]),
+            of(&|x, y| tail(x, x, y), vec![0.0, 1.0]),
+            of(&|x, y| tail(y, x, y), vec![0.0, 0.0, 1.0]),
+        ],
+    };
+    Camera {
+        spot_shape: SpotShape::from_template(&template, 1e-6).map(Arc::new),
+        ..camera
     }
 }
 
@@ -233,4 +285,79 @@ fn a_dark_level_and_noise_that_the_config_does_not_know_are_measured() {
     assert!(far < 0.1, "{far} standard deviations in another noise");
     assert!((found.reduced_chi2 - 1.0).abs() < 0.05, "{}", found.reduced_chi2);
     assert!(found.emitters.iter().all(|e| e.flags.is_empty()));
+}
+
+#[test]
+fn a_measured_spot_that_varies_over_the_sensor_is_the_same_in_windows() {
+    let camera = with_tails(camera([256, 192]));
+    let mut ml = estimator("ml", Rules::default(), &camera);
+    let mut whole = estimator("ml", Rules::without("windows").unwrap(), &camera);
+    let spots: Vec<_> = scatter([256, 192], 7, 6.0, 3)
+        .into_iter()
+        .map(|p| (p, ENERGY))
+        .collect();
+    let frame = smeared(
+        &camera,
+        &spots,
+        &Smear {
+            at_centre_m: [0.0; 2],
+            by_place: [[0.0; 2]; 2],
+        },
+        4,
+    );
+    let (by_windows, at_once) = (ml.estimate(&frame).unwrap(), whole.estimate(&frame).unwrap());
+    let far = difference(&camera, &at_once, &by_windows);
+    assert!(far < 0.1, "{far} standard deviations");
+    for (place, _) in &spots {
+        let e = at(&camera, &by_windows, *place).expect("an emitter within a pixel");
+        let off = [0, 1].map(|k| (pixel(&camera, e)[k] - place[k]) * camera.ground_scale() * camera.x.pitch_m);
+        assert!(
+            (0..2).all(|k| off[k].abs() < 5.0 * e.cov_m2[k][k].sqrt()),
+            "{off:?} against {:?}",
+            e.cov_m2
+        );
+    }
+}
+
+#[test]
+fn spots_smeared_differently_over_the_sensor_are_the_same_in_windows() {
+    let camera = camera([256, 192]);
+    let spots: Vec<_> = scatter([256, 192], 7, 8.0, 5)
+        .into_iter()
+        .map(|p| (p, ENERGY))
+        .collect();
+    // A platform that turns: up to 2.4 σ at the corners.
+    let smear = Smear {
+        at_centre_m: [3e-4, 0.0],
+        by_place: [[0.0, -0.03], [0.03, 0.0]],
+    };
+    let frame = smeared(&camera, &spots, &smear, 6);
+    let [by_windows, at_once] = [Rules::default(), Rules::without("windows").unwrap()].map(|rules| {
+        let mut ml = estimator("ml", rules, &camera);
+        ml.set_smear(Some(&smear));
+        ml.estimate(&frame).unwrap()
+    });
+    assert_eq!(by_windows.emitters.len(), spots.len());
+    let far = difference(&camera, &at_once, &by_windows);
+    assert!(far < 0.1, "{far} standard deviations");
+}
+
+#[test]
+fn a_ghost_in_a_window_of_its_own_is_no_emitter_under_a_spot_error() {
+    let camera = Camera {
+        spot_error: Some(0.04),
+        ..camera([256, 256])
+    };
+    let mut ml = estimator("ml", Rules::default(), &camera);
+    let bright = [[60.0, 60.0], [180.0, 100.0], [100.0, 200.0]];
+    // Ten σ away, 1 % of the light: 20 times the noise of a pixel.
+    let ghosts = bright.map(|[x, y]| ([x + 17.0, y - 12.0], 0.2 * ENERGY));
+    let spots = [bright.map(|p| (p, 20.0 * ENERGY)).as_slice(), &ghosts].concat();
+    let found = ml.estimate(&frame(&camera, &spots, 9)).unwrap();
+    assert_eq!(found.emitters.len(), bright.len());
+    // A beam as faint far from any other is one.
+    let spots = [spots.as_slice(), &[([220.0, 220.0], 0.2 * ENERGY)]].concat();
+    let found = ml.estimate(&frame(&camera, &spots, 9)).unwrap();
+    assert!(at(&camera, &found, [220.0, 220.0]).is_some());
+    assert_eq!(found.emitters.len(), bright.len() + 1);
 }

@@ -26,6 +26,14 @@ impl Smear {
         displacement(self.at_centre_m, self.by_place, place_m)
     }
 
+    /// The same motion as a window of the sensor sees it, whose middle is at `place_m`.
+    pub fn seen_from(&self, place_m: [f64; 2]) -> Self {
+        Self {
+            at_centre_m: self.displacement_m(place_m),
+            ..*self
+        }
+    }
+
     /// The longest displacement on a camera's sensor, m: that of a corner.
     pub fn longest_m(&self, camera: &Camera) -> f64 {
         let half = [camera.x.half_width(), camera.y.half_width()];

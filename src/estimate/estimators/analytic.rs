@@ -10,7 +10,7 @@ use crate::estimate::estimators::list::{EstimatorSpec, Method};
 use crate::estimate::estimators::search_bases::bases;
 use crate::estimate::fit::work_budget::WorkBudget;
 use crate::estimate::model::compressed_frame::CompressedFrame;
-use crate::estimate::model::hypothesis::{Hypothesis, Nuisances};
+use crate::estimate::model::hypothesis::{Hypothesis, Nuisances, PointSource};
 use crate::estimate::model::svd_basis::Basis;
 use crate::estimate::model_order::candidate::Candidate;
 use crate::estimate::model_order::map_search::maximum_posterior;
@@ -80,6 +80,14 @@ impl AnalyticEstimator {
     pub fn load(&mut self, frame: &Frame) -> Result<f64, Error> {
         self.search.frame.load(frame, &self.camera)?;
         Ok(self.search.inspect())
+    }
+
+    /// Says where the next window is: its middle on the whole sensor, m, and the emitters beyond it that cast a halo into it.
+    pub fn place_window(&mut self, origin_m: [f64; 2], beyond: Vec<PointSource>) {
+        let search = &mut self.search;
+        search.frame.beyond = beyond;
+        search.space.bases.set_origin(origin_m);
+        search.reweighting.space.bases.set_origin(origin_m);
     }
 
     /// Loads a window of a frame whose pixels have this noise, without its foreign pixels, of which `exclude` lists those of one window.

@@ -10,6 +10,7 @@ use crate::estimate::model_order::candidate::Candidate;
 use crate::estimate::model_order::common_misfit::is_narrow;
 use crate::estimate::model_order::initialise::{add_residual_peaks, filter_peaks, initial_hypothesis, initialise};
 use crate::estimate::model_order::maximum_likelihood::maximum_likelihood;
+use crate::estimate::model_order::pruning::without_insignificant;
 use crate::estimate::model_order::refine::shrink;
 use crate::estimate::model_order::reweighting::Reweighting;
 use crate::estimate::model_order::search::{Search, SearchSpace};
@@ -201,7 +202,7 @@ impl FrameSearch {
         let (frame, budget) = (&self.frame, &mut budgets.reweighting);
         let shape = match self.spot_error {
             Some(0.0) => Shape::AsModelled,
-            Some(error) => Shape::of_spot_error(error, &found.hypothesis),
+            Some(error) => Shape::of_spot_error(error, &found.hypothesis, &self.frame.beyond),
             None => inspect_shape(space, compressed, frame, &found.hypothesis, excess, budget),
         };
         match shape {
@@ -269,8 +270,9 @@ impl FrameSearch {
             Method::Pencil { steps } => initialise(&mut search, Nuisances::default(), steps).into_hypothesis(),
             Method::MaximumLikelihood | Method::MaximumPosterior | Method::Sequence => {
                 let initial = initial_hypothesis(&mut search);
-                if self.spot_error.is_some_and(|e| e > 0.0) && self.space.bases.are_pixels() {
+                if self.spot_error.is_some_and(|e| e > 0.0) && search.context.bases.are_pixels() {
                     // The search with the spot error is the only one.
+                    let initial = without_insignificant(&mut search, initial);
                     return Found::of(initial, SearchKind::Main);
                 }
                 let is_explained = self.compressed.is_explained_by(&initial);

@@ -11,7 +11,8 @@ use crate::estimate::error::Error;
 use crate::estimate::estimator::Estimator;
 use crate::estimate::estimators::analytic::AnalyticEstimator;
 use crate::estimate::estimators::list::EstimatorSpec;
-use crate::estimate::model::hypothesis::OVERLAPPING;
+use crate::estimate::model::halo;
+use crate::estimate::model::hypothesis::{OVERLAPPING, PointSource};
 use crate::estimate::model_order::criterion::source_penalty;
 use crate::estimate::model_order::initialise::is_background_visible;
 use crate::estimate::rules::Rules;
@@ -33,6 +34,11 @@ const MOST_MISFIT: f64 = 5.0;
 /// misfit, shows only there, and more would take seconds.
 const MOST_FOR_WHOLE: usize = 40;
 
+/// Spots smeared by more than this, σ, are searched for as a whole: a block holds too little of the light of faint ones.
+const MOST_SMEAR: f64 = 3.5;
+/// Least height of a halo in a window, in units of the noise, that counts there: less adds 1 % to a pixel's variance.
+const LEAST_HALO: f64 = 0.1;
+
 /// A companion of an emitter is within `COMPANION` σ and fainter than `FAINT` of it, or within [`OVERLAPPING`]. Where half of the bright
 /// emitters have one, the spot may be wider than the model or have a ghost: of 80 emitters on 256 × 256 pixels a quarter have.
 const COMPANION: f64 = 6.0;
@@ -51,7 +57,6 @@ pub(crate) struct WindowedEstimator {
     searches: BTreeMap<[usize; 2], WindowSearch>,
     /// Made for the first frame that needs it: it takes memory that grows with the area.
     whole: Option<AnalyticEstimator>,
-    /// Spots that are smeared differently over the sensor are searched for as a whole.
     smear: Option<Smear>,
 }
 
@@ -64,11 +69,10 @@ struct WindowSearch {
 }
 
 impl WindowedEstimator {
-    /// Whether the sensor is large, and its spots have no shape or error that reaches beyond a window.
+    /// Whether the sensor is large.
     pub fn suits(camera: &Camera, rules: Rules) -> bool {
-        let is_local = camera.spot_shape.is_none() && camera.spot_error.is_none_or(|e| e == 0.0);
         let [x, y] = widths(camera);
-        rules.windows && is_local && x.max(y) > WIDE
+        rules.windows && x.max(y) > WIDE
     }
 
     pub fn new(spec: &'static EstimatorSpec, camera: &Camera, rules: Rules) -> Self {
@@ -97,6 +101,11 @@ impl WindowedEstimator {
         is_background_visible(sums.usable, sums.low)
     }
 
+    /// Whether spots differ from the PSF in a way that all have in common, and that no window shows alone.
+    fn may_share_misfit(&self) -> bool {
+        self.camera.spot_error.is_none() || self.camera.spot_shape.is_none()
+    }
+
     /// Whether the frame's light stands apart before a dark background.
     fn is_apart(&self) -> bool {
         let sums = &self.segmentation.sums;
@@ -106,8 +115,14 @@ impl WindowedEstimator {
             && (largest as f64) < LARGEST * (self.camera.x.n * self.camera.y.n) as f64
     }
 
-    /// Searches a window; `None` where it has no usable pixel.
-    fn search(&mut self, frame: &Frame, window: &Window, is_over: &dyn Fn() -> bool) -> Option<Found> {
+    /// Searches a window beside the brighter emitters that were found before; `None` where it has no usable pixel.
+    fn search(
+        &mut self,
+        frame: &Frame,
+        window: &Window,
+        brighter: &[Emitter],
+        is_over: &dyn Fn() -> bool,
+    ) -> Option<Found> {
         let [x, y] = &window.pixels;
         let size = [x.len(), y.len()];
         let search = self
@@ -125,7 +140,11 @@ impl WindowedEstimator {
                 .mapv_inplace(|v| if v < limit { v - level_j } else { v });
         }
         search.frame.masked = frame.masked.as_ref().map(|m| m.slice(part).to_owned());
+        let offset = [0, 1].map(|k| [&self.camera.x, &self.camera.y][k].edge(window.pixels[k].start) - search.low_m[k]);
+        let beyond = beyond(&self.camera, brighter, offset, window);
         let estimator = &mut search.estimator;
+        estimator.place_window(offset, beyond);
+        estimator.set_smear(self.smear.as_ref().map(|smear| smear.seen_from(offset)).as_ref());
         let segmentation = &self.segmentation;
         // Of the squares of standard normal variates, one for each window, the largest is about 2 ln of their number.
         let spare_excess = (2.0 * (segmentation.windows.len() as f64).ln()).sqrt();
@@ -144,9 +163,8 @@ impl WindowedEstimator {
             });
         }
         let mut estimate = estimator.estimate_loaded(1.0, is_over);
-        let low = [self.camera.x.edge(x.start), self.camera.y.edge(y.start)];
         for emitter in &mut estimate.emitters {
-            place(emitter, &self.camera, [0, 1].map(|k| low[k] - search.low_m[k]));
+            place(emitter, &self.camera, offset);
         }
         Some(Found { estimate, sums })
     }
@@ -190,10 +208,13 @@ impl Total {
     }
 
     /// Whether the windows' emitters explain their light without a misfit of the spot.
-    fn is_explained(&self, spot_sigma_m: f64) -> bool {
+    fn is_explained(&self, camera: &Camera) -> bool {
         let spread = (2.0 * self.freedom).sqrt() + 1.0;
         let has_misfit = self.deviance > self.freedom + MOST_MISFIT * spread;
-        self.estimate.spot_error == 0.0 && !has_misfit && !are_attended(&self.estimate.emitters, spot_sigma_m)
+        let is_shape_known = camera.spot_error.is_some_and(|e| e > 0.0);
+        !has_misfit
+            && (is_shape_known
+                || self.estimate.spot_error == 0.0 && !are_attended(&self.estimate.emitters, camera.spot_sigma_m))
     }
 
     /// The frame's estimate, given the sums over all of its pixels.
@@ -262,6 +283,26 @@ fn are_attended(emitters: &[Emitter], spot_sigma_m: f64) -> bool {
     bright >= FEWEST && 2 * attended >= bright
 }
 
+/// The emitters that cast a halo into a window of the sensor, as the window, whose middle is at `offset`, sees them.
+fn beyond(camera: &Camera, emitters: &[Emitter], offset: [f64; 2], window: &Window) -> Vec<PointSource> {
+    let Some(error) = camera.spot_error.filter(|e| *e > 0.0) else {
+        return Vec::new();
+    };
+    let sigma = camera.spot_sigma_m;
+    let norm = halo::norm_of_pitches([&camera.x, &camera.y].map(|axis| axis.pitch_m / sigma));
+    let ends = [0, 1].map(|k| {
+        let axis = [&camera.x, &camera.y][k];
+        [window.pixels[k].start, window.pixels[k].end].map(|p| axis.edge(p))
+    });
+    let source = |e: &Emitter| {
+        let distance = [0, 1].map(|k| (e.sensor_m[k].clamp(ends[k][0], ends[k][1]) - e.sensor_m[k]) / sigma);
+        let a = e.energy_j / camera.noise_std_j;
+        let highest = error * norm * a * halo::height(distance[0].powi(2) + distance[1].powi(2));
+        (highest > LEAST_HALO).then(|| PointSource::new([0, 1].map(|k| (e.sensor_m[k] - offset[k]) / sigma), a))
+    };
+    emitters.iter().filter_map(source).collect()
+}
+
 /// Widths of a camera's sensor, σ.
 fn widths(camera: &Camera) -> [f64; 2] {
     [&camera.x, &camera.y].map(|axis| 2.0 * axis.half_width() / camera.spot_sigma_m)
@@ -291,7 +332,8 @@ impl Estimator for WindowedEstimator {
     }
 
     fn estimate_until(&mut self, frame: &Frame, is_over: &dyn Fn() -> bool) -> Result<Estimate, Error> {
-        if frame.pixels.dim() != self.camera.shape() || self.smear.is_some() {
+        let is_smeared = |smear: &Smear| smear.longest_m(&self.camera) > MOST_SMEAR * self.camera.spot_sigma_m;
+        if frame.pixels.dim() != self.camera.shape() || self.smear.as_ref().is_some_and(is_smeared) {
             return self.search_whole(frame, is_over);
         }
         self.segmentation.run(frame);
@@ -310,12 +352,12 @@ impl Estimator for WindowedEstimator {
                 total.estimate.is_cut_short = true;
                 break;
             }
-            if let Some(found) = self.search(frame, window, is_over) {
+            if let Some(found) = self.search(frame, window, &total.estimate.emitters, is_over) {
                 total.add(found);
             }
         }
-        let may_be_whole = total.windows <= MOST_FOR_WHOLE && !total.estimate.is_cut_short;
-        if may_be_whole && !total.is_explained(self.camera.spot_sigma_m) {
+        let may_be_whole = self.may_share_misfit() && total.windows <= MOST_FOR_WHOLE && !total.estimate.is_cut_short;
+        if may_be_whole && !total.is_explained(&self.camera) {
             return self.search_whole(frame, is_over);
         }
         Ok(total.finish(sums))

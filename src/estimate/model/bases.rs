@@ -31,6 +31,13 @@ impl Bases {
         self
     }
 
+    /// Says where on the sensor the axes' origin is, m, for a PSF that varies over it.
+    pub fn set_origin(&mut self, origin_m: [f64; 2]) {
+        if let Some(shape) = &mut self.shape {
+            shape.origin_m = origin_m;
+        }
+    }
+
     pub fn axes(&self) -> [&Basis; 2] {
         [&self.x, &self.y]
     }

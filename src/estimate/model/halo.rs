@@ -21,8 +21,13 @@ pub(crate) fn height(distance2: f64) -> f64 {
 
 /// Norm of a spot of unit energy over the pixels, √G.
 pub(crate) fn spot_norm(bases: &Bases) -> f64 {
-    let norm = |b: &Basis| (b.pitch() / (2.0 * std::f64::consts::PI.sqrt())).sqrt().min(1.0);
-    bases.axes().map(norm).iter().product()
+    norm_of_pitches(bases.axes().map(Basis::pitch))
+}
+
+/// The same for pixels of these pitches along x and y, σ.
+pub(crate) fn norm_of_pitches(pitches: [f64; 2]) -> f64 {
+    let norm = |pitch: f64| (pitch / (2.0 * std::f64::consts::PI.sqrt())).sqrt().min(1.0);
+    pitches.map(norm).iter().product()
 }
 
 /// The spots' halo at each pixel, (Ny, Nx), in units of the noise.

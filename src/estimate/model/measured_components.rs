@@ -22,6 +22,8 @@ pub(crate) struct MeasuredShape {
     shape: Arc<SpotShape>,
     /// The unit of length, m.
     sigma_m: f64,
+    /// Where the bases' origin is on the sensor, over which the spot varies, m.
+    pub origin_m: [f64; 2],
     /// Half-widths of the whole spot and of its core, σ.
     pub(super) radii: [f64; 2],
 }
@@ -70,6 +72,7 @@ impl MeasuredShape {
             radii: radii.map(|r| r / sigma_m),
             shape,
             sigma_m,
+            origin_m: [0.0; 2],
         }
     }
 
@@ -131,7 +134,7 @@ impl MeasuredComponents {
             });
         }
         let terms = &mut self.terms;
-        terms.collect(&shape.shape, shape.sigma_m, axes, &self.parts, whole);
+        terms.collect(&shape.shape, (shape.sigma_m, shape.origin_m), axes, &self.parts, whole);
         let n = terms.count;
         let reach = if terms.is_uniform { n } else { 2 * n };
         let [of_f2, of_f1, of_f] = [0, 1, 2].map(|k| k * n * columns);

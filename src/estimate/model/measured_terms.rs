@@ -43,9 +43,17 @@ pub(crate) struct MeasuredTerms {
 }
 
 impl MeasuredTerms {
-    /// Evaluates the terms of all parts over a span, whose last columns may be beyond the sensor.
+    /// Evaluates the terms of all parts over a span, whose last columns may be beyond the sensor. Axes are in `sigma_m`, from `origin_m` on the
+    /// sensor.
     #[inline(always)]
-    pub fn collect(&mut self, shape: &SpotShape, sigma_m: f64, axes: [&Basis; 2], parts: &[Part], span: Span) {
+    pub fn collect(
+        &mut self,
+        shape: &SpotShape,
+        (sigma_m, origin_m): (f64, [f64; 2]),
+        axes: [&Basis; 2],
+        parts: &[Part],
+        span: Span,
+    ) {
         let [columns, rows] = size(span);
         let count = parts.len() * shape.terms();
         self.count = count;
@@ -72,7 +80,8 @@ impl MeasuredTerms {
                 }
             }
             self.place(shape, axes[1], span[1], part.u[1], sigma_m);
-            let weights = shape.weights_at(part.u[0] * sigma_m, part.u[1] * sigma_m);
+            let [x, y] = [0, 1].map(|k| origin_m[k] + part.u[k] * sigma_m);
+            let weights = shape.weights_at(x, y);
             for (k, (w, du, dv)) in weights.enumerate() {
                 let (w, du, dv) = (part.share * w, part.share * du * sigma_m, part.share * dv * sigma_m);
                 let profile = shape.y_profile(k);

@@ -61,18 +61,22 @@ pub(crate) fn bright_spots(hypothesis: &Hypothesis, merge_core: bool) -> Vec<Poi
     let mut spots: Vec<[PointSource; 2]> = Vec::new();
     for source in sources {
         let is_in_core = |head: &PointSource| merge_core && distance2(head.u, source.u) < CORE * CORE;
-        let is_faint = |head: &PointSource| source.a < SATELLITE * halo::height(distance2(head.u, source.u)) * head.a;
         if let Some([spot, _]) = spots.iter_mut().find(|[_, head]| is_in_core(head)) {
             let whole = spot.a + source.a;
             for k in 0..2 {
                 spot.u[k] = (spot.a * spot.u[k] + source.a * source.u[k]) / whole;
             }
             spot.a = whole;
-        } else if !spots.iter().any(|[_, head]| is_faint(head)) {
+        } else if !spots.iter().any(|[_, head]| is_faint_beside(&source, head)) {
             spots.push([source; 2]);
         }
     }
     spots.into_iter().map(|[spot, _]| spot).collect()
+}
+
+/// Whether a source may be a part of the spot of a brighter one.
+pub(crate) fn is_faint_beside(source: &PointSource, head: &PointSource) -> bool {
+    source.a < SATELLITE * halo::height(distance2(head.u, source.u)) * head.a
 }
 
 /// Whether nearly all spots are pairs along the same direction and equally far apart, as an elongated spot is explained by a model that is

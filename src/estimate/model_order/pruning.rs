@@ -1,7 +1,7 @@
 //! Removes sources that do not exceed the misfit around them: where gain scatter or a wrong PSF leaves a residual that grows with the
 //! light, a source must be significant against that residual and not only against the noise.
 
-use crate::estimate::model::hypothesis::PointSource;
+use crate::estimate::model::hypothesis::{Hypothesis, PointSource};
 use crate::estimate::model_order::candidate::Candidate;
 use crate::estimate::model_order::search::Search;
 
@@ -9,6 +9,18 @@ use crate::estimate::model_order::search::Search;
 const CERTAIN: f64 = 100.0;
 /// Radius of the neighbourhood whose misfit a source must exceed, σ: it holds 86 % of a spot's light.
 const NEIGHBOURHOOD: f64 = 2.0;
+
+/// A fitted hypothesis without the sources that noise alone may be.
+pub(crate) fn without_insignificant(search: &mut Search, hypothesis: Hypothesis) -> Hypothesis {
+    let threshold = search.criterion.threshold();
+    let mut candidate = Candidate::from(hypothesis);
+    let mut significance = candidate.wald_statistics(&mut search.context).into_iter();
+    let mut hypothesis = candidate.into_hypothesis();
+    hypothesis
+        .sources
+        .retain(|_| significance.next().is_some_and(|s| s > threshold));
+    hypothesis
+}
 
 /// Removes spurious sources, the least significant first, until none is left.
 pub(crate) fn prune_spurious(search: &mut Search, candidate: &mut Candidate) {

@@ -8,7 +8,7 @@ use crate::estimate::model::halo::{Halo, height, spot_norm};
 use crate::estimate::model::hypothesis::{Hypothesis, Nuisances, PointSource, Width};
 use crate::estimate::model_order::candidate::Candidate;
 use crate::estimate::model_order::common_misfit::{
-    CORE, MAX_SPOT_ERROR, are_pairs_alike, bright_spots, common_misfit, distance2, is_narrow,
+    CORE, MAX_SPOT_ERROR, are_pairs_alike, bright_spots, common_misfit, distance2, is_faint_beside, is_narrow,
 };
 use crate::estimate::model_order::maximum_likelihood::refit_reweighted;
 use crate::estimate::model_order::proposals::split_all;
@@ -43,10 +43,12 @@ pub(crate) enum Shape {
 }
 
 impl Shape {
-    /// Of a spot error that is known.
-    pub fn of_spot_error(spot_error: f64, hypothesis: &Hypothesis) -> Self {
+    /// Of a spot error that is known, where emitters `beyond` the frame cast a halo into it.
+    pub fn of_spot_error(spot_error: f64, hypothesis: &Hypothesis, beyond: &[PointSource]) -> Self {
+        let mut sources = bright_spots(hypothesis, false);
+        sources.retain(|source| !beyond.iter().any(|head| is_faint_beside(source, head)));
         let start = Hypothesis {
-            sources: bright_spots(hypothesis, false),
+            sources,
             converged: false,
             ..hypothesis.clone()
         };
@@ -221,7 +223,7 @@ fn set_weights(
     spot_error: f64,
     sources: &[PointSource],
 ) {
-    let halo = Halo::new(&space.bases, sources);
+    let halo = Halo::new(&space.bases, &[sources, &frame.beyond].concat());
     let variance = |square: f64| 1.0 + spot_error * spot_error * square;
     compressed.set_weights(frame, space.bases.axes(), |k| variance(halo.square[k]));
     let nx = space.bases.x.n;

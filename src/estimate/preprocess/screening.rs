@@ -1,6 +1,7 @@
 //! Validates a frame: divides it by the noise, lists the pixels that cannot be used and interpolates over them.
 
 use crate::estimate::error::Error;
+use crate::estimate::model::hypothesis::PointSource;
 use crate::frame::Frame;
 use crate::optics::{Camera, DisplacedSpots};
 
@@ -24,6 +25,8 @@ pub(crate) struct PreprocessedFrame {
     pub saturated: usize,
     /// How spots are smeared by motion, for the frames that are loaded from now on.
     pub smear: Option<DisplacedSpots>,
+    /// Emitters beyond the frame that cast a halo into it, for the frames that are loaded from now on.
+    pub beyond: Vec<PointSource>,
 }
 
 /// A pixel that must not be used, and why.

@@ -71,15 +71,8 @@ impl Bench {
 
     /// The camera with the spot that a lens makes at a place on the sensor.
     pub fn camera_at(&self, place_m: [f64; 2]) -> Camera {
-        let half = self.camera.x.half_width();
-        let field = Field {
-            half_sensor_m: [half; 2],
-        };
-        let u = place_m.map(|p| p / half);
-        let density = |x: f64, y: f64| (self.lens.density)(x / PITCH_M, y / PITCH_M, u);
-        let template = Template::of_density(field, 0.5 * PITCH_M, REACH * PITCH_M, density);
         Camera {
-            spot_shape: SpotShape::from_template(&template, LEFT_OUT).map(Arc::new),
+            spot_shape: spot_shape(&self.lens, &self.camera, place_m),
             ..self.camera.clone()
         }
     }
@@ -171,4 +164,13 @@ impl Bench {
         });
         halves.collect()
     }
+}
+
+/// The spot that a lens makes at a place on a camera's sensor.
+pub fn spot_shape(lens: &Lens, camera: &Camera, place_m: [f64; 2]) -> Option<Arc<SpotShape>> {
+    let half_sensor_m = [camera.x.half_width(), camera.y.half_width()];
+    let u = [0, 1].map(|k| place_m[k] / half_sensor_m[k]);
+    let density = |x: f64, y: f64| (lens.density)(x / PITCH_M, y / PITCH_M, u);
+    let template = Template::of_density(Field { half_sensor_m }, 0.5 * PITCH_M, REACH * PITCH_M, density);
+    SpotShape::from_template(&template, LEFT_OUT).map(Arc::new)
 }

@@ -1,8 +1,8 @@
 //! What the estimator makes of spots that are no Gaussians: without a calibration, and with one that was learned blind.
 
 mod alerts;
-mod bench;
-mod shapes;
+pub mod bench;
+pub mod shapes;
 mod tally;
 
 use std::time::Instant;

@@ -15,12 +15,14 @@ pub struct Lens {
     pub is_uniform: bool,
 }
 
+pub const AIRY: Lens = uniform("Airy disc", |x, y, _| {
+    let r = (x.hypot(y) * 3.8317 / (2.9 * SIGMA)).max(1e-9);
+    (2.0 * libm::j1(r) / r).powi(2)
+});
+
 pub const LENSES: [Lens; 7] = [
     uniform("Gaussian", |x, y, _| gaussian(x, y, SIGMA)),
-    uniform("Airy disc", |x, y, _| {
-        let r = (x.hypot(y) * 3.8317 / (2.9 * SIGMA)).max(1e-9);
-        (2.0 * libm::j1(r) / r).powi(2)
-    }),
+    AIRY,
     uniform("Moffat, β 2.5", |x, y, _| {
         (1.0 + (x * x + y * y) / (2.05 * SIGMA).powi(2)).powf(-2.5)
     }),
