@@ -33,24 +33,36 @@ impl From<&Source> for Peak {
 
 /// Matched filter with the camera's Gaussian on images of its shape.
 pub struct MatchedFilter {
-    x: Vec<Vec<f64>>,
-    y: Vec<Vec<f64>>,
+    x: Vec<Kernel>,
+    y: Vec<Kernel>,
     norm2: f64,
 }
 
+/// A spot's profile around one pixel, as far as it has light.
+struct Kernel {
+    first: usize,
+    weights: Vec<f64>,
+}
+
+/// Half of a kernel, σ: beyond it a pixel has less than 10⁻⁷ of the middle one's weight.
+const KERNEL_RADIUS: f64 = 6.0;
+
 impl MatchedFilter {
     pub fn new(camera: &Camera) -> Self {
-        let kernels = |axis: &Axis| -> Vec<Vec<f64>> {
+        let sigma_m = camera.spot_sigma_m;
+        let kernels = |axis: &Axis| -> Vec<Kernel> {
+            let reach = (KERNEL_RADIUS * sigma_m / axis.pitch_m).ceil() as usize;
             (0..axis.n)
                 .map(|k| {
-                    let mut out = vec![0.0; axis.n];
-                    psf::profile(axis, axis.centre(k), camera.spot_sigma_m, &mut out);
-                    out
+                    let (first, last) = (k.saturating_sub(reach), (k + reach + 1).min(axis.n));
+                    let fraction = |p| psf::pixel_fraction(axis.edge(p), axis.edge(p + 1), axis.centre(k), sigma_m);
+                    let weights = (first..last).map(fraction).collect();
+                    Kernel { first, weights }
                 })
                 .collect()
         };
         let (x, y) = (kernels(&camera.x), kernels(&camera.y));
-        let norm = |k: &[Vec<f64>]| k[k.len() / 2].iter().map(|v| v * v).sum::<f64>();
+        let norm = |k: &[Kernel]| k[k.len() / 2].weights.iter().map(|v| v * v).sum::<f64>();
         Self {
             norm2: norm(&x) * norm(&y),
             x,
@@ -64,12 +76,17 @@ impl MatchedFilter {
         let mut along_x = vec![0.0; ny * nx];
         for (row, out) in image.chunks_exact(nx).zip(along_x.chunks_exact_mut(nx)) {
             for (o, kernel) in out.iter_mut().zip(&self.x) {
-                *o = kernel.iter().zip(row).map(|(a, b)| a * b).sum();
+                *o = kernel
+                    .weights
+                    .iter()
+                    .zip(&row[kernel.first..])
+                    .map(|(a, b)| a * b)
+                    .sum();
             }
         }
         let mut filtered = vec![0.0; ny * nx];
         for (kernel, out) in self.y.iter().zip(filtered.chunks_exact_mut(nx)) {
-            for (w, line) in kernel.iter().zip(along_x.chunks_exact(nx)).filter(|(w, _)| **w > 1e-12) {
+            for (w, line) in kernel.weights.iter().zip(along_x.chunks_exact(nx).skip(kernel.first)) {
                 out.iter_mut().zip(line).for_each(|(o, v)| *o += w * v);
             }
         }

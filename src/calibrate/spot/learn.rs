@@ -38,7 +38,7 @@ const LEAST_SNR: f64 = 12.0;
 /// State of the learning.
 pub struct Learner<'a> {
     pub camera: &'a Camera,
-    pub images: &'a [Image],
+    pub images: &'a [&'a Image],
     pub noise_j: f64,
     pub model: TemplateModel,
     pub patches: Vec<Patch>,
@@ -64,7 +64,7 @@ pub struct Round {
 
 impl<'a> Learner<'a> {
     /// Finds spots with the camera's Gaussian.
-    pub fn new(camera: &'a Camera, images: &'a [Image], noise_j: f64) -> Self {
+    pub fn new(camera: &'a Camera, images: &'a [&'a Image], noise_j: f64) -> Self {
         let pitch = camera.x.pitch_m.max(camera.y.pitch_m);
         let knot_m = (camera.spot_sigma_m / KNOTS_PER_SIGMA).clamp(FINEST * pitch, f64::MAX);
         let knot_m = match camera.spot_sigma_m > 4.0 * COARSEST * KNOTS_PER_SIGMA * pitch {
@@ -89,7 +89,7 @@ impl<'a> Learner<'a> {
     /// The same images with a model that was learned elsewhere.
     pub fn with_model(
         camera: &'a Camera,
-        images: &'a [Image],
+        images: &'a [&'a Image],
         noise_j: f64,
         model: &TemplateModel,
         misfit: f64,

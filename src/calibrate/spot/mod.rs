@@ -122,7 +122,8 @@ pub fn learn(
     check_pixels(&prepared, &chosen)?;
     // Each pass shows what the flashes that it masks have hidden.
     for _ in 0..FLASH_PASSES {
-        let mut first = Learner::new(camera, &prepared.images, prepared.noise_j);
+        let images = every(&prepared.images);
+        let mut first = Learner::new(camera, &images, prepared.noise_j);
         first.fit(15);
         let flashes = first.mask_flashes();
         if flashes.is_empty() {
@@ -130,14 +131,6 @@ pub fn learn(
         }
         prepared.mask_flashes(&flashes);
     }
-    let is_held = |k: usize| k % HELD_OUT == HELD_OUT / 2;
-    let split = |images: &[Image]| -> (Vec<Image>, Vec<Image>) {
-        let part = |held: bool| {
-            let images = images.iter().enumerate().filter(|(k, _)| is_held(*k) == held);
-            images.map(|(_, image)| image.clone()).collect()
-        };
-        (part(false), part(true))
-    };
     let (train, _) = split(&prepared.images);
     let mut learner = Learner::new(camera, &train, prepared.noise_j);
     let detected = Coverage::of(&learner);
@@ -180,13 +173,13 @@ pub fn learn(
     drop(learner);
     prepared.scale_noise(factor);
     let noise_j = prepared.noise_j;
-    let flashes = Learner::with_model(camera, &prepared.images, noise_j, &model, misfit).mask_flashes();
+    let flashes = Learner::with_model(camera, &every(&prepared.images), noise_j, &model, misfit).mask_flashes();
     prepared.mask_flashes(&flashes);
     let (train, held) = split(&prepared.images);
     let mut learner = Learner::with_model(camera, &train, noise_j, &model, misfit);
 
     // Over the field, as far as the held-out frames say that it helps.
-    let held_fit = |model: &TemplateModel, misfit: f64, images: &[Image]| -> f64 {
+    let held_fit = |model: &TemplateModel, misfit: f64, images: &[&Image]| -> f64 {
         let held = Learner::with_model(camera, images, noise_j, model, misfit);
         held.patches.iter().map(|p| p.chi2).sum()
     };
@@ -213,15 +206,16 @@ pub fn learn(
     let noise_j = prepared.noise_j;
 
     // Pixel maps, from all frames with the shape held fixed.
-    let mut all = Learner::with_model(camera, &prepared.images, noise_j, &model, misfit);
+    let everything = every(&prepared.images);
+    let mut all = Learner::with_model(camera, &everything, noise_j, &model, misfit);
     let odd = all.mask_odd();
     all.fit(6);
     let pixels = pixel_maps::estimate(&all, &odd, &prepared.hot, is_held, BETTER);
     let maps = pixels.maps;
     drop(all);
     let images = match &maps {
-        Some(maps) => prepare::corrected(&prepared.images, maps),
-        None => prepared.images.clone(),
+        Some(maps) => prepare::corrected(prepared.images, maps),
+        None => prepared.images,
     };
     let (train, held) = split(&images);
     if maps.is_some() {
@@ -255,6 +249,7 @@ pub fn learn(
     drop((after, before));
 
     // What is written is learned from all frames.
+    let images = every(&images);
     let mut last = Learner::with_model(camera, &images, noise_j, &model, misfit);
     run(&mut last, LAST_ROUNDS, "all frames");
     let information = statistics::information(&last);
@@ -308,6 +303,23 @@ pub fn learn(
         residuals,
         shape,
     })
+}
+
+fn every(images: &[Image]) -> Vec<&Image> {
+    images.iter().collect()
+}
+
+/// Images to learn from, and those held out.
+fn split(images: &[Image]) -> (Vec<&Image>, Vec<&Image>) {
+    let part = |held: bool| {
+        let images = images.iter().enumerate().filter(|(k, _)| is_held(*k) == held);
+        images.map(|(_, image)| image).collect()
+    };
+    (part(false), part(true))
+}
+
+fn is_held(k: usize) -> bool {
+    k % HELD_OUT == HELD_OUT / 2
 }
 
 const FLASH_PASSES: usize = 3;

@@ -137,15 +137,13 @@ fn middle_image(images: &[Image]) -> Vec<f64> {
 }
 
 /// Corrects images by pixel maps: gain, dark level, bad pixels.
-pub fn corrected(images: &[Image], maps: &PixelMaps) -> Vec<Image> {
-    let one = |image: &Image| {
-        let mut image = image.clone();
+pub fn corrected(mut images: Vec<Image>, maps: &PixelMaps) -> Vec<Image> {
+    for image in &mut images {
         for (p, ((gain, dark), bad)) in maps.gain.iter().zip(&maps.dark_j).zip(&maps.bad).enumerate() {
             image.pixels[p] = (image.pixels[p] - dark) / gain;
             // A pixel of low gain has its noise raised by the division.
             image.weight[p] *= if *bad { 0.0 } else { *gain };
         }
-        image
-    };
-    images.iter().map(one).collect()
+    }
+    images
 }
