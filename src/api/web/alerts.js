@@ -1,7 +1,8 @@
 // The list of alerts: what stands, or all page by page; filtered, sorted, grouped; acknowledged one by one or together.
 
-import { SEVERITIES, clock, el, fact, fullStamp, kindName, lasting, metres, named, shown, stamp } from "./words.js";
+import { SEVERITIES, clock, el, fullStamp, kindName, lasting, metres, named, shown, stamp } from "./words.js";
 import { claimIcon, icon } from "./marks.js";
+import { evidence } from "./evidence.js";
 import { sentences } from "./sentences.js";
 import { Thumbnails } from "./thumbnails.js";
 
@@ -258,7 +259,7 @@ export class Alerts {
           el("ul", { className: "evidence" }, ...told)),
         thumbnail),
       this.acts(alert, error), error,
-      this.details(alert, more, openParts.includes("numbers")));
+      evidence(this.link, alert, more, openParts.includes("numbers")));
     // What is being typed outlives a change of the alert.
     const [note, before] = [node, known?.node].map((n) => n?.querySelector(".note"));
     if (note && before) note.value = before.value;
@@ -319,55 +320,6 @@ export class Alerts {
       }
     });
     return el("details", { className: "approve" }, el("summary", {}, "A known light?"), form);
-  }
-
-  details(alert, more, isOpen) {
-    const rows = Object.entries(alert.evidence ?? {}).map(([k, v]) => fact(k, v));
-    rows.push(["raised", fullStamp(Date.parse(alert.raised_at))], ["from frame", `${alert.source.frame} (${alert.source.kind})`], ["id", alert.id]);
-    if (alert.source.file) rows.push(["file", shown(alert.source.file)]);
-    const table = el("table", {}, el("tbody", {}, ...rows.map(([k, v]) => el("tr", {}, el("td", {}, shown(k)), el("td", {}, el("bdi", {}, v))))));
-    const details = el("details", { open: isOpen, className: "numbers" }, el("summary", {}, "Evidence in full"), more.length ? el("ul", { className: "evidence" }, ...more) : "");
-    if (alert.source.file) details.append(this.fit(alert, details));
-    details.append(table, this.downloads(alert));
-    return details;
-  }
-
-  // The frame, the model and the residual, drawn when the reader opens the details.
-  fit(alert, details) {
-    const image = el("img", { alt: "The frame, the model that explains it, and the residual" });
-    const box = el("figure", { className: "fit", hidden: true }, image, el("figcaption", {}, "Frame, model, residual (blue −5 σ, black 0, orange +5 σ)"));
-    let tries = 3;
-    const load = async () => {
-      if (!details.open || image.src) return;
-      try {
-        const answer = await this.link.request(`/v1/alerts/${encodeURIComponent(alert.id)}/evidence.png?panels=all`);
-        image.src = URL.createObjectURL(await answer.blob());
-        image.onload = () => URL.revokeObjectURL(image.src);
-        box.hidden = false;
-      } catch {
-        // A new alert's recording takes a moment; an old one's may have made way for newer ones.
-        if (--tries > 0) setTimeout(load, 1500);
-      }
-    };
-    details.addEventListener("toggle", load);
-    return box;
-  }
-
-  downloads(alert) {
-    const box = el("p", { className: "downloads" });
-    if (!alert.source.file) return box;
-    for (const [ending, words] of [["npy", "Frames (.npy)"], ["json", "Claims (.json)"]]) {
-      const button = el("button", { type: "button" }, words);
-      button.addEventListener("click", async () => {
-        try {
-          await this.link.save(`/v1/alerts/${encodeURIComponent(alert.id)}/evidence.${ending}`, `${alert.id}.${ending}`);
-        } catch (e) {
-          button.replaceWith(el("span", { className: "quiet" }, e.message));
-        }
-      });
-      box.append(button);
-    }
-    return box;
   }
 
   async table(button) {

@@ -3,6 +3,7 @@
 import { metres, shown, svg } from "./words.js";
 import { place } from "./labels.js";
 import { shape } from "./marks.js";
+import { listen } from "./pointing.js";
 
 // 95 % of a two-dimensional normal distribution lies within this many standard deviations.
 const NINETY_FIVE = Math.sqrt(5.991);
@@ -37,88 +38,7 @@ export class GroundMap {
     this.names = svg("g");
     node.append(this.below, this.back, this.places, this.trails, this.claims, this.marks, this.names, this.handles);
     new ResizeObserver(() => this.redraw()).observe(node);
-    this.listen();
-  }
-
-  listen() {
-    const node = this.node;
-    const pointers = new Map();
-    node.addEventListener("wheel", (e) => {
-      e.preventDefault();
-      this.zoomBy(Math.exp(-e.deltaY * 0.0015), this.place(e));
-    }, { passive: false });
-    let moved = 0;
-    node.addEventListener("pointerdown", (e) => {
-      moved = 0;
-      node.setPointerCapture(e.pointerId);
-      pointers.set(e.pointerId, [e.clientX, e.clientY]);
-      this.held = this.cornerAt(e);
-      node.classList.add("drag");
-    });
-    node.addEventListener("pointermove", (e) => {
-      const before = pointers.get(e.pointerId);
-      if (!before) return;
-      const others = [...pointers].filter(([id]) => id !== e.pointerId).map(([, p]) => p);
-      if (this.held !== null) {
-        moved = 4;
-        this.corners[this.held] = this.place(e).map((v) => +v.toFixed(2));
-      } else if (others.length) {
-        const gap = (p) => Math.hypot(p[0] - others[0][0], p[1] - others[0][1]);
-        const now = [e.clientX, e.clientY];
-        this.zoomBy(gap(now) / Math.max(1, gap(before)), this.place(e));
-      } else {
-        moved += Math.hypot(e.clientX - before[0], e.clientY - before[1]);
-        this.isFollowing = false;
-        this.centre[0] -= (e.clientX - before[0]) / this.scale;
-        this.centre[1] += (e.clientY - before[1]) / this.scale;
-      }
-      pointers.set(e.pointerId, [e.clientX, e.clientY]);
-      this.redraw();
-    });
-    const end = (e) => {
-      pointers.delete(e.pointerId);
-      this.held = null;
-      if (!pointers.size) node.classList.remove("drag");
-    };
-    node.addEventListener("pointerup", (e) => {
-      end(e);
-      if (moved < 4) this.touch(e);
-    });
-    node.addEventListener("pointercancel", end);
-    node.addEventListener("keydown", (e) => {
-      const step = 40 / this.scale;
-      const moves = { ArrowLeft: [-step, 0], ArrowRight: [step, 0], ArrowUp: [0, step], ArrowDown: [0, -step] };
-      if (moves[e.key]) {
-        e.preventDefault();
-        this.isFollowing = false;
-        this.centre[0] += moves[e.key][0];
-        this.centre[1] += moves[e.key][1];
-        this.redraw();
-      }
-    });
-  }
-
-  // A beam or an unseen user was clicked, or the ground beside them; while a zone is drawn, a corner of it.
-  touch(e) {
-    if (!this.scene) return;
-    if (this.corners) {
-      this.corners.push(this.place(e).map((v) => +v.toFixed(2)));
-      this.redraw();
-      return;
-    }
-    const box = this.node.getBoundingClientRect();
-    const at = [e.clientX - box.left, e.clientY - box.top];
-    const claims = new Map(this.scene.claims.map((c) => [c.user, c]));
-    const unseen = this.scene.unseen.flatMap((user) => (claims.has(user) ? [{ key: `u${user}`, x_m: claims.get(user).x_m, y_m: claims.get(user).y_m }] : []));
-    const marks = [...this.scene.emitters.map((b) => ({ key: `b${b.track}`, x_m: b.x_m, y_m: b.y_m })), ...unseen].map((m) => {
-      const [x, y] = this.px([m.x_m, m.y_m]);
-      return { ...m, far: Math.hypot(x - at[0], y - at[1]) };
-    });
-    const near = marks.filter((m) => m.far < 20).sort((a, b) => a.far - b.far)[0];
-    this.pickedKey = near?.key ?? null;
-    this.picked = null;
-    this.on.pick(this.pickedKey);
-    this.redraw();
+    listen(this);
   }
 
   // Zones as GeoJSON features, and known lights.
@@ -137,15 +57,6 @@ export class GroundMap {
   undoCorner() {
     this.corners?.pop();
     this.redraw();
-  }
-
-  // Index of the corner under a pointer.
-  cornerAt(e) {
-    if (!this.corners) return null;
-    const box = this.node.getBoundingClientRect();
-    const far = (c) => Math.hypot(this.px(c)[0] - (e.clientX - box.left), this.px(c)[1] - (e.clientY - box.top));
-    const k = this.corners.findIndex((c) => far(c) < 14);
-    return k < 0 ? null : k;
   }
 
   path(rings) {
