@@ -54,7 +54,9 @@ fn a_cut_and_its_backlog() {
     hub.wait_for("/v1/alerts", "alert", |v| !alerts(v).is_empty());
     let (done, is_over) = (AtomicU64::new(0), AtomicBool::new(false));
     let (backlog, recovered) = std::thread::scope(|scope| {
-        scope.spawn(|| acknowledge(&station, Duration::from_millis(5), &done, &is_over));
+        let (station, done, is_over) = (&station, &done, &is_over);
+        let pause = Duration::from_millis(number("PAUSE_MS", 5));
+        scope.spawn(move || acknowledge(station, pause, done, is_over));
         let port = server.kill();
         let before = done.load(Ordering::Relaxed);
         std::thread::sleep(Duration::from_secs(seconds));
