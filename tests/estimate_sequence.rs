@@ -171,3 +171,47 @@ fn a_clock_that_jumps_ends_the_memory() {
     let mut new = scene.estimator();
     assert_eq!(found, place(&new.estimate(&late).expect("a usable frame")));
 }
+
+#[test]
+fn who_bends_their_way_is_one_emitter() {
+    // A circle of 15 m at 1.1 m/s, and a corner.
+    let walks: [Walk; 2] = [
+        |t| Some([-40.0 + 15.0 * (0.075 * t).cos(), 40.0 + 15.0 * (0.075 * t).sin()]),
+        |t| {
+            Some(if t < 20.0 {
+                [60.0, -60.0 + 1.4 * t]
+            } else {
+                [60.0 - 1.4 * (t - 20.0), -32.0]
+            })
+        },
+    ];
+    let mut scene = Scene::new(1e-3, &walks);
+    let mut together = scene.estimator();
+    let mut extra = 0;
+    for _ in 0..400 {
+        extra += together
+            .estimate(&scene.frame())
+            .expect("a usable frame")
+            .emitters
+            .len()
+            .saturating_sub(2);
+    }
+    // A bend may pass for a newcomer for some frames, but not for good.
+    assert!(extra <= 12, "{extra} emitters too many in 400 frames");
+}
+
+#[test]
+fn nobody_is_born_of_the_noise_of_many_frames() {
+    let mut scene = Scene::new(1e-3, &[]);
+    let mut together = scene.estimator();
+    let counts = (0..1500).map(|_| {
+        together
+            .estimate(&scene.frame())
+            .expect("a usable frame")
+            .emitters
+            .len()
+    });
+    let frames = counts.filter(|count| *count > 0).count();
+    // What a lone frame takes for an emitter, one in a thousand, is dropped within a few.
+    assert!(frames <= 30, "{frames} of 1500 dark frames hold somebody");
+}

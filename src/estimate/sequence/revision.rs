@@ -52,15 +52,21 @@ pub(crate) struct Revision {
 }
 
 impl Revision {
-    /// Of a window, with an emitter more at one of `births`, and, where emitters are not told apart for certain, with one fewer, one
-    /// elsewhere, or all anew; `None` where there is nothing to try.
+    /// Of a window, with an emitter more at one of `births`, without one that may be noise, and, where emitters are not told apart for certain,
+    /// with one elsewhere, or all anew; `None` where there is nothing to try.
     pub fn begin(window: &Window, search: &WindowSearch, births: Vec<[f64; 2]>) -> Option<Self> {
         let mut proposals = VecDeque::from([Proposal::Same]);
         proposals.extend(births.into_iter().map(Proposal::Birth));
-        if is_ambiguous(window) {
+        let is_ambiguous = is_ambiguous(window);
+        if is_ambiguous {
             proposals.push_back(Proposal::Restart);
-            proposals.extend(search.weakest(window).into_iter().map(Proposal::Death));
         }
+        let without = if is_ambiguous {
+            search.weakest(window)
+        } else {
+            search.faint(window)
+        };
+        proposals.extend(without.into_iter().map(Proposal::Death));
         (proposals.len() > 1).then(|| Self {
             base: window.clone(),
             score: f64::INFINITY,

@@ -33,10 +33,12 @@ pub(crate) fn penalty(single: f64, frames: f64) -> f64 {
     frames + 2.0 * frames.sqrt() * root + 2.0 * root * root
 }
 
-/// The penalised −2 ln L of a fitted window; the lower, the better.
+/// The penalised −2 ln L of a fitted window; the lower, the better. Energies are free in the fit: what it gained by light that is negative in the
+/// mean does not count.
 pub(crate) fn score(window: &Window, single: f64) -> f64 {
     let penalties: f64 = window.counts().iter().map(|&k| penalty(single, k)).sum();
-    window.cost - window.dropped * window.len() as f64 + penalties
+    let negative: f64 = mean_light(window).into_iter().map(|z| z.min(0.0).powi(2)).sum();
+    window.cost - window.dropped * window.len() as f64 + penalties + negative
 }
 
 /// A search of one window.
@@ -126,10 +128,20 @@ impl WindowSearch<'_, '_, '_> {
         has_shrunk
     }
 
-    /// Targets that may not be: the farther one of each close pair, and those whose light is little against its errors.
+    /// Targets whose light is little against its errors, or negative, the weakest first.
+    pub fn faint(&self, window: &Window) -> Vec<usize> {
+        let (evidence, mean, counts) = (light(window), mean_light(window), window.counts());
+        let mut faint: Vec<usize> = (0..window.len())
+            .filter(|&e| mean[e] < 0.0 || evidence[e] < 2.0 * penalty(self.penalty, counts[e]))
+            .collect();
+        faint.sort_by(|&a, &b| evidence[a].total_cmp(&evidence[b]));
+        faint
+    }
+
+    /// Targets that may not be: faint ones, and the farther one of each close pair.
     fn doubtful(&self, window: &Window) -> Vec<usize> {
         let evidence = light(window);
-        let counts = window.counts();
+        let faint = self.faint(window);
         let place = |e: usize| [window.state[4 * e], window.state[4 * e + 1]];
         let mut doubtful: Vec<usize> = (0..window.len())
             .filter(|&e| {
@@ -137,7 +149,7 @@ impl WindowSearch<'_, '_, '_> {
                     let (a, b) = (place(e), place(f));
                     f != e && (a[0] - b[0]).hypot(a[1] - b[1]) < OVERLAPPING && (evidence[e], e) <= (evidence[f], f)
                 });
-                is_near || evidence[e] < 2.0 * penalty(self.penalty, counts[e])
+                is_near || faint.contains(&e)
             })
             .collect();
         doubtful.sort_by(|&a, &b| evidence[a].total_cmp(&evidence[b]));
@@ -253,6 +265,22 @@ pub(crate) fn light(window: &Window) -> Vec<f64> {
         }
     }
     evidence
+}
+
+/// The mean energy of each target over the snapshots, in its standard deviations.
+fn mean_light(window: &Window) -> Vec<f64> {
+    let mut sums = vec![(0.0, 0.0); window.len()];
+    for s in &window.snapshots {
+        // A snapshot that was not linearised yet says nothing of its energies.
+        let energies = s.local.energies.iter().zip(&s.local.energy_variances);
+        for (e, (energy, variance)) in window.present(s.time_s).into_iter().zip(energies) {
+            sums[e].0 += energy / variance;
+            sums[e].1 += variance.recip();
+        }
+    }
+    sums.into_iter()
+        .map(|(sum, precision): (f64, f64)| sum / precision.max(f64::MIN_POSITIVE).sqrt())
+        .collect()
 }
 
 /// Targets, those of least light first.

@@ -14,7 +14,7 @@ use crate::estimate::fit::work_budget::WorkBudget;
 use crate::estimate::model::hypothesis::Nuisances;
 use crate::estimate::rules::Rules;
 use crate::estimate::sequence::joint_information::{JointInformation, STATE};
-use crate::estimate::sequence::motion::open;
+use crate::estimate::sequence::motion::{courses, open, surprised};
 use crate::estimate::sequence::report::report;
 use crate::estimate::sequence::residual_map::ResidualSum;
 use crate::estimate::sequence::revision::{Revised, Revision};
@@ -154,24 +154,32 @@ impl SequenceEstimator {
         let is_even = self.single.loaded().1.variance.is_constant();
         if is_even && self.window.len() > 0 {
             let known = self.window.total.clone();
-            if let Some(fresh) = self.explain(known, time_s, scale, &mut budget) {
+            let turned = self.turned(&known, time_s, &mut budget);
+            if turned.is_empty()
+                && let Some(fresh) = self.explain(known, time_s, scale, &mut budget)
+            {
                 self.accept(fresh);
                 return None;
             }
             // The first frames may have been misread; later it is likelier that somebody has turned or stopped: the same with a manoeuvre since
             // the frame before.
-            if self.window.snapshots.len() <= YOUNG && self.search_again(time_s, is_over) {
+            let is_young = self.window.snapshots.len() <= YOUNG;
+            if turned.is_empty() && is_young && self.search_again(time_s, is_over) {
                 return None;
             }
             let unit = 1.0 / self.ground_m();
-            let mut opened = self.window.total.clone();
-            open(&mut opened, elapsed, unit);
-            if let Some(fresh) = self.explain(opened, time_s, scale, &mut budget) {
-                let all = self.window.snapshots.len();
-                self.window.fold(all);
-                open(&mut self.window.prior, elapsed, unit);
-                self.accept(fresh);
-                return None;
+            let everybody: Vec<usize> = (0..self.window.len()).collect();
+            for who in [turned, everybody].into_iter().filter(|who| !who.is_empty()) {
+                let mut opened = self.window.total.clone();
+                open(&mut opened, &who, elapsed, unit);
+                if let Some(fresh) = self.explain(opened, time_s, scale, &mut budget) {
+                    let all = self.window.snapshots.len();
+                    self.window.fold(all);
+                    open(&mut self.window.prior, &who, elapsed, unit);
+                    self.left.clear();
+                    self.accept(fresh);
+                    return None;
+                }
             }
         }
         if is_even && self.window.snapshots.len() > YOUNG && self.search_again(time_s, is_over) {
@@ -200,6 +208,13 @@ impl SequenceEstimator {
         }
         self.accept(alone);
         None
+    }
+
+    /// Targets that the loaded frame shows elsewhere than where they would have come straight on.
+    fn turned(&mut self, known: &JointInformation, time_s: f64, budget: &mut WorkBudget) -> Vec<usize> {
+        let mut fresh = self.fresh(known.clone(), time_s);
+        self.with_search(budget, |_, search| fresh.fit(search.engine, FRAME_STEPS));
+        surprised(known, &fresh.total, &fresh.present(time_s))
     }
 
     /// The newest frame on top of `known`; `None` where that does not explain it. Newcomers need the frame's own word: where it shows alone no
@@ -293,8 +308,10 @@ impl SequenceEstimator {
         is_explained.then_some(fresh)
     }
 
-    /// Ends targets that have gone dark: frames before hold them still.
+    /// Ends targets that have gone dark or left the view: frames before hold them still.
     fn bury(&mut self, elapsed: f64, is_over: &dyn Fn() -> bool) {
+        let (space, _, _) = self.single.loaded();
+        let ends = space.bases.axes().map(|b| b.min_position()..b.max_position());
         let window = &mut self.window;
         let Some(last) = window.snapshots.last() else { return };
         let (time_s, weight) = (last.time_s, (elapsed / COHERENCE_S).clamp(0.0, 1.0));
@@ -302,7 +319,8 @@ impl SequenceEstimator {
         for (i, e) in window.present(time_s).into_iter().enumerate() {
             let target = &mut window.targets[e];
             target.weigh(last.local.energies[i], last.local.energy_variances[i], weight);
-            if target.darkness > DARK {
+            let has_left = (0..2).any(|k| !ends[k].contains(&window.state[STATE * e + k]));
+            if target.darkness > DARK || has_left {
                 target.died_s = time_s;
                 has_died = true;
             }
@@ -385,6 +403,11 @@ impl SequenceEstimator {
     /// Runs `run` on the window, with what a search of the loaded frame's space needs.
     fn with_search<R>(&mut self, budget: &mut WorkBudget, run: impl FnOnce(&mut Window, &mut WindowSearch) -> R) -> R {
         let (space, _, _) = self.single.loaded();
+        let span_s = self
+            .window
+            .snapshots
+            .first()
+            .map_or(0.0, |s| self.window.time_s - s.time_s);
         let mut engine = Engine {
             bases: &space.bases,
             rules: self.rules,
@@ -394,7 +417,7 @@ impl SequenceEstimator {
         let mut search = WindowSearch {
             engine: &mut engine,
             matched_filter: &mut space.matched_filter,
-            penalty: space.source_penalty,
+            penalty: space.source_penalty + 2.0 * courses(self.window.unknown[1].sqrt(), span_s).ln(),
             left: Vec::new(),
         };
         run(&mut self.window, &mut search)
