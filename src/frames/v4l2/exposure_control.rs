@@ -13,12 +13,16 @@ pub struct Brightness {
 pub struct ExposureControl {
     /// As configured, which is also the longest, µs.
     longest_us: f64,
+    /// As far as the device has shown, µs.
+    shortest_us: f64,
     /// That follows the brightest beam, µs: the only one, or the short one of a pair.
     exposure_us: f64,
     /// Whether frames of the longest exposure are taken between those.
     is_pair: bool,
     /// Whether the newest frame's is the longest of a pair.
     is_long: bool,
+    /// The exposure that was last asked for, the longest of a pair apart, µs.
+    asked_us: f64,
     bright: u32,
     dim: u32,
 }
@@ -39,15 +43,19 @@ const STEP: f64 = 2.0;
 const SHORTEST_ALONE: f64 = 0.25;
 /// And the shortest of a pair: a beam may be a thousand times as bright as what the configured exposure bears.
 const SHORTEST: f64 = 1.0 / 1024.0;
+/// A device that grants more than this many times a shorter exposure has no shorter one: rounding to its steps changes less.
+const REFUSED: f64 = 1.2;
 
 impl ExposureControl {
     /// Begins at the configured exposure, which is also the longest.
     pub fn new(configured_us: f64) -> Self {
         Self {
             longest_us: configured_us,
+            shortest_us: SHORTEST * configured_us,
             exposure_us: configured_us,
             is_pair: false,
             is_long: false,
+            asked_us: configured_us,
             bright: 0,
             dim: 0,
         }
@@ -59,19 +67,25 @@ impl ExposureControl {
 
     /// The exposure that the device reports after a change, µs.
     pub fn granted(&mut self, exposure_us: f64) {
-        if !self.is_long {
-            self.exposure_us = exposure_us;
+        if self.is_long {
+            return;
         }
+        if exposure_us > REFUSED * self.asked_us {
+            self.shortest_us = exposure_us;
+        }
+        self.exposure_us = exposure_us;
     }
 
     /// The next exposure, µs, where it has to change after a frame.
     pub fn after(&mut self, frame: Brightness) -> Option<f64> {
         if self.is_long {
             self.is_long = false;
+            self.asked_us = self.exposure_us;
             return Some(self.exposure_us);
         }
         let wanted_us = self.follow(frame);
-        let next_us = wanted_us.unwrap_or(self.exposure_us).max(SHORTEST * self.longest_us);
+        let next_us = wanted_us.unwrap_or(self.exposure_us).max(self.shortest_us);
+        self.asked_us = next_us;
         self.is_pair = next_us < SHORTEST_ALONE * self.longest_us;
         if self.is_pair {
             self.exposure_us = next_us;
@@ -110,6 +124,11 @@ mod tests {
 
     /// Runs the control on a beam of constant power: the exposure of each frame. `power` is the share of saturation at 1 µs.
     fn exposures(power: impl Fn(usize) -> f64, frames: usize, start_us: f64) -> Vec<f64> {
+        exposures_from(0.0, power, frames, start_us)
+    }
+
+    /// The same on a device whose shortest exposure is `shortest_us`.
+    fn exposures_from(shortest_us: f64, power: impl Fn(usize) -> f64, frames: usize, start_us: f64) -> Vec<f64> {
         let mut control = ExposureControl::new(start_us);
         let mut exposure = start_us;
         (0..frames)
@@ -121,8 +140,8 @@ mod tests {
                 };
                 let seen = exposure;
                 if let Some(next) = control.after(frame) {
-                    exposure = next;
-                    control.granted(next);
+                    exposure = next.max(shortest_us);
+                    control.granted(exposure);
                 }
                 seen
             })
@@ -163,6 +182,14 @@ mod tests {
         let found = exposures(|_| 1e6, 300, 1600.0);
         assert_eq!(found.iter().copied().fold(f64::INFINITY, f64::min), 1600.0 / 1024.0);
         assert!(found[200..].contains(&1600.0));
+    }
+
+    #[test]
+    fn a_device_without_short_exposures_keeps_to_its_shortest() {
+        for shortest in [480.0, 700.0] {
+            let found = exposures_from(shortest, |_| 40.0 / 1600.0, 300, 1600.0);
+            assert!(found[20..].iter().all(|e| *e == shortest), "{:?}", &found[20..40]);
+        }
     }
 
     #[test]
