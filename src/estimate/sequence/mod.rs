@@ -10,6 +10,7 @@ mod motion;
 mod report;
 mod residual_map;
 mod revision;
+mod revision_schedule;
 mod search;
 mod sequence_estimator;
 mod snapshot;

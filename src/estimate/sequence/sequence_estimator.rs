@@ -17,7 +17,7 @@ use crate::estimate::sequence::joint_information::{JointInformation, STATE};
 use crate::estimate::sequence::motion::{courses, open, surprised};
 use crate::estimate::sequence::report::report;
 use crate::estimate::sequence::residual_map::ResidualSum;
-use crate::estimate::sequence::revision::{Revised, Revision};
+use crate::estimate::sequence::revision_schedule::{RevisionSchedule, YOUNG};
 use crate::estimate::sequence::search::{WindowSearch, unconfirmed};
 use crate::estimate::sequence::snapshot::{Engine, LocalQuadratic, Snapshot};
 use crate::estimate::sequence::target::Target;
@@ -37,16 +37,8 @@ const FRAME_STEPS: usize = 12;
 const WINDOW_STEPS: usize = 30;
 /// Snapshots that are linearised anew with a frame: more follow a change sooner, each costs as much as a step of the frame's own fit.
 const REFRESHED: usize = 8;
-/// A search of the window begins when it has grown by this factor since the last, and at the latest after this many frames.
-const SEARCH_GROWTH: f64 = 1.4;
-const SEARCH_AFTER: usize = 32;
 /// Work of a search that has to end with its frame, in frames' searches: where what is remembered explains nothing.
 const SEARCH_WORK: f64 = 0.5;
-/// Work of a search that goes on from frame to frame, a frame: less finds emitters later, more makes frames slower. A window that is shorter
-/// than `SEARCH_AFTER` by some factor is given more by that factor, up to `YOUNG`: it is the first frames that make the number right.
-const REVISION_WORK: f64 = 0.06;
-/// Frames up to which what is remembered is likelier wrong than that somebody has turned.
-const YOUNG: usize = 8;
 
 /// An estimator that remembers.
 pub(crate) struct SequenceEstimator {
@@ -59,10 +51,7 @@ pub(crate) struct SequenceEstimator {
     window: Window,
     /// What frames have left unexplained since the number of emitters changed.
     left: ResidualSum,
-    /// The search in progress; frames since it began, and the window's length then.
-    revision: Option<Revision>,
-    since_search: usize,
-    searched: usize,
+    schedule: RevisionSchedule,
     /// Gap after which nothing is remembered, s.
     memory_s: f64,
 }
@@ -83,9 +72,7 @@ impl SequenceEstimator {
             epoch: None,
             window: Window::default(),
             left: ResidualSum::default(),
-            revision: None,
-            since_search: 0,
-            searched: 0,
+            schedule: RevisionSchedule::default(),
             memory_s,
         }
     }
@@ -102,9 +89,7 @@ impl SequenceEstimator {
             ..Window::default()
         };
         self.left.clear();
-        self.revision = None;
-        self.since_search = 0;
-        self.searched = 0;
+        self.schedule = RevisionSchedule::default();
     }
 }
 
@@ -359,43 +344,17 @@ impl SequenceEstimator {
 
     /// Searches the window for another number of emitters: begins when it has grown, and goes on with each frame for a share of its time.
     fn revise(&mut self, is_over: &dyn Fn() -> bool) {
-        let length = self.window.snapshots.len();
-        self.since_search += 1;
-        let is_due = self.since_search >= SEARCH_AFTER || length as f64 >= SEARCH_GROWTH * self.searched as f64;
-        let revision = self.revision.take().filter(|r| r.is_of(&self.window));
-        let begins = revision.is_none();
-        if begins && (length < 2 || !is_due) {
+        if !self.schedule.is_due(&self.window) {
             return;
         }
-        if begins {
-            (self.since_search, self.searched) = (0, length);
-        }
-        let left = std::mem::take(&mut self.left);
+        let (mut schedule, left) = (std::mem::take(&mut self.schedule), std::mem::take(&mut self.left));
         let memory_s = self.memory_s;
-        let youth = SEARCH_AFTER as f64 / length.max(1) as f64;
-        let work = REVISION_WORK * youth.clamp(1.0, YOUNG as f64);
-        let mut budget = WorkBudget::of_frames(work, is_over);
-        let (revision, has_changed) = self.with_search(&mut budget, |window, search| {
-            let revision = revision.or_else(|| Revision::begin(window, search, search.births(window, &left)));
-            let Some(mut revision) = revision else {
-                return (None, false);
-            };
-            match revision.advance(search) {
-                Revised::Finished => (None, false),
-                Revised::Unfinished => (Some(revision), false),
-                Revised::Better(mut better) => {
-                    let newer = window.snapshots.iter().filter(|s| s.time_s > revision.time_s());
-                    let newer: Vec<Snapshot> = newer.cloned().collect();
-                    better.catch_up(search.engine, &newer, memory_s);
-                    *window = *better;
-                    (None, true)
-                }
-            }
+        let mut budget = WorkBudget::of_frames(RevisionSchedule::work(&self.window), is_over);
+        let has_changed = self.with_search(&mut budget, |window, search| {
+            schedule.advance(window, search, &left, memory_s)
         });
-        self.revision = revision;
-        if has_changed {
-            self.searched = 0;
-        } else {
+        self.schedule = schedule;
+        if !has_changed {
             self.left = left;
         }
     }
