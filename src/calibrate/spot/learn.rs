@@ -151,7 +151,7 @@ impl<'a> Learner<'a> {
         self.patches = sources
             .into_par_iter()
             .enumerate()
-            .flat_map_iter(|(k, sources)| grouping::patches(camera, k, &images[k], sources, radius))
+            .flat_map_iter(|(k, sources)| grouping::patches(camera, k, images[k], sources, radius))
             .collect();
     }
 
