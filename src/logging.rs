@@ -3,7 +3,7 @@
 use std::io::IsTerminal;
 
 use serde::{Deserialize, Serialize};
-use tracing_subscriber::filter::Targets;
+use tracing_subscriber::filter::{LevelFilter, Targets};
 use tracing_subscriber::layer::SubscriberExt;
 use tracing_subscriber::util::SubscriberInitExt;
 use tracing_subscriber::{Layer, Registry, reload};
@@ -38,6 +38,9 @@ pub enum Error {
 /// The levels, from nothing to everything.
 const LEVELS: [&str; 6] = ["off", "error", "warn", "info", "debug", "trace"];
 
+/// The target of the NATS client's own events.
+const NATS_CLIENT: &str = "async_nats";
+
 /// Changes the level of a running daemon.
 #[derive(Clone)]
 pub struct Handle(reload::Handle<Targets, Registry>);
@@ -63,9 +66,15 @@ impl Config {
                 found: found.to_owned(),
             });
         }
-        self.level.parse().map_err(|source| Error::Filter {
+        let filter: Targets = self.level.parse().map_err(|source| Error::Filter {
             level: self.level.clone(),
             source,
+        })?;
+        // Every attempt to reach a server that is gone would be a line: `fleet` says when it is gone, and when it is back.
+        let is_talkative = filter.default_level() == Some(LevelFilter::INFO) && !self.level.contains(NATS_CLIENT);
+        Ok(match is_talkative {
+            true => filter.with_target(NATS_CLIENT, LevelFilter::WARN),
+            false => filter,
         })
     }
 }
@@ -138,5 +147,20 @@ mod tests {
             let error = filter(bad).expect_err(bad).to_string();
             assert!(error.starts_with("log.level: expected"), "{error}");
         }
+    }
+
+    #[test]
+    fn the_nats_client_speaks_where_it_is_asked_to() {
+        let says = |level: &str| {
+            let config = Config {
+                level: level.to_owned(),
+            };
+            config
+                .filter()
+                .unwrap()
+                .would_enable(NATS_CLIENT, &tracing::Level::INFO)
+        };
+        assert!(!says("info") && !says("warn") && !says("off") && !says("info,oapwatch::frames=debug"));
+        assert!(says("debug") && says("info,async_nats=info"));
     }
 }

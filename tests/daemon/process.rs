@@ -5,6 +5,7 @@ use std::net::{TcpListener, TcpStream};
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::sync::{Arc, Mutex};
+use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use serde_json::Value;
@@ -13,6 +14,8 @@ use serde_json::Value;
 pub struct Daemon {
     child: Child,
     url: String,
+    /// Reads the log as it is written: a pipe that is full stops who writes to it.
+    log: JoinHandle<Vec<String>>,
 }
 
 impl Daemon {
@@ -27,15 +30,17 @@ impl Daemon {
         std::fs::write(&file, config).unwrap();
         // Figures are to be of the program as it is shipped, whatever the test was built as.
         let program = std::env::var_os("OAPWATCH_PROGRAM").unwrap_or_else(|| env!("CARGO_BIN_EXE_oapwatch").into());
-        let child = Command::new(program)
+        let mut child = Command::new(program)
             .args([command, "--config"])
             .arg(&file)
             .args(["--listen", &format!("127.0.0.1:{port}")])
             .stderr(Stdio::piped())
             .spawn()
             .unwrap();
+        let stderr = BufReader::new(child.stderr.take().unwrap());
+        let log = std::thread::spawn(move || stderr.lines().map_while(Result::ok).collect());
         let url = format!("http://127.0.0.1:{port}");
-        Self { child, url }
+        Self { child, url, log }
     }
 
     /// Asks until `accept` takes the answer; fails after 20 s.
@@ -124,9 +129,9 @@ impl Daemon {
 
     /// Waits for the end; gives the exit code and the log.
     pub fn end(mut self) -> (Option<i32>, Vec<String>) {
-        let stderr = BufReader::new(self.child.stderr.take().unwrap());
-        let log = stderr.lines().map_while(Result::ok).collect();
-        (self.child.wait().unwrap().code(), log)
+        let code = self.child.wait().unwrap().code();
+        let log = std::mem::replace(&mut self.log, std::thread::spawn(Vec::new));
+        (code, log.join().unwrap())
     }
 }
 
