@@ -212,6 +212,6 @@ fn nobody_is_born_of_the_noise_of_many_frames() {
             .len()
     });
     let frames = counts.filter(|count| *count > 0).count();
-    // What a lone frame takes for an emitter, one in a thousand, is dropped within a few.
-    assert!(frames <= 30, "{frames} of 1500 dark frames hold somebody");
+    // What a lone frame takes for an emitter, one in a thousand, is dropped within some twenty.
+    assert!(frames <= 75, "{frames} of 1500 dark frames hold somebody");
 }

@@ -9,6 +9,7 @@ use super::config::{Config, Source};
 use super::input::claim_state::ActiveClaim;
 use super::input::claim_timing::ClaimTiming;
 use super::input::crowding::Crowding;
+use super::input::overload::Overload;
 use super::input::sensor_health::SensorHealth;
 use super::known_lights::{KnownLight, KnownLights, LightError, Request};
 use super::light_history::LightHistory;
@@ -28,7 +29,7 @@ use super::track::registration::register;
 use super::track::tracker::Tracker;
 use super::track::user_tracks::UserTracks;
 use super::zones::ZoneMap;
-use crate::claims::{Squeeze, seconds};
+use crate::claims::seconds;
 use crate::geo::{LocalAxes, View};
 use crate::optics::Camera;
 
@@ -48,15 +49,6 @@ const MAX_SCORE: f64 = 1.5;
 /// Time since a user was last seen, beside any blindness, within which they count as visible, s. Longer takes users who have left
 /// for a lost sensor, shorter forgets those whom a few frames missed. Not measured.
 const VISIBLE_S: f64 = 2.0;
-/// Claims that found no room or time, lately, and the room there is.
-#[derive(Clone, Copy, Debug, Default)]
-pub(super) struct Overload {
-    pub squeezed: Squeeze,
-    /// Claims that bear on the view and that the frame had no time for.
-    pub left_out: usize,
-    pub users: usize,
-    pub max_users: usize,
-}
 
 /// Largest score of a track.
 fn max_score(budget: &ErrorBudget) -> f64 {

@@ -272,8 +272,7 @@ impl FrameSearch {
                 let initial = initial_hypothesis(&mut search);
                 if self.spot_error.is_some_and(|e| e > 0.0) && search.context.bases.are_pixels() {
                     // The search with the spot error is the only one.
-                    let initial = without_insignificant(&mut search, initial);
-                    return Found::of(initial, SearchKind::Main);
+                    return Found::of(without_insignificant(&mut search, initial), SearchKind::Main);
                 }
                 let is_explained = self.compressed.is_explained_by(&initial);
                 let by_pencil = if is_explained {

@@ -7,7 +7,8 @@ use crate::claims::{WINDOW_S, seconds};
 use crate::monitor::alert::{AlertKind, Severity};
 use crate::monitor::evidence::claimed;
 use crate::monitor::finding::{Cause, Content, Finding};
-use crate::monitor::frame_context::{FrameContext, Overload};
+use crate::monitor::frame_context::FrameContext;
+use crate::monitor::input::overload::Overload;
 
 /// Claim periods for which the whole log may be quiet, where they are longer than `claims_stale_s`.
 const QUIET_PERIODS: f64 = 5.0;
