@@ -22,6 +22,13 @@ pub(crate) struct AmplitudeSystem {
     values: Vec<f64>,
 }
 
+impl AmplitudeSystem {
+    /// Which components of the last solution are not fixed at their bound.
+    pub fn is_free(&self) -> &[bool] {
+        &self.is_free
+    }
+}
+
 /// Solves the amplitudes of a model; sources that fall below the bound are fixed at it.
 #[inline(always)]
 pub(crate) fn solve_amplitudes(

@@ -43,12 +43,18 @@ pub(crate) fn report(
             budget: &mut budget,
             workspace: &mut space.workspace,
         };
-        let local = LocalQuadratic::new(&mut engine, compressed, Nuisances::default(), positions.clone());
+        let local = LocalQuadratic::new(
+            &mut engine,
+            compressed,
+            window.energies,
+            Nuisances::default(),
+            positions.clone(),
+        );
         if let Some(information) = own.cholesky().map(|c| c.inverse()) {
             known = information - local.information;
         }
     }
-    let mut hypothesis = hypothesis(&positions, Nuisances::default());
+    let mut hypothesis = hypothesis(&positions, window.energies, Nuisances::default());
     hypothesis.converged = true;
     let mut context = FitContext {
         bases: &space.bases,

@@ -4,7 +4,7 @@ use nalgebra::DMatrix;
 
 use crate::estimate::detect::matched_filter::MatchedFilter;
 use crate::estimate::model::bases::Bases;
-use crate::estimate::sequence::snapshot::{Engine, Snapshot, residual};
+use crate::estimate::sequence::snapshot::{Energies, Engine, Snapshot, residual};
 use crate::estimate::sequence::window::Window;
 
 /// Least share of a spot that lies outside the emitters' span for a birth there: nearer, it is the same emitter.
@@ -42,16 +42,20 @@ impl UnitSpot {
     }
 }
 
-/// What the residuals of all frames leave for one more emitter at each point of the matched filter's grid, Σ (fᵀr)²/‖P⊥f‖².
+/// What the residuals of all frames leave for one more emitter at each point of the matched filter's grid, Σ (fᵀr)²/‖P⊥f‖²; what it
+/// would be below zero counts as nothing.
 pub(crate) fn residual_map(engine: &mut Engine, filter: &mut MatchedFilter, window: &Window) -> Vec<f64> {
     let mut sum: Vec<f64> = Vec::new();
     for s in &window.snapshots {
         let positions = window.positions(&window.state, s.time_s);
-        let (left, _) = residual(engine, &s.compressed, s.nuisances, &positions);
+        let (left, _) = residual(engine, &s.compressed, window.energies, s.nuisances, &positions);
         filter.respond(left, s.compressed.mx, s.compressed.my);
         sum.resize(filter.map().len(), 0.0);
         for (total, v) in sum.iter_mut().zip(filter.map()) {
-            *total += v * v;
+            *total += match window.energies {
+                Energies::NonNegative => v.max(0.0).powi(2),
+                Energies::Signed => v * v,
+            };
         }
     }
     if let Some(last) = window.snapshots.last() {

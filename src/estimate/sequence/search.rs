@@ -5,7 +5,7 @@ use crate::estimate::detect::matched_filter::MatchedFilter;
 use crate::estimate::model::hypothesis::{Nuisances, OVERLAPPING};
 use crate::estimate::sequence::joint_information::STATE;
 use crate::estimate::sequence::residual_map::{ResidualSum, peaks, residual_map};
-use crate::estimate::sequence::snapshot::{Engine, LocalQuadratic, Snapshot};
+use crate::estimate::sequence::snapshot::{Energies, Engine, LocalQuadratic, Snapshot};
 use crate::estimate::sequence::subspace::Subspace;
 use crate::estimate::sequence::target::Target;
 use crate::estimate::sequence::window::Window;
@@ -33,12 +33,16 @@ pub(crate) fn penalty(single: f64, frames: f64) -> f64 {
     frames + 2.0 * frames.sqrt() * root + 2.0 * root * root
 }
 
-/// The penalised −2 ln L of a fitted window; the lower, the better. Energies are free in the fit: what it gained by light that is negative in the
-/// mean does not count.
+/// The penalised −2 ln L of a fitted window; the lower, the better. A target pays for the frames that it lights.
 pub(crate) fn score(window: &Window, single: f64) -> f64 {
-    let penalties: f64 = window.counts().iter().map(|&k| penalty(single, k)).sum();
-    let negative: f64 = mean_light(window).into_iter().map(|z| z.min(0.0).powi(2)).sum();
-    window.cost - window.dropped * window.len() as f64 + penalties + negative
+    let penalties = window.lit().into_iter().map(|k| penalty(single, k));
+    window.cost - window.dropped * window.len() as f64 + penalties.sum::<f64>()
+}
+
+/// The height of a residual map from which a peak is tried: its noise, and this share of what a source must bring beyond it.
+fn beyond_noise(single: f64, frames: f64, energies: Energies, share: f64) -> f64 {
+    let lit = energies.lit_by_noise() * frames;
+    lit + share * (penalty(single, lit) - lit)
 }
 
 /// A search of one window.
@@ -64,7 +68,7 @@ impl WindowSearch<'_, '_, '_> {
 
     /// Where the frames together show light that none shows alone.
     pub fn births(&self, window: &Window, left: &ResidualSum) -> Vec<[f64; 2]> {
-        let beyond = |share: f64| left.frames + share * (penalty(self.penalty, left.frames) - left.frames);
+        let beyond = |share: f64| beyond_noise(self.penalty, left.frames, window.energies, share);
         let positions = window.positions(&window.state, window.time_s);
         let is_near = |at: [f64; 2]| {
             let mut others = positions.as_slice().chunks_exact(2);
@@ -86,7 +90,7 @@ impl WindowSearch<'_, '_, '_> {
                 break;
             }
             let frames = window.snapshots.iter().filter(|s| s.time_s >= born_s).count() as f64;
-            let least = frames + TRIED * (penalty(self.penalty, frames) - frames);
+            let least = beyond_noise(self.penalty, frames, window.energies, TRIED);
             let peaks = self.residual_peaks(window, least);
             let before = self.score(window);
             let mut best: Option<Window> = None;
@@ -130,9 +134,9 @@ impl WindowSearch<'_, '_, '_> {
 
     /// Targets whose light is little against its errors, or negative, the weakest first.
     pub fn faint(&self, window: &Window) -> Vec<usize> {
-        let (evidence, mean, counts) = (light(window), mean_light(window), window.counts());
+        let (evidence, lit) = (evidence(window), window.lit());
         let mut faint: Vec<usize> = (0..window.len())
-            .filter(|&e| mean[e] < 0.0 || evidence[e] < 2.0 * penalty(self.penalty, counts[e]))
+            .filter(|&e| evidence[e] < 2.0 * penalty(self.penalty, lit[e]))
             .collect();
         faint.sort_by(|&a, &b| evidence[a].total_cmp(&evidence[b]));
         faint
@@ -140,7 +144,7 @@ impl WindowSearch<'_, '_, '_> {
 
     /// Targets that may not be: faint ones, and the farther one of each close pair.
     fn doubtful(&self, window: &Window) -> Vec<usize> {
-        let evidence = light(window);
+        let evidence = evidence(window);
         let faint = self.faint(window);
         let place = |e: usize| [window.state[4 * e], window.state[4 * e + 1]];
         let mut doubtful: Vec<usize> = (0..window.len())
@@ -223,6 +227,7 @@ impl WindowSearch<'_, '_, '_> {
                 .collect(),
             dropped: subspace.dropped as f64,
             unknown: window.unknown,
+            energies: Energies::Signed,
             ..Window::default()
         };
         let mut best: Option<Window> = None;
@@ -257,35 +262,21 @@ impl WindowSearch<'_, '_, '_> {
 }
 
 /// Σ a²/var(a) of each target over the snapshots: what its light weighs against its errors.
-pub(crate) fn light(window: &Window) -> Vec<f64> {
+fn evidence(window: &Window) -> Vec<f64> {
     let mut evidence = vec![0.0; window.len()];
     for s in &window.snapshots {
-        for (i, e) in window.present(s.time_s).into_iter().enumerate() {
-            evidence[e] += s.local.energies[i].powi(2) / s.local.energy_variances[i];
+        // A snapshot that was not linearised yet says nothing of its energies.
+        let energies = s.local.energies.iter().zip(&s.local.energy_variances);
+        for (e, (energy, variance)) in window.present(s.time_s).into_iter().zip(energies) {
+            evidence[e] += energy * energy / variance;
         }
     }
     evidence
 }
 
-/// The mean energy of each target over the snapshots, in its standard deviations.
-fn mean_light(window: &Window) -> Vec<f64> {
-    let mut sums = vec![(0.0, 0.0); window.len()];
-    for s in &window.snapshots {
-        // A snapshot that was not linearised yet says nothing of its energies.
-        let energies = s.local.energies.iter().zip(&s.local.energy_variances);
-        for (e, (energy, variance)) in window.present(s.time_s).into_iter().zip(energies) {
-            sums[e].0 += energy / variance;
-            sums[e].1 += variance.recip();
-        }
-    }
-    sums.into_iter()
-        .map(|(sum, precision): (f64, f64)| sum / precision.max(f64::MIN_POSITIVE).sqrt())
-        .collect()
-}
-
 /// Targets, those of least light first.
 fn by_light(window: &Window) -> Vec<usize> {
-    let evidence = light(window);
+    let evidence = evidence(window);
     let mut order: Vec<usize> = (0..window.len()).collect();
     order.sort_by(|&a, &b| evidence[a].total_cmp(&evidence[b]));
     order
@@ -297,10 +288,10 @@ pub(crate) fn unconfirmed(window: &Window, single: f64) -> Vec<usize> {
     let Some(first) = window.snapshots.first() else {
         return Vec::new();
     };
-    let (evidence, counts) = (light(window), window.counts());
+    let (evidence, lit) = (evidence(window), window.lit());
     let is_young = |e: &usize| window.targets[*e].born_s >= first.time_s && window.targets[*e].is_in(window.time_s);
     let targets = (0..window.len()).rev().filter(is_young);
-    targets.filter(|&e| evidence[e] < penalty(single, counts[e])).collect()
+    targets.filter(|&e| evidence[e] < penalty(single, lit[e])).collect()
 }
 
 /// Whether a pair of emitters is not told apart for certain.

@@ -14,7 +14,7 @@ use crate::estimate::fit::work_budget::WorkBudget;
 use crate::estimate::model::hypothesis::Nuisances;
 use crate::estimate::rules::Rules;
 use crate::estimate::sequence::joint_information::{JointInformation, STATE};
-use crate::estimate::sequence::motion::{courses, open, surprised};
+use crate::estimate::sequence::motion::{Straying, courses, open, surprised};
 use crate::estimate::sequence::report::report;
 use crate::estimate::sequence::residual_map::ResidualSum;
 use crate::estimate::sequence::revision_schedule::{RevisionSchedule, YOUNG};
@@ -139,9 +139,11 @@ impl SequenceEstimator {
         let is_even = self.single.loaded().1.variance.is_constant();
         if is_even && self.window.len() > 0 {
             let known = self.window.total.clone();
-            let turned = self.turned(&known, time_s, &mut budget);
+            let fresh = self.fresh(known.clone(), time_s);
+            let mut fresh = self.fit(fresh, &mut budget);
+            let turned = surprised(&known, &mut fresh);
             if turned.is_empty()
-                && let Some(fresh) = self.explain(known, time_s, scale, &mut budget)
+                && let Some(fresh) = self.explain(fresh, scale, &mut budget)
             {
                 self.accept(fresh);
                 return None;
@@ -157,7 +159,11 @@ impl SequenceEstimator {
             for who in [turned, everybody].into_iter().filter(|who| !who.is_empty()) {
                 let mut opened = self.window.total.clone();
                 open(&mut opened, &who, elapsed, unit);
-                if let Some(fresh) = self.explain(opened, time_s, scale, &mut budget) {
+                let mut fresh = self.fresh(opened, time_s);
+                who.iter()
+                    .for_each(|&e| fresh.targets[e].straying = Straying::default());
+                let fresh = self.fit(fresh, &mut budget);
+                if let Some(fresh) = self.explain(fresh, scale, &mut budget) {
                     let all = self.window.snapshots.len();
                     self.window.fold(all);
                     open(&mut self.window.prior, &who, elapsed, unit);
@@ -182,7 +188,8 @@ impl SequenceEstimator {
             alone.insert(Target::born(time_s), at, [0.0; 2]);
         }
         let fitted = if is_even {
-            self.fit_fresh(alone, true, &mut budget)
+            let alone = self.fit(alone, &mut budget);
+            self.with_newcomers(alone, &mut budget)
         } else {
             None
         };
@@ -195,30 +202,19 @@ impl SequenceEstimator {
         None
     }
 
-    /// Targets that the loaded frame shows elsewhere than where they would have come straight on.
-    fn turned(&mut self, known: &JointInformation, time_s: f64, budget: &mut WorkBudget) -> Vec<usize> {
-        let mut fresh = self.fresh(known.clone(), time_s);
-        self.with_search(budget, |_, search| fresh.fit(search.engine, FRAME_STEPS));
-        surprised(known, &fresh.total, &fresh.present(time_s))
-    }
-
-    /// The newest frame on top of `known`; `None` where that does not explain it. Newcomers need the frame's own word: where it shows alone no
+    /// The fitted newest frame with newcomers; `None` where that does not explain it. They need the frame's own word: where it shows alone no
     /// fewer emitters than are known, but fewer than with them, there are none.
-    fn explain(&mut self, known: JointInformation, time_s: f64, scale: f64, budget: &mut WorkBudget) -> Option<Window> {
-        let plain = self.fresh(known, time_s);
-        let before = plain.present(time_s).len();
-        let grown = self.fit_fresh(plain.clone(), true, budget)?;
-        let after = grown.present(time_s).len();
+    fn explain(&mut self, fresh: Window, scale: f64, budget: &mut WorkBudget) -> Option<Window> {
+        let before = fresh.present(fresh.time_s).len();
+        let grown = self.with_newcomers(fresh.clone(), budget)?;
+        let after = grown.present(grown.time_s).len();
         if after == before {
             return Some(grown);
         }
         let found = self.single.estimate_loaded(scale, &|| budget.is_exhausted());
-        let alone = found.emitters.len();
-        if (before..after).contains(&alone) {
-            self.fit_fresh(plain, false, budget)
-        } else {
-            Some(grown)
-        }
+        let has_newcomers = !(before..after).contains(&found.emitters.len());
+        let fresh = if has_newcomers { grown } else { fresh };
+        fresh.is_last_explained().then_some(fresh)
     }
 
     /// Searches the frames of the window together with the loaded one, as what is remembered may be wrong. Whether that explains it.
@@ -276,18 +272,23 @@ impl SequenceEstimator {
         window.snapshots.append(&mut fresh.snapshots);
     }
 
-    /// Fits the newest frame to what is remembered, with newcomers where they are `allowed`; `None` where that does not explain it.
-    fn fit_fresh(&mut self, mut fresh: Window, allowed: bool, budget: &mut WorkBudget) -> Option<Window> {
+    /// Fits the newest frame to what is remembered.
+    fn fit(&mut self, mut fresh: Window, budget: &mut WorkBudget) -> Window {
+        self.with_search(budget, |_, search| fresh.fit(search.engine, FRAME_STEPS));
+        fresh
+    }
+
+    /// The fitted newest frame with all newcomers that it shows; `None` where that does not explain it.
+    fn with_newcomers(&mut self, mut fresh: Window, budget: &mut WorkBudget) -> Option<Window> {
         let time_s = fresh.time_s;
         let (has_grown, left) = self.with_search(budget, |_, search| {
-            fresh.fit(search.engine, FRAME_STEPS);
-            let has_grown = allowed && search.grow(&mut fresh, time_s);
+            let has_grown = search.grow(&mut fresh, time_s);
             (has_grown, std::mem::take(&mut search.left))
         });
         let is_explained = fresh.is_last_explained();
         if has_grown {
             self.left.clear();
-        } else if is_explained && allowed {
+        } else if is_explained {
             self.left.add(&left, MAX_SNAPSHOTS as f64);
         }
         is_explained.then_some(fresh)
@@ -367,6 +368,9 @@ impl SequenceEstimator {
             .snapshots
             .first()
             .map_or(0.0, |s| self.window.time_s - s.time_s);
+        let courses = courses(self.window.unknown[1].sqrt(), span_s);
+        // What many frames take for an emitter stays as long as they do.
+        let frames = self.window.snapshots.len().max(1) as f64;
         let mut engine = Engine {
             bases: &space.bases,
             rules: self.rules,
@@ -376,7 +380,7 @@ impl SequenceEstimator {
         let mut search = WindowSearch {
             engine: &mut engine,
             matched_filter: &mut space.matched_filter,
-            penalty: space.source_penalty + 2.0 * courses(self.window.unknown[1].sqrt(), span_s).ln(),
+            penalty: space.source_penalty + 2.0 * (courses * frames).ln(),
             left: Vec::new(),
         };
         run(&mut self.window, &mut search)

@@ -25,6 +25,26 @@ pub(crate) struct Engine<'a, 'b> {
     pub workspace: &'a mut Workspace,
 }
 
+/// What the energies of emitters may be in the snapshots of a window.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(crate) enum Energies {
+    /// Light: frames.
+    #[default]
+    NonNegative,
+    /// Sums of light with signs: the principal components of frames.
+    Signed,
+}
+
+impl Energies {
+    /// Share of the snapshots in which noise lights an emitter that is none.
+    pub fn lit_by_noise(self) -> f64 {
+        match self {
+            Self::NonNegative => 0.5,
+            Self::Signed => 1.0,
+        }
+    }
+}
+
 /// A frame that the window holds.
 #[derive(Clone)]
 pub(crate) struct Snapshot {
@@ -45,14 +65,16 @@ pub(crate) struct LocalQuadratic {
     pub gradient: DVector<f64>,
     pub information: DMatrix<f64>,
     pub energies: Vec<f64>,
-    /// Variances of the energies where the positions are known.
+    /// Variances of the energies where the positions are known, were all of them free.
     pub energy_variances: Vec<f64>,
+    /// Which energies are not at zero, where they may not be below it.
+    pub is_lit: Vec<bool>,
 }
 
-/// Sources at `positions` with signed energies.
-pub(crate) fn hypothesis(positions: &DVector<f64>, nuisances: Nuisances) -> Hypothesis {
+/// Sources at `positions`.
+pub(crate) fn hypothesis(positions: &DVector<f64>, energies: Energies, nuisances: Nuisances) -> Hypothesis {
     let mut hypothesis = Hypothesis::empty(nuisances);
-    hypothesis.has_signed_energies = true;
+    hypothesis.has_signed_energies = energies == Energies::Signed;
     let sources = positions.as_slice().chunks_exact(2);
     hypothesis
         .sources
@@ -65,10 +87,11 @@ impl LocalQuadratic {
     pub fn new(
         engine: &mut Engine,
         compressed: &CompressedFrame,
+        energies: Energies,
         nuisances: Nuisances,
         positions: DVector<f64>,
     ) -> Self {
-        let mut hypothesis = hypothesis(&positions, nuisances);
+        let mut hypothesis = hypothesis(&positions, energies, nuisances);
         let problem = Problem {
             bases: engine.bases,
             compressed,
@@ -81,26 +104,40 @@ impl LocalQuadratic {
         let position = |k: usize| 3 * (k / 2) + k % 2;
         let energy = |k: usize| if k < n { 3 * k + 2 } else { 2 * n + k };
         let entry = |a: usize, b: usize| h[a.min(b) * p + a.max(b)];
-        let mut inner = DMatrix::from_fn(linear, linear, |r, c| entry(energy(r), energy(c)));
-        for k in 0..linear {
-            inner[(k, k)] *= 1.0 + RIDGE;
-            inner[(k, k)] += 1e-300;
-        }
-        let cross = DMatrix::from_fn(linear, 2 * n, |r, c| entry(energy(r), position(c)));
+        let factor = |of: &[usize]| {
+            let mut inner = DMatrix::from_fn(of.len(), of.len(), |r, c| entry(energy(of[r]), energy(of[c])));
+            for k in 0..of.len() {
+                inner[(k, k)] *= 1.0 + RIDGE;
+                inner[(k, k)] += 1e-300;
+            }
+            Cholesky::new(inner)
+        };
+        let all: Vec<usize> = (0..linear).collect();
+        let is_free = at.scratch.amplitudes.is_free();
+        let free: Vec<usize> = all.iter().copied().filter(|&k| is_free[k]).collect();
         let mut information = DMatrix::from_fn(2 * n, 2 * n, |r, c| entry(position(r), position(c)));
         let mut energy_variances = vec![f64::INFINITY; n];
-        if let Some(factor) = Cholesky::new(inner) {
-            let weights = factor.solve(&cross);
-            information -= cross.transpose() * weights;
+        if let Some(factor) = factor(&free) {
+            let cross = DMatrix::from_fn(free.len(), 2 * n, |r, c| entry(energy(free[r]), position(c)));
+            information -= cross.transpose() * factor.solve(&cross);
+        }
+        if let Some(factor) = factor(&all) {
             let inverse = factor.inverse();
             energy_variances = (0..n).map(|k| inverse[(k, k)]).collect();
         }
+        let is_lit = is_free[..n].to_vec();
         Self {
             deviance: hypothesis.deviance,
             gradient: DVector::from_fn(2 * n, |k, _| at.equations.gradient[position(k)]),
             information,
-            energies: hypothesis.sources.iter().map(|s| s.a).collect(),
+            energies: hypothesis
+                .sources
+                .iter()
+                .zip(&is_lit)
+                .map(|(s, lit)| if *lit { s.a } else { 0.0 })
+                .collect(),
             energy_variances,
+            is_lit,
             positions,
         }
     }
@@ -110,10 +147,11 @@ impl LocalQuadratic {
 pub(crate) fn residual<'w>(
     engine: &'w mut Engine,
     compressed: &CompressedFrame,
+    energies: Energies,
     nuisances: Nuisances,
     positions: &DVector<f64>,
 ) -> (&'w [f64], f64) {
-    let mut hypothesis = hypothesis(positions, nuisances);
+    let mut hypothesis = hypothesis(positions, energies, nuisances);
     let mut context = FitContext {
         bases: engine.bases,
         compressed,
@@ -123,4 +161,78 @@ pub(crate) fn residual<'w>(
     };
     evaluate(&mut context, &mut hypothesis);
     (&engine.workspace.current.residual, hypothesis.deviance)
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::DVector;
+
+    use super::{Energies, Engine, LocalQuadratic};
+    use crate::estimate::fit::work_budget::WorkBudget;
+    use crate::estimate::model::hypothesis::Nuisances;
+    use crate::estimate::test_frame::{Shown, TestFrame};
+
+    fn local(test: &mut TestFrame, energies: Energies, positions: &[f64]) -> LocalQuadratic {
+        let mut engine = Engine {
+            bases: &test.space.bases,
+            rules: Default::default(),
+            budget: &mut WorkBudget::new(&|| false),
+            workspace: &mut test.space.workspace,
+        };
+        let positions = DVector::from_column_slice(positions);
+        LocalQuadratic::new(&mut engine, &test.compressed, energies, Nuisances::default(), positions)
+    }
+
+    fn one_spot() -> TestFrame {
+        Shown {
+            pixels_per_sigma: 2.0,
+            sources: &[([0.3, -0.4], 200.0)],
+            noise: Some(5),
+            ..Shown::default()
+        }
+        .frame()
+    }
+
+    #[test]
+    fn light_below_zero_explains_nothing() {
+        let mut test = one_spot();
+        // Beside the spot, and 0.2 σ from each other: opposite lights would shift it.
+        let pair = [0.45, -0.4, 0.65, -0.4];
+        let signed = local(&mut test, Energies::Signed, &pair);
+        let light = local(&mut test, Energies::NonNegative, &pair);
+        assert!(
+            signed.energies[0] > 200.0 && signed.energies[1] < 0.0,
+            "{:?}",
+            signed.energies
+        );
+        assert_eq!((&light.is_lit[..], light.energies[1]), (&[true, false][..], 0.0));
+        let alone = local(&mut test, Energies::NonNegative, &pair[..2]);
+        let std = alone.energy_variances[0].sqrt();
+        assert!((light.energies[0] - alone.energies[0]).abs() < 0.1 * std);
+        assert!(light.deviance > signed.deviance + 10.0);
+        // But for the little light that gives a dark emitter's position a gradient.
+        assert!((light.deviance - alone.deviance).abs() < 1.0);
+    }
+
+    #[test]
+    fn the_gradient_is_that_of_the_deviance_with_dark_emitters_at_zero() {
+        let mut test = one_spot();
+        let at = [0.35, -0.42, 0.65, -0.3];
+        let quadratic = local(&mut test, Energies::NonNegative, &at);
+        assert_eq!(quadratic.is_lit, [true, false]);
+        for k in 0..4 {
+            let h = 1e-5;
+            let mut deviance = |sign: f64| {
+                let mut moved = at;
+                moved[k] += sign * h;
+                local(&mut test, Energies::NonNegative, &moved).deviance
+            };
+            let slope = (deviance(1.0) - deviance(-1.0)) / (2.0 * h);
+            let expected = -2.0 * quadratic.gradient[k];
+            assert!(
+                (slope - expected).abs() < 1e-3 * (1.0 + expected.abs()),
+                "{k}: {slope} against {expected}"
+            );
+        }
+    }
 }

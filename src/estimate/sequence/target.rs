@@ -1,5 +1,7 @@
 //! An emitter that the window follows, and whether it has gone dark.
 
+use crate::estimate::sequence::motion::Straying;
+
 /// Frames from which a target's mean energy is known well enough to miss it, and over how many it is averaged.
 const FEW: f64 = 3.0;
 const MANY: f64 = 100.0;
@@ -16,6 +18,7 @@ pub(crate) struct Target {
     pub frames: f64,
     /// ln of the evidence that it has gone dark over that it has not, never below zero.
     pub darkness: f64,
+    pub straying: Straying,
 }
 
 impl Target {
@@ -26,6 +29,7 @@ impl Target {
             mean_energy: 0.0,
             frames: 0.0,
             darkness: 0.0,
+            straying: Straying::default(),
         }
     }
 

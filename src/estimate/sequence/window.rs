@@ -4,7 +4,7 @@ use nalgebra::DVector;
 
 use crate::estimate::model::hypothesis::OVERLAPPING;
 use crate::estimate::sequence::joint_information::{JointInformation, STATE};
-use crate::estimate::sequence::snapshot::{Engine, LocalQuadratic, Snapshot};
+use crate::estimate::sequence::snapshot::{Energies, Engine, LocalQuadratic, Snapshot};
 use crate::estimate::sequence::target::Target;
 
 /// Damping λ: first value and range, as in the fit of one frame.
@@ -58,6 +58,7 @@ pub(crate) struct Window {
     /// −2 ln L of the last fit, and the damping λ it ended with; 0 to begin with `LAMBDA_START`.
     pub cost: f64,
     pub damping: f64,
+    pub energies: Energies,
     /// Variances of position, σ², and velocity, σ²/s², of an emitter of which nothing is known.
     pub unknown: [f64; 2],
 }
@@ -176,7 +177,7 @@ impl Window {
         let mut cost = self.prior.cost(state);
         for s in &self.snapshots {
             let positions = self.positions(state, s.time_s);
-            let local = LocalQuadratic::new(engine, &s.compressed, s.nuisances, positions);
+            let local = LocalQuadratic::new(engine, &s.compressed, self.energies, s.nuisances, positions);
             cost += local.deviance;
             locals.push(local);
         }
@@ -265,12 +266,17 @@ impl Window {
         Some(self.total.factor(1e-13)?.inverse())
     }
 
-    /// Number of snapshots that hold each target.
-    pub fn counts(&self) -> Vec<f64> {
-        self.targets
-            .iter()
-            .map(|t| self.dropped + self.snapshots.iter().filter(|s| t.is_in(s.time_s)).count() as f64)
-            .collect()
+    /// Number of snapshots that each target lights.
+    pub fn lit(&self) -> Vec<f64> {
+        let mut lit = vec![self.dropped; self.len()];
+        for s in &self.snapshots {
+            // A snapshot that was not linearised yet says nothing of its energies.
+            let is_lit = s.local.is_lit.iter().map(|l| f64::from(*l));
+            for (e, share) in self.present(s.time_s).into_iter().zip(is_lit) {
+                lit[e] += share;
+            }
+        }
+        lit
     }
 
     /// Whether noise alone explains what the newest snapshot leaves.
@@ -329,7 +335,7 @@ impl Window {
     fn relinearise(&mut self, engine: &mut Engine, k: usize) {
         let positions = self.positions(&self.state, self.snapshots[k].time_s);
         let s = &mut self.snapshots[k];
-        s.local = LocalQuadratic::new(engine, &s.compressed, s.nuisances, positions);
+        s.local = LocalQuadratic::new(engine, &s.compressed, self.energies, s.nuisances, positions);
     }
 
     /// Linearises the newest snapshot anew, as when one of its targets has turned out to be dark.
