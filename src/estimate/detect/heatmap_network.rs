@@ -54,11 +54,33 @@ pub enum NetworkError {
 
 /// What of the card matters for running the network; the rest is for people.
 #[derive(Deserialize)]
-struct Card {
+pub(crate) struct Card {
     sha256: String,
     /// Ny, Nx.
     shape: [usize; 2],
     floor_sigma: f32,
+    /// Width of the spots that it was trained on, pixels.
+    pub spot_sigma_px: Option<f64>,
+}
+
+impl Card {
+    /// Of the embedded network.
+    pub fn embedded() -> Result<Self, NetworkError> {
+        let (name, _, card) = EMBEDDED;
+        Self::parse(Path::new(name), card)
+    }
+
+    fn parse(path: &Path, text: &str) -> Result<Self, NetworkError> {
+        toml::from_str(text).map_err(|e| NetworkError::Card {
+            path: path.with_extension("toml"),
+            reason: e.message().to_owned(),
+        })
+    }
+
+    /// Whether the network takes frames of (Ny, Nx).
+    pub fn takes(&self, (ny, nx): (usize, usize)) -> bool {
+        self.shape == [ny, nx]
+    }
 }
 
 /// A maximum of the heatmap: column and row in pixels, a pixel's centre at its integer.
@@ -102,10 +124,7 @@ impl Network {
 
     fn from_parts(path: &Path, bytes: &[u8], card: &str, (ny, nx): (usize, usize)) -> Result<Self, NetworkError> {
         let path = path.to_owned();
-        let card: Card = toml::from_str(card).map_err(|e| NetworkError::Card {
-            path: path.with_extension("toml"),
-            reason: e.message().to_owned(),
-        })?;
+        let card = Card::parse(&path, card)?;
         let found: String = Sha256::digest(bytes).iter().map(|b| format!("{b:02x}")).collect();
         if found != card.sha256.to_ascii_lowercase() {
             return Err(NetworkError::Changed {
@@ -114,7 +133,7 @@ impl Network {
                 found,
             });
         }
-        if card.shape != [ny, nx] {
+        if !card.takes((ny, nx)) {
             return Err(NetworkError::WrongShape {
                 path,
                 network_x: card.shape[1],

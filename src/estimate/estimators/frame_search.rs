@@ -1,6 +1,8 @@
 //! The searches of a frame: by an estimator's method, anew where the spots differ from the PSF, and anew where the noise grows with the light.
 
+use crate::estimate::estimators::budgets::Budgets;
 use crate::estimate::estimators::list::{EstimatorSpec, Method};
+use crate::estimate::estimators::network_start::NetworkStart;
 use crate::estimate::fit::levenberg_marquardt::{evaluate, fit};
 use crate::estimate::fit::work_budget::WorkBudget;
 use crate::estimate::model::compressed_frame::CompressedFrame;
@@ -32,32 +34,6 @@ const KEPT_OUTLIERS_WORK: f64 = 0.1;
 const MISFIT_WORK: f64 = 0.1;
 /// Passes over a frame for isolated outliers.
 const OUTLIER_PASSES: usize = 3;
-
-/// What each of a frame's searches may spend.
-pub(crate) struct Budgets<'a> {
-    search: WorkBudget<'a>,
-    pencil: WorkBudget<'a>,
-    reweighting: WorkBudget<'a>,
-}
-
-impl<'a> Budgets<'a> {
-    pub fn new(is_over: &'a dyn Fn() -> bool) -> Self {
-        let budget = || WorkBudget::new(is_over);
-        Self {
-            search: budget(),
-            pencil: budget(),
-            reweighting: budget(),
-        }
-    }
-
-    pub fn steps(&self) -> u64 {
-        self.search.steps + self.pencil.steps + self.reweighting.steps
-    }
-
-    pub fn is_limited(&self) -> bool {
-        self.search.is_limited || self.pencil.is_limited || self.reweighting.is_limited
-    }
-}
 
 /// Which of the searches a hypothesis is of.
 #[derive(Clone, Copy, PartialEq)]
@@ -103,6 +79,7 @@ pub(crate) struct FrameSearch {
     pub space: SearchSpace,
     pub compressed: CompressedFrame,
     pub reweighting: Reweighting,
+    network_start: NetworkStart,
     rules: Rules,
 }
 
@@ -129,6 +106,7 @@ impl FrameSearch {
             space: SearchSpace::new(bases, rules).with_shape(camera),
             compressed: CompressedFrame::of_camera(camera),
             reweighting: Reweighting::new(camera, rules),
+            network_start: NetworkStart::new(camera, rules.network_start && spec.chooses_order()),
             rules,
         }
     }
@@ -269,12 +247,15 @@ impl FrameSearch {
             }
             Method::Pencil { steps } => initialise(&mut search, Nuisances::default(), steps).into_hypothesis(),
             Method::MaximumLikelihood | Method::MaximumPosterior | Method::Sequence => {
-                let initial = initial_hypothesis(&mut search);
+                let mut initial = initial_hypothesis(&mut search);
                 if self.spot_error.is_some_and(|e| e > 0.0) && search.context.bases.are_pixels() {
                     // The search with the spot error is the only one.
                     return Found::of(without_insignificant(&mut search, initial), SearchKind::Main);
                 }
                 let is_explained = self.compressed.is_explained_by(&initial);
+                if !is_explained {
+                    self.network_start.improve(&mut search, &mut initial);
+                }
                 let by_pencil = if is_explained {
                     None
                 } else {

@@ -6,10 +6,11 @@ use crate::estimate::emitter::Estimate;
 use crate::estimate::error::Error;
 use crate::estimate::estimator::Estimator;
 use crate::estimate::estimators::list::Learned;
+use crate::estimate::estimators::network_start::network_sources;
 use crate::estimate::fit::levenberg_marquardt::fit;
 use crate::estimate::fit::work_budget::WorkBudget;
 use crate::estimate::model::compressed_frame::CompressedFrame;
-use crate::estimate::model::hypothesis::{Hypothesis, Nuisances, PointSource};
+use crate::estimate::model::hypothesis::{Hypothesis, Nuisances};
 use crate::estimate::model::svd_basis::Basis;
 use crate::estimate::model_order::candidate::Candidate;
 use crate::estimate::model_order::refine::shrink;
@@ -18,7 +19,7 @@ use crate::estimate::preprocess::screening::PreprocessedFrame;
 use crate::estimate::rules::Rules;
 use crate::estimate::uncertainty::localise::localise;
 use crate::frame::Frame;
-use crate::optics::{Camera, Smear, psf};
+use crate::optics::{Camera, Smear};
 
 /// Steps of the joint fit from the network's peaks.
 const STEPS: usize = 60;
@@ -72,19 +73,7 @@ impl Estimator for NetworkEstimator {
         self.compressed
             .load(&self.frame, &self.space.bases.x, &self.space.bases.y);
         let mut hypothesis = Hypothesis::empty(Nuisances::default());
-        let sigma = camera.spot_sigma_m;
-        for peak in self.network.run(&self.frame.pixels)? {
-            let x = camera.x.centre(0) + peak.column * camera.x.pitch_m;
-            let y = camera.y.centre(0) + peak.row * camera.y.pitch_m;
-            let (row, column) = peak.pixel;
-            // The energy of a lone source with this brightest pixel.
-            let share = psf::pixel_fraction(camera.x.edge(column), camera.x.edge(column + 1), x, sigma)
-                * psf::pixel_fraction(camera.y.edge(row), camera.y.edge(row + 1), y, sigma);
-            hypothesis.sources.push(PointSource::new(
-                [x / sigma, y / sigma],
-                (self.frame.pixels[row * camera.x.n + column] / share).max(0.0),
-            ));
-        }
+        hypothesis.sources = network_sources(&mut self.network, &self.frame, camera)?;
         let mut budget = WorkBudget::new(&|| false);
         let mut search = self.space.search(&self.compressed, &self.frame, &mut budget);
         if self.spec == Learned::Hybrid {

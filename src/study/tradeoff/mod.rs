@@ -70,10 +70,13 @@ impl Plan {
         }
     }
 
-    /// [`Plan::full`], and cells whose noise grows with the light, which some of the estimators' rules are for.
+    /// [`Plan::full`], and what some of the estimators' rules are for: cells whose noise grows with the light, and crowds before the embedded
+    /// network.
     pub fn ablation() -> Self {
         let mut plan = Self::full();
         plan.cells.extend(cells_under(Condition::Gains));
+        plan.cells
+            .extend([20, 40].map(|emitters| Cell::new(Noise::Energy, 1.0, 64).holding(emitters)));
         plan
     }
 
