@@ -96,7 +96,7 @@ async fn without_a_recorder_an_alert_of_this_run_has_a_picture() {
     fake.alert("a-1", 1).await;
     problem(get(&fake, "/v1/alerts/a-1/evidence.png").await, 404).await;
     let alert = fake.journal.alert("a-1").unwrap().unwrap();
-    fake.feed.illustrate(&[alert], &crate::fake::snapshot(1));
+    fake.feed.illustrate(&[alert], &crate::fixtures::snapshot(1));
     let png = get(&fake, "/v1/alerts/a-1/evidence.png").await;
     assert_eq!(size_of(&png.bytes().await.unwrap()), (256, 256));
     problem(get(&fake, "/v1/alerts/a-1/evidence.png?panels=all").await, 404).await;

@@ -10,7 +10,8 @@ use oapwatch::optics;
 use reqwest::{Client, StatusCode, header};
 use serde_json::{Value, json};
 
-use crate::fake::{Fake, alert, at, get, json_of, problem, publish, snapshot};
+use crate::fake::{Fake, at, get, json_of, problem, publish};
+use crate::fixtures::{alert, snapshot};
 
 /// What the monitor says of a beam that stands at a place, m, and that nobody claims.
 fn watch(axes: LocalAxes, [x_m, y_m]: [f64; 2]) -> (Report, Alert) {

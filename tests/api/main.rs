@@ -5,6 +5,7 @@ mod bodies;
 mod connections;
 mod evidence;
 mod fake;
+mod fixtures;
 mod geojson;
 mod guards;
 mod rest;

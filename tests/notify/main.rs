@@ -1,11 +1,13 @@
 //! Webhooks against real receivers on the loopback address. The worker's clock runs fast where a test spans hours.
 
+mod alertmanager;
 mod config;
 mod counterparts;
 mod disk;
 mod exports;
 mod positions;
 mod receiver;
+mod sapient;
 mod sender;
 mod trouble;
 

@@ -13,7 +13,7 @@ use crate::optics::Camera;
 use crate::study::tradeoff::{CUTOFF_M, Cell, Noise, Snapshots, Walk, is_apart};
 
 /// Numbers of frames after which answers are scored.
-const AFTER: [usize; 3] = [10, 30, 100];
+const AFTER: [usize; 4] = [10, 30, 100, 300];
 const RATES_HZ: [f64; 2] = [10.0, 100.0];
 const RELATIVE_STDS: [f64; 3] = [0.09, 0.29, 0.9];
 const CELLS: [(Noise, f64); 6] = [

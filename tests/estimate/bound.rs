@@ -4,11 +4,12 @@
 use ndarray::Array2;
 use oapwatch::assign::ospa;
 use oapwatch::estimate::{Config, ESTIMATORS, Error, Estimate, Estimator, Flags, KnownPower, build, position_bound};
-use oapwatch::frame::Frame;
 use oapwatch::optics::{self, Camera, psf};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, Normal};
+
+use crate::frames::{estimator, frame, places};
 
 const ENERGY_J: f64 = 7e-3;
 
@@ -20,25 +21,6 @@ fn camera(sigma_m: f64, pixels: usize, noise_std_j: f64) -> Camera {
         ..Default::default()
     };
     config.camera().unwrap()
-}
-
-fn estimator(name: Option<&str>, camera: &Camera) -> Box<dyn Estimator> {
-    let config = Config {
-        name: name.map(str::to_owned),
-        ..Default::default()
-    };
-    build(&config, camera).unwrap()
-}
-
-fn frame(pixels: Array2<f64>) -> Frame {
-    Frame {
-        index: 0,
-        time: jiff::Timestamp::UNIX_EPOCH,
-        pixels,
-        masked: None,
-        exposure_s: None,
-        energy_scale: 1.0,
-    }
 }
 
 fn render(camera: &Camera, positions: &[[f64; 2]], rng: &mut ChaCha8Rng) -> Array2<f64> {
@@ -72,10 +54,6 @@ fn scatter(count: usize, apart_m: f64, rng: &mut ChaCha8Rng) -> Vec<[f64; 2]> {
         }
     }
     positions
-}
-
-fn places(estimate: &Estimate) -> Vec<[f64; 2]> {
-    estimate.emitters.iter().map(|e| [e.x_m, e.y_m]).collect()
 }
 
 /// Mean squared error over bound, share within the 95 % ellipse, and number of pairs.

@@ -4,13 +4,15 @@
 use std::sync::Arc;
 
 use ndarray::Array2;
-use oapwatch::estimate::{Config, Emitter, Estimate, Estimator, build, position_bound};
+use oapwatch::estimate::{Emitter, position_bound};
 use oapwatch::frame::Frame;
 use oapwatch::optics::spot::{Field, SpotShape, Template};
 use oapwatch::optics::{self, Camera, Smear, add_spot};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, Normal};
+
+use crate::frames::{estimator, frame, places};
 
 const ENERGY_J: f64 = 7e-3;
 const SIGMA_M: f64 = 1e-3;
@@ -25,29 +27,6 @@ fn camera() -> Camera {
         ..Default::default()
     };
     config.camera().unwrap()
-}
-
-fn estimator(name: Option<&str>, camera: &Camera) -> Box<dyn Estimator> {
-    let config = Config {
-        name: name.map(str::to_owned),
-        ..Default::default()
-    };
-    build(&config, camera).unwrap()
-}
-
-fn frame(pixels: Array2<f64>) -> Frame {
-    Frame {
-        index: 0,
-        time: jiff::Timestamp::UNIX_EPOCH,
-        pixels,
-        masked: None,
-        exposure_s: None,
-        energy_scale: 1.0,
-    }
-}
-
-fn places(estimate: &Estimate) -> Vec<[f64; 2]> {
-    estimate.emitters.iter().map(|e| [e.x_m, e.y_m]).collect()
 }
 
 /// A Moffat profile (1969) of index 2.5, of about the width of a Gaussian of `sigma_m`: lenses with scattered light have such halos.

@@ -2,12 +2,14 @@
 
 use jiff::{SignedDuration, Timestamp};
 use ndarray::Array2;
-use oapwatch::estimate::{Config, Estimate, Estimator, build};
+use oapwatch::estimate::{Estimate, Estimator};
 use oapwatch::frame::Frame;
 use oapwatch::optics::{self, Camera, add_spot};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, Normal};
+
+use crate::frames::{estimator, frame};
 
 const MEAN_ENERGY_J: f64 = 7e-3;
 const RATE_HZ: f64 = 10.0;
@@ -40,11 +42,7 @@ impl Scene {
     }
 
     fn estimator(&self) -> Box<dyn Estimator> {
-        let config = Config {
-            name: Some("sequence".to_owned()),
-            ..Default::default()
-        };
-        build(&config, &self.camera).expect("an estimator")
+        estimator(Some("sequence"), &self.camera)
     }
 
     /// Those who shine at the newest frame.
@@ -66,10 +64,7 @@ impl Scene {
         Frame {
             index: self.next - 1,
             time: Timestamp::UNIX_EPOCH + SignedDuration::from_secs_f64(time_s),
-            pixels,
-            masked: None,
-            exposure_s: None,
-            energy_scale: 1.0,
+            ..frame(pixels)
         }
     }
 

@@ -11,6 +11,8 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 
+use crate::frames;
+
 /// Pixels per σ, and the energy of a spot whose brightest pixel is a hundred times the noise.
 const SIGMA: f64 = 2.1;
 const ENERGY: f64 = 100.0 * std::f64::consts::TAU * SIGMA * SIGMA;
@@ -50,18 +52,7 @@ fn frame(camera: &Camera, spots: &[([f64; 2], f64)], seed: u64) -> Frame {
             *pixel += energy * fy[j] * fx[i];
         }
     }
-    of_pixels(pixels * camera.noise_std_j)
-}
-
-fn of_pixels(pixels: Array2<f64>) -> Frame {
-    Frame {
-        index: 0,
-        time: jiff::Timestamp::UNIX_EPOCH,
-        pixels,
-        masked: None,
-        exposure_s: None,
-        energy_scale: 1.0,
-    }
+    frames::frame(pixels * camera.noise_std_j)
 }
 
 /// Spots of the camera's own shape, smeared.
@@ -79,7 +70,7 @@ fn smeared(camera: &Camera, spots: &[([f64; 2], f64)], smear: &Smear, seed: u64)
             add_spot(camera, at, energy * camera.noise_std_j / MOMENTS as f64, &mut pixels);
         }
     }
-    of_pixels(Array2::from_shape_vec(shape, pixels).unwrap())
+    frames::frame(Array2::from_shape_vec(shape, pixels).unwrap())
 }
 
 /// A round spot with a tail that points away from the sensor's middle and grows towards its edges, as coma does.

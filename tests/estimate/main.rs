@@ -1,0 +1,7 @@
+//! The estimators from outside, on frames that are drawn here from the optics alone.
+
+mod bound;
+mod frames;
+mod lens;
+mod sequence;
+mod windows;
