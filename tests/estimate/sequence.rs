@@ -23,6 +23,9 @@ struct Scene {
     walks: Vec<Walk>,
     rng: ChaCha8Rng,
     next: u64,
+    /// Of the next frame, and from it to the one after.
+    time_s: f64,
+    step_s: f64,
 }
 
 impl Scene {
@@ -38,6 +41,8 @@ impl Scene {
             walks: walks.to_vec(),
             rng: ChaCha8Rng::seed_from_u64(5),
             next: 0,
+            time_s: 0.0,
+            step_s: 1.0 / RATE_HZ,
         }
     }
 
@@ -47,12 +52,12 @@ impl Scene {
 
     /// Those who shine at the newest frame.
     fn truth(&self) -> Vec<[f64; 2]> {
-        let last_s = (self.next - 1) as f64 / RATE_HZ;
+        let last_s = self.time_s - self.step_s;
         self.walks.iter().filter_map(|walk| walk(last_s)).collect()
     }
 
     fn frame(&mut self) -> Frame {
-        let time_s = self.next as f64 / RATE_HZ;
+        let time_s = self.time_s;
         let noise = Normal::new(0.0, self.camera.noise_std_j).expect("noise is positive and finite");
         let mut pixels = Array2::from_shape_simple_fn(self.camera.shape(), || noise.sample(&mut self.rng));
         let buffer = pixels.as_slice_mut().expect("a fresh array is contiguous");
@@ -61,6 +66,7 @@ impl Scene {
             add_spot(&self.camera, self.camera.to_sensor(at), energy_j, buffer);
         }
         self.next += 1;
+        self.time_s += self.step_s;
         Frame {
             index: self.next - 1,
             time: Timestamp::UNIX_EPOCH + SignedDuration::from_secs_f64(time_s),
@@ -209,4 +215,108 @@ fn nobody_is_born_of_the_noise_of_many_frames() {
     let frames = counts.filter(|count| *count > 0).count();
     // What a lone frame takes for an emitter, one in a thousand, is dropped within some twenty.
     assert!(frames <= 75, "{frames} of 1500 dark frames hold somebody");
+}
+
+#[test]
+fn two_who_cross_are_two_again() {
+    let walks: [Walk; 2] = [|t| Some([-20.0 + t, 0.0]), |t| Some([20.0 - t, 1.5])];
+    let mut scene = Scene::new(1e-3, &walks);
+    let mut together = scene.estimator();
+    let counts: Vec<usize> = (0..400).map(|_| scene.run(&mut *together, 1).emitters.len()).collect();
+    let wrong = counts.iter().filter(|n| **n != 2).count();
+    assert!(wrong <= 4, "{wrong} of 400 frames: {counts:?}");
+    let found = scene.run(&mut *together, 1);
+    let misses = misses(&scene.truth(), &found);
+    assert!(misses.iter().all(|m| *m < 0.1), "{misses:?}");
+}
+
+#[test]
+fn when_all_fade_at_once_nobody_is_invented_and_all_come_back() {
+    let walks: [Walk; 3] = [
+        |t| (!(3.95..4.95).contains(&t)).then_some([-50.0 + t, 20.0]),
+        |t| (!(3.95..4.95).contains(&t)).then_some([50.0, 40.0 - t]),
+        |t| (!(3.95..4.95).contains(&t)).then_some([0.0, -60.0]),
+    ];
+    let mut scene = Scene::new(1e-3, &walks);
+    let mut together = scene.estimator();
+    scene.run(&mut *together, 40);
+    for _ in 0..10 {
+        assert!(scene.run(&mut *together, 1).emitters.len() <= 3);
+    }
+    let found = scene.run(&mut *together, 1);
+    assert_eq!(found.emitters.len(), 3);
+    let found = scene.run(&mut *together, 4);
+    let misses = misses(&scene.truth(), &found);
+    assert!(misses.iter().all(|m| *m < 0.3), "{misses:?}");
+}
+
+#[test]
+fn frames_that_are_missing_and_another_rate_change_nothing() {
+    let walks: [Walk; 2] = [|t| Some([-60.0 + t, 20.0]), |t| Some([50.0, 40.0 - 0.5 * t])];
+    let mut scene = Scene::new(1e-3, &walks);
+    let mut together = scene.estimator();
+    scene.run(&mut *together, 30);
+    scene.time_s += 2.5;
+    for step_s in [0.1, 0.01, 0.5, 0.1] {
+        scene.step_s = step_s;
+        for _ in 0..40 {
+            let found = scene.run(&mut *together, 1);
+            assert_eq!(found.emitters.len(), 2, "at {} s", scene.time_s);
+            let misses = misses(&scene.truth(), &found);
+            assert!(misses.iter().all(|m| *m < 0.2), "{misses:?} at {} s", scene.time_s);
+        }
+    }
+}
+
+#[test]
+fn a_car_that_turns_at_five_metres_per_second_squared_is_followed() {
+    // 10 m/s on a circle of 20 m, from the third second on.
+    let walks: [Walk; 1] = [|t| {
+        let angle = 0.5 * (t - 3.0).max(0.0);
+        Some([
+            10.0 * t.min(3.0) - 40.0 + 20.0 * angle.sin(),
+            20.0 * (1.0 - angle.cos()) - 20.0,
+        ])
+    }];
+    let mut scene = Scene::new(1e-3, &walks);
+    let mut together = scene.estimator();
+    scene.run(&mut *together, 20);
+    let (mut extra, mut worst) = (0, 0.0_f64);
+    for _ in 0..100 {
+        let found = scene.run(&mut *together, 1);
+        extra += found.emitters.len() - 1;
+        worst = worst.max(misses(&scene.truth(), &found)[0]);
+    }
+    assert!(extra <= 3 && worst < 0.6, "{extra} too many, {worst} m off");
+}
+
+#[test]
+fn a_hundred_thousand_frames_leave_the_numerics_as_they_were() {
+    let walks: [Walk; 2] = [
+        |_| Some([-20.0, 10.0]),
+        |t| Some([30.0 + 5.0 * (0.01 * t).sin(), -20.0]),
+    ];
+    let mut scene = Scene::new(2e-3, &walks);
+    let mut together = scene.estimator();
+    let mut first = None;
+    for thousand in 1..=100 {
+        let found = scene.run(&mut *together, 1000);
+        assert_eq!(found.emitters.len(), 2, "after {thousand},000 frames");
+        for emitter in &found.emitters {
+            let [[xx, xy], [yx, yy]] = emitter.cov_m2;
+            assert!(xx > 0.0 && xx * yy > xy * xy && xy == yx, "{:?}", emitter.cov_m2);
+        }
+        let misses = misses(&scene.truth(), &found);
+        let still = found.emitters.iter().find(|e| e.x_m < 0.0).expect("who stands");
+        let variance = still.cov_m2[0][0] + still.cov_m2[1][1];
+        let at_first = *first.get_or_insert(variance);
+        assert!(
+            (0.25..4.0).contains(&(variance / at_first)),
+            "{variance} m² after {at_first}"
+        );
+        assert!(
+            misses[0].powi(2) < 16.0 * variance && misses[1] < 0.5,
+            "{misses:?} with {variance} m² after {thousand},000 frames"
+        );
+    }
 }

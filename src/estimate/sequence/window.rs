@@ -184,7 +184,8 @@ impl Window {
         cost
     }
 
-    fn sum(&self, state: &DVector<f64>, locals: &[LocalQuadratic]) -> JointInformation {
+    /// The prior and all snapshots, linearised as in `locals`, about `state`.
+    fn sum<'l>(&self, state: &DVector<f64>, locals: impl IntoIterator<Item = &'l LocalQuadratic>) -> JointInformation {
         let mut total = self.prior.clone();
         total.recentre(state);
         for (s, local) in self.snapshots.iter().zip(locals) {
@@ -348,11 +349,7 @@ impl Window {
 
     /// Adds up the prior and the snapshots as they are linearised, and takes a Gauss–Newton step.
     fn step(&mut self) {
-        let mut total = self.prior.clone();
-        total.recentre(&self.state);
-        for s in &self.snapshots {
-            self.absorb(&mut total, &s.local, s.time_s);
-        }
+        let mut total = self.sum(&self.state, self.snapshots.iter().map(|s| &s.local));
         if let Some(factor) = total.factor(LAMBDA_FLOOR) {
             let span = self.snapshots.first().map_or(0.0, |s| (self.time_s - s.time_s).abs());
             let mut step = factor.solve(&total.gradient);
