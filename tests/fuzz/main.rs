@@ -3,6 +3,8 @@
 #[path = "../api/fake.rs"]
 #[allow(dead_code, reason = "the API's own tests use more of it")]
 mod fake;
+#[path = "../api/fixtures.rs"]
+mod fixtures;
 #[path = "../../fuzz/src/http.rs"]
 mod http;
 #[path = "../../fuzz/src/targets.rs"]
