@@ -7,6 +7,7 @@ includes that of `ml`. JPDA is told the covariance of each detection and nothing
 """
 
 import json
+import re
 import subprocess
 import sys
 import tempfile
@@ -43,24 +44,8 @@ FALSE_A_FRAME, SEEN = 1e-3, 0.999
 # Frames whose tracks begin: not counted.
 FIRST = 20
 
-OPTICS = """rate_hz = 10.0
-[optics]
-altitude_m = 300.0
-lens_radius_m = 0.05
-plane_distance_m = 0.036
-pixels = [64, 64]
-sensor_size_m = [0.03, 0.03]
-spot_sigma_m = 0.001
-noise_std_j = 1.0e-6
-[link]
-integration_time_s = 0.1
-coherence_time_s = 0.01
-[effects]
-attenuation = { kappa_per_m = 0.001 }
-fading = { alpha = 4.0, beta = 2.0 }
-pointing = { jitter_m = 0.1 }
-thermal_noise = {}
-"""
+# Optics and light of the built-in scene, and its honest users.
+LIGHT, *PEOPLE = re.split(r"(?m)^(?=\[\[)", (Path(__file__).parent.parent / "config/scenes/builtin.toml").read_text())
 
 
 def walk(name, *through, speed=1.2):
@@ -72,12 +57,7 @@ def still(name, x, y):
 
 
 SCENES = {
-    "apart: six who walk, roam and stand": walk("a", (-90, -80), (-30, -85), (-35, -40), (-95, -35))
-    + walk("b", (20, -90), (95, -95), (90, -50))
-    + walk("c", (85, 10), (100, 70), (60, 40))
-    + '[[user]]\nname = "d"\nmotion.roam = { home_m = [-60, 70], spread_m = 12.0, time_s = 15.0 }\n'
-    + still("e", 5, 5)
-    + walk("f", (0, 60), (30, 100), (-15, 105)),
+    "apart: the built-in scene's six users": "".join(p for p in PEOPLE if p.startswith("[[user]]")),
     "two cross, two walk abreast": walk("a", (-40, -30), (40, 30), speed=1.0)
     + walk("b", (-40, 30), (40, -30), speed=1.0)
     + walk("c", (-40, 70), (40, 70), speed=1.0)
@@ -161,7 +141,7 @@ def main():
     for name, users in SCENES.items():
         with tempfile.TemporaryDirectory() as folder:
             folder = Path(folder)
-            (folder / "scene.toml").write_text(f'about = "{name}"\n{OPTICS}{users}')
+            (folder / "scene.toml").write_text(LIGHT + users)
             simulate = [program, "simulate", "--scene", folder / "scene.toml", "--frames", str(count), "--seed", "1"]
             subprocess.run([*simulate, "--out", folder / "out"], check=True, capture_output=True)
             truth = [json.loads(line) for line in (folder / "out/truth.ndjson").read_text().splitlines()]

@@ -14,6 +14,7 @@ mod revision_schedule;
 mod search;
 mod sequence_estimator;
 mod snapshot;
+mod straying;
 mod subspace;
 mod target;
 mod window;

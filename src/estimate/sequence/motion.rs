@@ -11,11 +11,6 @@ use crate::optics::Camera;
 const SPEEDS_M_S: [f64; 4] = [0.01, 0.7, 2.5, SPEED_STD_M_S];
 /// Standard deviation of a change of velocity, m/s: a walker who turns round; a car changes its by as much within two seconds.
 const MANOEUVRE_M_S: f64 = 3.0;
-/// Frames over which changes of an emitter's position are added up: the newest alone shows a corner, more of them a bend.
-const MEMORIES: [f64; 3] = [1.0, 8.0, 32.0];
-/// Squared standard deviations of such a sum from which an emitter has turned: by chance once in 270,000 frames, and what it costs is
-/// the knowledge of one velocity. More leaves bends to the search of the window, which takes them for newcomers; 18 loses melted emitters.
-const SURPRISE: f64 = 25.0;
 /// Relative rounding of a difference of covariances.
 const ROUNDING: f64 = 1e-6;
 /// A hypothesis of less weight is left out.
@@ -96,23 +91,6 @@ pub(crate) fn velocity_on_ground(camera: &Camera, sensor_m: [f64; 2], velocity: 
     }
 }
 
-/// How an emitter has strayed from its straight course over the last frames: sums of the changes of its position by each of them, in their
-/// standard deviations, over memories of `MEMORIES` frames.
-#[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct Straying([(Vector2<f64>, f64); MEMORIES.len()]);
-
-impl Straying {
-    /// Takes a new frame's change. Whether chance does not explain the changes of some memory.
-    fn add(&mut self, change: Vector2<f64>) -> bool {
-        for ((sum, variance), frames) in self.0.iter_mut().zip(MEMORIES) {
-            let kept = 1.0 - 1.0 / frames;
-            *sum = kept * *sum + change;
-            *variance = kept * kept * *variance + 1.0;
-        }
-        self.0.iter().any(|(sum, v)| sum.norm_squared() > SURPRISE * v)
-    }
-}
-
 /// The targets of the fitted newest frame, on top of what was `known` before, that it or the frames before show elsewhere than straight on. The
 /// covariance of a change of position is what the variance falls by (Kalman, 1960), and successive changes are independent.
 pub(crate) fn surprised(known: &JointInformation, fresh: &mut Window) -> Vec<usize> {
@@ -162,31 +140,4 @@ pub(crate) fn open(knowledge: &mut JointInformation, who: &[usize], elapsed: f64
 /// a lone frame has noise to look like an emitter.
 pub(crate) fn courses(speed_std: f64, span_s: f64) -> f64 {
     (1.0 + 2.0 * speed_std * span_s).powi(2)
-}
-
-#[cfg(test)]
-mod tests {
-    use nalgebra::Vector2;
-    use rand::SeedableRng;
-    use rand_chacha::ChaCha8Rng;
-    use rand_distr::{Distribution, StandardNormal};
-
-    use super::Straying;
-
-    #[test]
-    fn a_corner_and_a_bend_are_straying_and_noise_is_not() {
-        let mut rng = ChaCha8Rng::seed_from_u64(1);
-        let mut noise = || Vector2::from_fn(|_, _| StandardNormal.sample(&mut rng));
-        let mut straying = Straying::default();
-        let by_chance = (0..20_000).filter(|_| straying.add(noise())).count();
-        assert!(by_chance <= 2, "{by_chance} times by chance");
-        let frames_until = |bias: f64, noise: &mut dyn FnMut() -> Vector2<f64>| {
-            let mut straying = Straying::default();
-            (1..100).find(|_| straying.add(noise() + Vector2::new(bias, 0.0)))
-        };
-        assert_eq!(frames_until(9.0, &mut noise), Some(1));
-        // Two standard deviations a frame are 5.3 of eight frames.
-        let bend = frames_until(2.0, &mut noise).expect("a bend is seen");
-        assert!((3..16).contains(&bend), "after {bend} frames");
-    }
 }

@@ -1,6 +1,6 @@
 //! An emitter that the window follows, and whether it has gone dark.
 
-use crate::estimate::sequence::motion::Straying;
+use crate::estimate::sequence::straying::Straying;
 
 /// Frames from which a target's mean energy is known well enough to miss it, and over how many it is averaged.
 const FEW: f64 = 3.0;
