@@ -37,8 +37,8 @@ from stonesoup.updater.kalman import KalmanUpdater
 
 CUTOFF_M = 5.0
 AREA_M2 = 250.0**2
-# A walker's acceleration, m/s^1.5: velocity changes by 0.5 m/s within a second.
-NOISE = 0.25
+# Acceleration, m/s^1.5: the best for JPDA of 0.25, 0.5 and 1 in these scenes.
+NOISE = 1.0
 # Of `ml`: one frame in a thousand holds an emitter that is none, one in a thousand misses one that is alone.
 FALSE_A_FRAME, SEEN = 1e-3, 0.999
 # Frames whose tracks begin: not counted.
