@@ -3,7 +3,9 @@
 
 use ndarray::Array2;
 use oapwatch::assign::ospa;
-use oapwatch::estimate::{Config, ESTIMATORS, Error, Estimate, Estimator, Flags, KnownPower, build, position_bound};
+use oapwatch::estimate::{
+    Config, ESTIMATORS, Error, Estimate, Estimator, Flags, KnownPower, Rules, build, position_bound,
+};
 use oapwatch::optics::{self, Camera, psf};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -350,4 +352,27 @@ fn a_budget_ends_the_search_and_says_so() {
     assert!(short.emitters.iter().all(|e| e.flags.contains(Flags::OUT_OF_TIME)));
     assert!(!long.is_cut_short);
     assert_eq!(long.emitters.len(), 8);
+}
+
+#[test]
+fn a_crowd_is_searched_in_fewer_steps_from_the_network_and_is_the_same() {
+    let camera = camera(1e-3, 64, 1e-6);
+    let mut with = estimator(None, &camera);
+    let config = Config {
+        rules: Rules::without("network_start").unwrap(),
+        ..Default::default()
+    };
+    let mut without = build(&config, &camera).unwrap();
+    let mut rng = ChaCha8Rng::seed_from_u64(23);
+    let (mut steps, mut steps_without) = (0, 0);
+    for _ in 0..10 {
+        let crowd = scatter(30, 8.0, &mut rng);
+        let frame = frame(render(&camera, &crowd, &mut rng));
+        let [found, expected] = [&mut with, &mut without].map(|e| e.estimate(&frame).unwrap());
+        let apart = ospa(&places(&expected), &places(&found), 1.0);
+        assert!(apart.distance_m < 1e-3, "{} m apart", apart.distance_m);
+        steps += found.steps;
+        steps_without += expected.steps;
+    }
+    assert!(3 * steps < 2 * steps_without, "{steps} steps, {steps_without} without");
 }
