@@ -140,6 +140,8 @@ fn ask_scene(questions: &Questions, path: &Path) -> Result<Vec<Answer>, Error> {
     let mut config = Config::default();
     config.source.scene = Some(path.to_owned());
     config.adopt_platform(&scene);
+    // A network's arithmetic is the processor's: what begins with it differs from machine to machine.
+    config.estimator.rules.network_start = false;
     let mut pipeline = pipeline::Pipeline::new(&config, plan.camera())?;
     let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
     let mut maker = plan.maker();
