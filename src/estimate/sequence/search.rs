@@ -132,7 +132,7 @@ impl WindowSearch<'_, '_, '_> {
         has_shrunk
     }
 
-    /// Targets whose light is little against its errors, or negative, the weakest first.
+    /// Targets whose light is little against its errors, the weakest first.
     pub fn faint(&self, window: &Window) -> Vec<usize> {
         let (evidence, lit) = (evidence(window), window.lit());
         let mut faint: Vec<usize> = (0..window.len())
