@@ -4,6 +4,7 @@ use std::io::Write;
 
 use super::progress::Steps;
 use super::{Failure, Outcome};
+use crate::estimate::ESTIMATORS;
 use crate::study::measurements::{ALL, Measurement};
 
 #[derive(Debug, clap::Args)]
@@ -24,6 +25,9 @@ pub struct Args {
     /// Of lens, lens-calibrated, lens-alerts: only the rows whose name begins so ("airy disc 300"); may be repeated
     #[arg(long, value_name = "ROW")]
     only: Vec<String>,
+    /// Of honest-pixels to shadow: the estimator
+    #[arg(long, value_name = "NAME", value_parser = clap::builder::PossibleValuesParser::new(ESTIMATORS.iter().map(|e| e.name)))]
+    estimator: Option<String>,
 }
 
 pub fn run(args: Args) -> Outcome {
@@ -36,7 +40,7 @@ pub fn run(args: Args) -> Outcome {
         let mut printed = print(&format!("## {}\n", measurement.name));
         let mut say = |line: &str| printed = std::mem::replace(&mut printed, Ok(())).and_then(|()| print(line));
         let stories = args.stories.unwrap_or(measurement.stories);
-        let measured = measurement.run(stories, args.seed, &args.only, &mut say);
+        let measured = measurement.run(stories, args.seed, &args.only, args.estimator.as_deref(), &mut say);
         say(&measured.text);
         printed.map_err(Failure::other)?;
         steps.next(measurement.name);

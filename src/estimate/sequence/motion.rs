@@ -111,25 +111,33 @@ pub(crate) fn surprised(known: &JointInformation, fresh: &mut Window) -> Vec<usi
         for k in 0..2 {
             errors[(k, k)] = errors[(k, k)].max(0.0) + least(k);
         }
-        let change = errors.cholesky().and_then(|c| c.l().solve_lower_triangular(&moved));
-        change.is_some_and(|c| fresh.targets[*e].straying.add(c))
+        let Some(std) = errors.cholesky().map(|c| c.l()) else {
+            return false;
+        };
+        let now = Matrix2::from_fn(|k, l| posterior[(at + k, at + l)]);
+        let left = std.solve_lower_triangular(&now).map(|left| left.transpose());
+        let change = std.solve_lower_triangular(&moved);
+        let (Some(change), Some(left)) = (change, left) else {
+            return false;
+        };
+        fresh.targets[*e].straying.add(change, left)
     };
     present.into_iter().filter(|e| is_surprised(e)).collect()
 }
 
-/// Adds to `knowledge` that these emitters may have changed their velocity in the `elapsed` seconds since the frame before. `unit` is 1 m/s in σ/s.
-pub(crate) fn open(knowledge: &mut JointInformation, who: &[usize], elapsed: f64, unit: f64) {
+/// Adds to `knowledge` that these emitters may have changed their velocity about `since_s` seconds ago. `unit` is 1 m/s in σ/s.
+pub(crate) fn open(knowledge: &mut JointInformation, who: &[usize], since_s: f64, unit: f64) {
     let speed = (MANOEUVRE_M_S * unit).powi(2);
     for &e in who {
         let at: Vec<usize> = (0..STATE).map(|k| STATE * e + k).collect();
         let noise = DMatrix::from_fn(STATE, STATE, |r, c| {
-            let place = |k: usize| if k < 2 { 0.5 * elapsed } else { 1.0 };
+            let place = |k: usize| if k < 2 { since_s } else { 1.0 };
             let shared = if r % 2 == c % 2 {
                 speed * place(r) * place(c)
             } else {
                 0.0
             };
-            // Half of the position's is its own: when the manoeuvre was is not known.
+            // A fifth of the position's is its own: when the manoeuvre was is not known.
             if r == c { 1.2 * shared + 1e-12 } else { shared }
         });
         knowledge.add_noise(&at, &noise);

@@ -36,7 +36,15 @@ pub(crate) fn report(
     if let Some(Posterior { state, covariance }) = &posterior {
         positions = window.positions(state, window.time_s);
         let place = |k: usize| STATE * present[k / 2] + k % 2;
-        let own = DMatrix::from_fn(2 * n, 2 * n, |r, c| covariance[(place(r), place(c))]);
+        let mut own = DMatrix::from_fn(2 * n, 2 * n, |r, c| covariance[(place(r), place(c))]);
+        for (i, &e) in present.iter().enumerate() {
+            let lag = window.targets[e].straying.lag();
+            for k in 0..2 {
+                for l in 0..2 {
+                    own[(2 * i + k, 2 * i + l)] += lag[(k, l)];
+                }
+            }
+        }
         let mut engine = Engine {
             bases: &space.bases,
             rules,

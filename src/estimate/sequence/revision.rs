@@ -3,7 +3,10 @@
 
 use std::collections::VecDeque;
 
-use crate::estimate::sequence::search::{CONVERGE_STEPS, RELOCATED, TRIAL_STEPS, WindowSearch, is_ambiguous};
+use crate::estimate::sequence::search::{
+    CONVERGE_STEPS, RELOCATED, TRIAL_STEPS, TURN_PENALTY, WindowSearch, is_ambiguous,
+};
+use crate::estimate::sequence::straying::SURPRISE;
 use crate::estimate::sequence::target::Target;
 use crate::estimate::sequence::window::{Progress, Window};
 
@@ -16,6 +19,8 @@ const MOVES: usize = 2;
 enum Proposal {
     /// The same emitters, fitted to the end: what the others are compared with.
     Same,
+    /// The same, where these have changed their velocity in the middle of the window.
+    Turn(Vec<usize>),
     Birth([f64; 2]),
     Death(usize),
     /// An emitter that has been removed from the window, at another place.
@@ -30,6 +35,14 @@ struct Trial {
     steps: usize,
     /// The emitter without which it is, to be tried elsewhere.
     without: Option<Target>,
+    /// What frames have cost that were folded for a turn.
+    folded: Option<f64>,
+}
+
+impl Trial {
+    fn score(&self, search: &WindowSearch) -> f64 {
+        search.score(&self.window) + self.folded.unwrap_or(0.0)
+    }
 }
 
 /// What became of a frame's share of the search.
@@ -44,9 +57,10 @@ pub(crate) enum Revised {
 /// A search in progress.
 pub(crate) struct Revision {
     base: Window,
-    /// Of the fitted base.
+    /// Of the fitted base, or of the same emitters where some have turned.
     score: f64,
     is_fitted: bool,
+    turned: Option<Window>,
     proposals: VecDeque<Proposal>,
     trial: Option<Trial>,
 }
@@ -56,6 +70,9 @@ impl Revision {
     /// with one elsewhere, or all anew; `None` where there is nothing to try.
     pub fn begin(window: &Window, search: &WindowSearch, births: Vec<[f64; 2]>) -> Option<Self> {
         let mut proposals = VecDeque::from([Proposal::Same]);
+        if !births.is_empty() {
+            proposals.push_back(Proposal::Turn(window.beside(&births)));
+        }
         proposals.extend(births.into_iter().map(Proposal::Birth));
         let is_ambiguous = is_ambiguous(window);
         if is_ambiguous {
@@ -71,6 +88,7 @@ impl Revision {
             base: window.clone(),
             score: f64::INFINITY,
             is_fitted: false,
+            turned: None,
             proposals,
             trial: None,
         })
@@ -92,12 +110,15 @@ impl Revision {
         while !search.engine.budget.is_exhausted() {
             let Some(mut trial) = self.trial.take() else {
                 let Some(proposal) = self.proposals.pop_front() else {
-                    return Revised::Finished;
+                    return self
+                        .turned
+                        .take()
+                        .map_or(Revised::Finished, |turned| Revised::Better(Box::new(turned)));
                 };
                 self.trial = self.start(search, proposal);
                 continue;
             };
-            let highest = self.score - LEAST_GAIN - search.score(&trial.window) + trial.window.cost;
+            let highest = self.score - LEAST_GAIN - trial.score(search) + trial.window.cost;
             let progress = trial.window.fit_below(search.engine, &mut trial.steps, highest);
             if progress == Progress::Unfinished && trial.steps > 0 {
                 self.trial = Some(trial);
@@ -115,8 +136,12 @@ impl Revision {
         let mut window = self.base.clone();
         let mut steps = TRIAL_STEPS;
         let mut without = None;
+        let mut folded = None;
         match proposal {
             Proposal::Same => {}
+            Proposal::Turn(who) => {
+                folded = Some(search.turn(&mut window, &who)?);
+            }
             Proposal::Birth(at) => window.insert(Target::born(born_s), at, [0.0; 2]),
             Proposal::Death(e) => {
                 without = Some(window.targets[e]);
@@ -132,15 +157,30 @@ impl Revision {
             }
         }
         window.damping = 0.0;
-        Some(Trial { window, steps, without })
+        Some(Trial {
+            window,
+            steps,
+            without,
+            folded,
+        })
     }
 
     /// Compares a fitted trial. Returns it where it is better.
     fn conclude(&mut self, search: &mut WindowSearch, trial: Trial) -> Option<Window> {
-        let Trial { window, without, .. } = trial;
-        let score = search.score(&window);
+        let score = trial.score(search);
+        let Trial {
+            window,
+            without,
+            folded,
+            ..
+        } = trial;
         if !self.is_fitted {
             (self.is_fitted, self.score, self.base) = (true, score, window);
+            return None;
+        }
+        if folded.is_some() {
+            self.turned = (score + SURPRISE < self.score).then_some(window);
+            self.score = self.score.min(score + TURN_PENALTY);
             return None;
         }
         if score < self.score - LEAST_GAIN {

@@ -4,8 +4,10 @@
 use crate::estimate::detect::matched_filter::MatchedFilter;
 use crate::estimate::model::hypothesis::{Nuisances, OVERLAPPING};
 use crate::estimate::sequence::joint_information::STATE;
+use crate::estimate::sequence::motion::{courses, open};
 use crate::estimate::sequence::residual_map::{ResidualSum, peaks, residual_map};
 use crate::estimate::sequence::snapshot::{Energies, Engine, LocalQuadratic, Snapshot};
+use crate::estimate::sequence::straying::Straying;
 use crate::estimate::sequence::subspace::Subspace;
 use crate::estimate::sequence::target::Target;
 use crate::estimate::sequence::window::Window;
@@ -21,6 +23,8 @@ const TRIED_ALONE: f64 = 0.9;
 const PEAKS: usize = 3;
 /// Pairs nearer than this many standard deviations of their difference are ambiguous: the window is searched again.
 const AMBIGUOUS: f64 = 4.0;
+/// Penalty of a change of velocity that explains what a newcomer would: walkers turn every some hundred frames.
+pub(crate) const TURN_PENALTY: f64 = 6.0;
 /// Rounds of births and deaths.
 const ROUNDS: usize = 12;
 /// Targets that are moved to the residual's peaks, the weakest first.
@@ -33,31 +37,67 @@ pub(crate) fn penalty(single: f64, frames: f64) -> f64 {
     frames + 2.0 * frames.sqrt() * root + 2.0 * root * root
 }
 
-/// The penalised −2 ln L of a fitted window; the lower, the better. A target pays for the frames that it lights.
-pub(crate) fn score(window: &Window, single: f64) -> f64 {
-    let penalties = window.lit().into_iter().map(|k| penalty(single, k));
-    window.cost - window.dropped * window.len() as f64 + penalties.sum::<f64>()
+/// The chances that noise has to look like an emitter in the frames of a window.
+pub(crate) struct Chances {
+    /// The penalty of a source in a lone frame.
+    single: f64,
+    /// Standard deviation of an unknown speed, σ/s.
+    speed_std: f64,
+    /// Times of the window's frames, s.
+    times_s: Vec<f64>,
+    now_s: f64,
 }
 
-/// The height of a residual map from which a peak is tried: its noise, and this share of what a source must bring beyond it.
-fn beyond_noise(single: f64, frames: f64, energies: Energies, share: f64) -> f64 {
-    let lit = energies.lit_by_noise() * frames;
-    lit + share * (penalty(single, lit) - lit)
+impl Chances {
+    pub fn new(window: &Window, single: f64) -> Self {
+        Self {
+            single,
+            speed_std: window.unknown[1].sqrt(),
+            times_s: window.snapshots.iter().map(|s| s.time_s).collect(),
+            now_s: window.time_s,
+        }
+    }
+
+    /// The penalty of a source born at `born_s` that lights `lit` frames. It pays for the straight courses it may have taken, and what many
+    /// frames take for an emitter stays as long as they do.
+    pub fn penalty(&self, born_s: f64, lit: f64) -> f64 {
+        let first_s = self.times_s.first().map_or(self.now_s, |first| first.max(born_s));
+        let frames = self.times_s.iter().filter(|t| **t >= born_s).count().max(1) as f64;
+        let courses = courses(self.speed_std, self.now_s - first_s);
+        penalty(self.single + 2.0 * (courses * frames).ln(), lit)
+    }
+
+    /// The height of a residual map of `frames` frames from which an emitter born at `born_s` is tried: its noise, and this share of what a
+    /// source must bring beyond it.
+    fn beyond_noise(&self, born_s: f64, frames: f64, energies: Energies, share: f64) -> f64 {
+        let lit = energies.lit_by_noise() * frames;
+        lit + share * (self.penalty(born_s, lit) - lit)
+    }
 }
 
 /// A search of one window.
 pub(crate) struct WindowSearch<'s, 'a, 'b> {
     pub engine: &'s mut Engine<'a, 'b>,
     pub matched_filter: &'s mut MatchedFilter,
-    /// The penalty of a source in a lone frame.
-    pub penalty: f64,
+    pub chances: Chances,
+    /// 1 m/s in σ/s.
+    pub speed_unit: f64,
     /// What the emitters found last leave; see `residual_map`.
     pub left: Vec<f64>,
 }
 
 impl WindowSearch<'_, '_, '_> {
+    /// The penalised −2 ln L of a fitted window; the lower, the better. A target pays for the frames that it lights.
     pub fn score(&self, window: &Window) -> f64 {
-        score(window, self.penalty)
+        let penalties: f64 = self.penalties(window).iter().sum();
+        window.cost - window.dropped * window.len() as f64 + penalties
+    }
+
+    fn penalties(&self, window: &Window) -> Vec<f64> {
+        let targets = window.targets.iter().zip(window.lights());
+        targets
+            .map(|(t, light)| self.chances.penalty(t.born_s, light.lit))
+            .collect()
     }
 
     /// Maxima of at least `least` of the residual map, the highest first.
@@ -68,7 +108,8 @@ impl WindowSearch<'_, '_, '_> {
 
     /// Where the frames together show light that none shows alone.
     pub fn births(&self, window: &Window, left: &ResidualSum) -> Vec<[f64; 2]> {
-        let beyond = |share: f64| beyond_noise(self.penalty, left.frames, window.energies, share);
+        let born_s = window.snapshots.first().map_or(window.time_s, |s| s.time_s);
+        let beyond = |share: f64| self.chances.beyond_noise(born_s, left.frames, window.energies, share);
         let positions = window.positions(&window.state, window.time_s);
         let is_near = |at: [f64; 2]| {
             let mut others = positions.as_slice().chunks_exact(2);
@@ -90,7 +131,7 @@ impl WindowSearch<'_, '_, '_> {
                 break;
             }
             let frames = window.snapshots.iter().filter(|s| s.time_s >= born_s).count() as f64;
-            let least = beyond_noise(self.penalty, frames, window.energies, TRIED);
+            let least = self.chances.beyond_noise(born_s, frames, window.energies, TRIED);
             let peaks = self.residual_peaks(window, least);
             let before = self.score(window);
             let mut best: Option<Window> = None;
@@ -134,12 +175,25 @@ impl WindowSearch<'_, '_, '_> {
 
     /// Targets whose light is little against its errors, the weakest first.
     pub fn faint(&self, window: &Window) -> Vec<usize> {
-        let (evidence, lit) = (evidence(window), window.lit());
+        let (lights, penalties) = (window.lights(), self.penalties(window));
         let mut faint: Vec<usize> = (0..window.len())
-            .filter(|&e| evidence[e] < 2.0 * penalty(self.penalty, lit[e]))
+            .filter(|&e| lights[e].evidence < 2.0 * penalties[e])
             .collect();
-        faint.sort_by(|&a, &b| evidence[a].total_cmp(&evidence[b]));
+        faint.sort_by(|&a, &b| lights[a].evidence.total_cmp(&lights[b].evidence));
         faint
+    }
+
+    /// Targets, the last first, whose light over all frames that held them is less than their penalty: noise that was born as an emitter.
+    pub fn unconfirmed(&self, window: &Window) -> Vec<usize> {
+        let lights = window.lights();
+        let is_noise = |e: &usize| {
+            let target = &window.targets[*e];
+            let mut light = target.folded;
+            light.add(lights[*e]);
+            light.evidence < self.chances.penalty(target.born_s, light.lit)
+        };
+        let present = window.present(window.time_s).into_iter().rev();
+        present.filter(is_noise).collect()
     }
 
     /// Targets that may not be: faint ones, and the farther one of each close pair.
@@ -194,6 +248,23 @@ impl WindowSearch<'_, '_, '_> {
             }
         }
         false
+    }
+
+    /// Lets these targets change their velocity in the middle of the window. Returns what this takes off the score with the frames before;
+    /// `None` where there are none.
+    pub fn turn(&self, window: &mut Window, who: &[usize]) -> Option<f64> {
+        let half = window.snapshots.len() / 2;
+        if half == 0 {
+            return None;
+        }
+        let since_s = window.time_s - window.snapshots[half].time_s;
+        let penalties = |window: &Window| self.penalties(window).iter().sum::<f64>();
+        let before = penalties(window);
+        let folded = window.fold(half) + before - penalties(window);
+        open(&mut window.prior, who, since_s, self.speed_unit);
+        who.iter()
+            .for_each(|&e| window.targets[e].straying = Straying::default());
+        Some(folded)
     }
 
     /// Grows, shrinks and relocates until nothing improves.
@@ -261,17 +332,9 @@ impl WindowSearch<'_, '_, '_> {
     }
 }
 
-/// Σ a²/var(a) of each target over the snapshots: what its light weighs against its errors.
+/// What the light of each target weighs against its errors.
 fn evidence(window: &Window) -> Vec<f64> {
-    let mut evidence = vec![0.0; window.len()];
-    for s in &window.snapshots {
-        // A snapshot that was not linearised yet says nothing of its energies.
-        let energies = s.local.energies.iter().zip(&s.local.energy_variances);
-        for (e, (energy, variance)) in window.present(s.time_s).into_iter().zip(energies) {
-            evidence[e] += energy * energy / variance;
-        }
-    }
-    evidence
+    window.lights().into_iter().map(|light| light.evidence).collect()
 }
 
 /// Targets, those of least light first.
@@ -280,18 +343,6 @@ fn by_light(window: &Window) -> Vec<usize> {
     let mut order: Vec<usize> = (0..window.len()).collect();
     order.sort_by(|&a, &b| evidence[a].total_cmp(&evidence[b]));
     order
-}
-
-/// Targets, the last first, whose light over all frames that held them is less than their penalty: noise that was born as an emitter. Those with
-/// frames that have left the window are not among them.
-pub(crate) fn unconfirmed(window: &Window, single: f64) -> Vec<usize> {
-    let Some(first) = window.snapshots.first() else {
-        return Vec::new();
-    };
-    let (evidence, lit) = (evidence(window), window.lit());
-    let is_young = |e: &usize| window.targets[*e].born_s >= first.time_s && window.targets[*e].is_in(window.time_s);
-    let targets = (0..window.len()).rev().filter(is_young);
-    targets.filter(|&e| evidence[e] < penalty(single, lit[e])).collect()
 }
 
 /// Whether a pair of emitters is not told apart for certain.

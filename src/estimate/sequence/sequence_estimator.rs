@@ -14,13 +14,13 @@ use crate::estimate::fit::work_budget::WorkBudget;
 use crate::estimate::model::hypothesis::Nuisances;
 use crate::estimate::rules::Rules;
 use crate::estimate::sequence::joint_information::{JointInformation, STATE};
-use crate::estimate::sequence::motion::{courses, open, surprised};
+use crate::estimate::sequence::motion::{open, surprised};
 use crate::estimate::sequence::report::report;
 use crate::estimate::sequence::residual_map::ResidualSum;
 use crate::estimate::sequence::revision_schedule::{RevisionSchedule, YOUNG};
-use crate::estimate::sequence::search::{WindowSearch, unconfirmed};
+use crate::estimate::sequence::search::{Chances, TURN_PENALTY, WindowSearch};
 use crate::estimate::sequence::snapshot::{Engine, LocalQuadratic, Snapshot};
-use crate::estimate::sequence::straying::Straying;
+use crate::estimate::sequence::straying::{SURPRISE, Straying};
 use crate::estimate::sequence::target::Target;
 use crate::estimate::sequence::window::{SPEED_STD_M_S, Window};
 use crate::frame::Frame;
@@ -38,6 +38,8 @@ const FRAME_STEPS: usize = 12;
 const WINDOW_STEPS: usize = 30;
 /// Snapshots that are linearised anew with a frame: more follow a change sooner, each costs as much as a step of the frame's own fit.
 const REFRESHED: usize = 8;
+/// Who stands beside a newcomer may have turned in so many frames instead.
+const LATELY: f64 = 8.0;
 /// Work of a search that has to end with its frame, in frames' searches: where what is remembered explains nothing.
 const SEARCH_WORK: f64 = 0.5;
 
@@ -144,9 +146,9 @@ impl SequenceEstimator {
             let mut fresh = self.fit(fresh, &mut budget);
             let turned = surprised(&known, &mut fresh);
             if turned.is_empty()
-                && let Some(fresh) = self.explain(fresh, scale, &mut budget)
+                && let Some(grown) = self.explain(fresh.clone(), scale, &mut budget)
             {
-                self.accept(fresh);
+                self.accept_turned(fresh, grown, &[], elapsed, &mut budget);
                 return None;
             }
             // The first frames may have been misread; later it is likelier that somebody has turned or stopped: the same with a manoeuvre since
@@ -155,21 +157,11 @@ impl SequenceEstimator {
             if turned.is_empty() && is_young && self.search_again(time_s, is_over) {
                 return None;
             }
-            let unit = 1.0 / self.ground_m();
             let everybody: Vec<usize> = (0..self.window.len()).collect();
             for who in [turned, everybody].into_iter().filter(|who| !who.is_empty()) {
-                let mut opened = self.window.total.clone();
-                open(&mut opened, &who, elapsed, unit);
-                let mut fresh = self.fresh(opened, time_s);
-                who.iter()
-                    .for_each(|&e| fresh.targets[e].straying = Straying::default());
-                let fresh = self.fit(fresh, &mut budget);
-                if let Some(fresh) = self.explain(fresh, scale, &mut budget) {
-                    let all = self.window.snapshots.len();
-                    self.window.fold(all);
-                    open(&mut self.window.prior, &who, elapsed, unit);
-                    self.left.clear();
-                    self.accept(fresh);
+                let fresh = self.turned(&who, 0.5 * elapsed, &mut budget);
+                if let Some(grown) = self.explain(fresh.clone(), scale, &mut budget) {
+                    self.accept_turned(fresh, grown, &who, elapsed, &mut budget);
                     return None;
                 }
             }
@@ -216,6 +208,54 @@ impl SequenceEstimator {
         let has_newcomers = !(before..after).contains(&found.emitters.len());
         let fresh = if has_newcomers { grown } else { fresh };
         fresh.is_last_explained().then_some(fresh)
+    }
+
+    /// The newest frame fitted to what is remembered, where these targets may have changed their velocity `since_s` seconds ago.
+    fn turned(&mut self, who: &[usize], since_s: f64, budget: &mut WorkBudget) -> Window {
+        let mut opened = self.window.total.clone();
+        open(&mut opened, who, since_s, 1.0 / self.ground_m());
+        let mut fresh = self.fresh(opened, self.window.time_s);
+        who.iter()
+            .for_each(|&e| fresh.targets[e].straying = Straying::default());
+        self.fit(fresh, budget)
+    }
+
+    /// Makes the newest frame, fitted and `grown` by newcomers, part of the window, in which these targets may have changed their velocity
+    /// since the frame before. Newcomers beside others have to explain it better than that these have turned.
+    fn accept_turned(
+        &mut self,
+        fresh: Window,
+        mut grown: Window,
+        who: &[usize],
+        elapsed: f64,
+        budget: &mut WorkBudget,
+    ) {
+        let (mut who, mut since_s) = (who.to_vec(), 0.5 * elapsed);
+        let newcomers: Vec<[f64; 2]> = (self.window.len()..grown.len()).map(|e| grown.place(e)).collect();
+        let mut doubted = fresh.beside(&newcomers);
+        doubted.retain(|e| !who.contains(e));
+        if !doubted.is_empty() {
+            doubted.extend(&who);
+            let lately = 0.5 * LATELY * elapsed;
+            let turned = self.turned(&doubted, lately, budget);
+            let [as_is, with_newcomers, with_turn] =
+                self.with_search(budget, |_, search| [&fresh, &grown, &turned].map(|w| search.score(w)));
+            let can_stay = fresh.is_last_explained() && as_is < with_turn + SURPRISE;
+            if with_turn + TURN_PENALTY < with_newcomers {
+                if can_stay {
+                    grown = fresh;
+                } else if turned.is_last_explained() {
+                    (grown, who, since_s) = (turned, doubted, lately);
+                }
+            }
+        }
+        if !who.is_empty() {
+            let (all, unit) = (self.window.snapshots.len(), 1.0 / self.ground_m());
+            self.window.fold(all);
+            open(&mut self.window.prior, &who, since_s, unit);
+            self.left.clear();
+        }
+        self.accept(grown);
     }
 
     /// Searches the frames of the window together with the loaded one, as what is remembered may be wrong. Whether that explains it.
@@ -267,7 +307,9 @@ impl SequenceEstimator {
             let at = |k: usize| fresh.state[STATE * e + k];
             window.insert(fresh.targets[e], [at(0), at(1)], [at(2), at(3)]);
         }
-        window.targets = fresh.targets;
+        for (target, fresh) in window.targets.iter_mut().zip(&fresh.targets) {
+            target.straying = fresh.straying;
+        }
         window.state = fresh.state;
         window.total = fresh.total;
         window.snapshots.append(&mut fresh.snapshots);
@@ -322,7 +364,7 @@ impl SequenceEstimator {
     fn drop_unconfirmed(&mut self, is_over: &dyn Fn() -> bool) {
         let mut budget = WorkBudget::new(is_over);
         self.with_search(&mut budget, |window, search| {
-            let targets = unconfirmed(window, search.penalty);
+            let targets = search.unconfirmed(window);
             window.discard(search.engine, &targets);
         });
     }
@@ -363,15 +405,8 @@ impl SequenceEstimator {
 
     /// Runs `run` on the window, with what a search of the loaded frame's space needs.
     fn with_search<R>(&mut self, budget: &mut WorkBudget, run: impl FnOnce(&mut Window, &mut WindowSearch) -> R) -> R {
+        let speed_unit = 1.0 / self.ground_m();
         let (space, _, _) = self.single.loaded();
-        let span_s = self
-            .window
-            .snapshots
-            .first()
-            .map_or(0.0, |s| self.window.time_s - s.time_s);
-        let courses = courses(self.window.unknown[1].sqrt(), span_s);
-        // What many frames take for an emitter stays as long as they do.
-        let frames = self.window.snapshots.len().max(1) as f64;
         let mut engine = Engine {
             bases: &space.bases,
             rules: self.rules,
@@ -381,7 +416,8 @@ impl SequenceEstimator {
         let mut search = WindowSearch {
             engine: &mut engine,
             matched_filter: &mut space.matched_filter,
-            penalty: space.source_penalty + 2.0 * (courses * frames).ln(),
+            chances: Chances::new(&self.window, space.source_penalty),
+            speed_unit,
             left: Vec::new(),
         };
         run(&mut self.window, &mut search)

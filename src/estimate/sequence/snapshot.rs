@@ -13,6 +13,7 @@ use crate::estimate::model::bases::Bases;
 use crate::estimate::model::compressed_frame::CompressedFrame;
 use crate::estimate::model::hypothesis::{Hypothesis, Nuisances, PointSource};
 use crate::estimate::rules::Rules;
+use crate::estimate::sequence::target::Light;
 
 /// Relative increase of the energies' information before it is factorised: sources at one place leave it singular.
 const RIDGE: f64 = 1e-13;
@@ -140,6 +141,21 @@ impl LocalQuadratic {
             is_lit,
             positions,
         }
+    }
+
+    /// −2 ln L of the frame with its emitters at `positions`, as far as the quadratic holds.
+    pub fn cost(&self, positions: &DVector<f64>) -> f64 {
+        let step = positions - &self.positions;
+        self.deviance - 2.0 * self.gradient.dot(&step) + (&self.information * &step).dot(&step)
+    }
+
+    /// What the light of each emitter weighs; none, where the frame was not linearised yet.
+    pub fn lights(&self) -> impl Iterator<Item = Light> {
+        let energies = self.energies.iter().zip(&self.energy_variances);
+        energies.zip(&self.is_lit).map(|((energy, variance), is_lit)| Light {
+            evidence: energy * energy / variance,
+            lit: f64::from(*is_lit),
+        })
     }
 }
 

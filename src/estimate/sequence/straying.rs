@@ -1,33 +1,59 @@
 //! Who has left their straight course.
 
-use nalgebra::Vector2;
+use nalgebra::{Matrix2, Vector2};
 
 /// Frames over which changes of an emitter's position are added up: the newest alone shows a corner, more of them a bend.
 const MEMORIES: [f64; 3] = [1.0, 8.0, 32.0];
 /// Squared standard deviations of such a sum from which an emitter has turned: by chance once in 270,000 frames, and what it costs is
 /// the knowledge of one velocity. More leaves bends to the search of the window, which takes them for newcomers; 18 loses melted emitters.
-const SURPRISE: f64 = 25.0;
+pub(crate) const SURPRISE: f64 = 25.0;
+
+/// ln of the prior odds that an emitter is leaving its straight course, and the variance of the sum's mean where it is, in units of the sum's
+/// own. Higher odds give standing users errors that are not there, lower ones walkers too small ones at corners.
+const LN_ODDS: f64 = -4.0;
+const SPREAD: f64 = 10.0;
 
 /// How an emitter has strayed from its straight course over the last frames: sums of the changes of its position by each of them, in their
 /// standard deviations, over memories of `MEMORIES` frames.
 #[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct Straying([(Vector2<f64>, f64); MEMORIES.len()]);
+pub(crate) struct Straying {
+    sums: [(Vector2<f64>, f64); MEMORIES.len()],
+    /// The error that is left in the position, σ, where a frame has changed it by a standard deviation.
+    left: Matrix2<f64>,
+}
 
 impl Straying {
-    /// Takes a new frame's change. Whether chance does not explain the changes of some memory.
-    pub fn add(&mut self, change: Vector2<f64>) -> bool {
-        for ((sum, variance), frames) in self.0.iter_mut().zip(MEMORIES) {
+    /// Takes a new frame's change, in its standard deviations, and what error it leaves for each of these, σ. Whether chance does not explain
+    /// the changes of some memory.
+    pub fn add(&mut self, change: Vector2<f64>, left: Matrix2<f64>) -> bool {
+        self.left = left;
+        for ((sum, variance), frames) in self.sums.iter_mut().zip(MEMORIES) {
             let kept = 1.0 - 1.0 / frames;
             *sum = kept * *sum + change;
             *variance = kept * kept * *variance + 1.0;
         }
-        self.0.iter().any(|(sum, v)| sum.norm_squared() > SURPRISE * v)
+        self.sums.iter().any(|(sum, v)| sum.norm_squared() > SURPRISE * v)
+    }
+
+    /// The second moment of how far the fitted position is behind, σ², over whether the emitter has left its course, by the memory that tells
+    /// most of it. The position itself stays: moved by the expected lag, those of straight walkers and of who stands would be worse.
+    pub fn lag(&self) -> Matrix2<f64> {
+        let z2 = |(sum, v): &(Vector2<f64>, f64)| sum.norm_squared() / v.max(1.0);
+        let sums = self.sums.iter().zip(MEMORIES);
+        let Some((most, frames)) = sums.max_by(|(a, _), (b, _)| z2(a).total_cmp(&z2(b))) else {
+            return Matrix2::zeros();
+        };
+        let gain = SPREAD / (1.0 + SPREAD);
+        let odds = (LN_ODDS + 0.5 * gain * z2(most) - (1.0 + SPREAD).ln()).exp();
+        let mean = gain / frames * (self.left * most.0);
+        let own = gain * most.1 / (frames * frames) * self.left * self.left.transpose();
+        odds / (1.0 + odds) * (own + mean * mean.transpose())
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use nalgebra::Vector2;
+    use nalgebra::{Matrix2, Vector2};
     use rand::SeedableRng;
     use rand_chacha::ChaCha8Rng;
     use rand_distr::{Distribution, StandardNormal};
@@ -39,15 +65,39 @@ mod tests {
         let mut rng = ChaCha8Rng::seed_from_u64(1);
         let mut noise = || Vector2::from_fn(|_, _| StandardNormal.sample(&mut rng));
         let mut straying = Straying::default();
-        let by_chance = (0..20_000).filter(|_| straying.add(noise())).count();
+        let by_chance = (0..20_000)
+            .filter(|_| straying.add(noise(), Matrix2::identity()))
+            .count();
         assert!(by_chance <= 2, "{by_chance} times by chance");
         let frames_until = |bias: f64, noise: &mut dyn FnMut() -> Vector2<f64>| {
             let mut straying = Straying::default();
-            (1..100).find(|_| straying.add(noise() + Vector2::new(bias, 0.0)))
+            (1..100).find(|_| straying.add(noise() + Vector2::new(bias, 0.0), Matrix2::identity()))
         };
         assert_eq!(frames_until(9.0, &mut noise), Some(1));
         // Two standard deviations a frame are 5.3 of eight frames.
         let bend = frames_until(2.0, &mut noise).expect("a bend is seen");
         assert!((3..16).contains(&bend), "after {bend} frames");
+    }
+
+    #[test]
+    fn who_strays_may_be_elsewhere_and_who_does_not_is_where_expected() {
+        // One coordinate, filtered with a gain of a tenth: a change has a standard deviation of 0.316 of the measurement's, and leaves 0.9 of
+        // the error that it is a tenth of.
+        let (gain, std) = (0.1, 0.1f64.sqrt());
+        let lag_of = |error: f64| {
+            let mut straying = Straying::default();
+            for _ in 0..8 {
+                straying.add(
+                    Vector2::new(gain * error / std, 0.0),
+                    Matrix2::identity() * std * (1.0 - gain) / gain,
+                );
+            }
+            straying.lag()
+        };
+        let far = lag_of(8.0)[(0, 0)].sqrt();
+        // Eight frames of a sum that forgets over eight hold two thirds of it.
+        assert!((0.5..1.0).contains(&(far / (0.9 * 8.0))), "{far}");
+        let near = lag_of(0.5)[(0, 0)].sqrt();
+        assert!(near < 0.3 * std && near < 0.1 * far, "{near}");
     }
 }

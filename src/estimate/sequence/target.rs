@@ -19,6 +19,22 @@ pub(crate) struct Target {
     /// ln of the evidence that it has gone dark over that it has not, never below zero.
     pub darkness: f64,
     pub straying: Straying,
+    /// Of frames that have left the window.
+    pub folded: Light,
+}
+
+/// What an emitter's light weighs in some frames: Σ a²/var(a), and the number of those that it lights.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Light {
+    pub evidence: f64,
+    pub lit: f64,
+}
+
+impl Light {
+    pub fn add(&mut self, other: Self) {
+        self.evidence += other.evidence;
+        self.lit += other.lit;
+    }
 }
 
 impl Target {
@@ -30,6 +46,7 @@ impl Target {
             frames: 0.0,
             darkness: 0.0,
             straying: Straying::default(),
+            folded: Light::default(),
         }
     }
 

@@ -5,7 +5,7 @@ use nalgebra::DVector;
 use crate::estimate::model::hypothesis::OVERLAPPING;
 use crate::estimate::sequence::joint_information::{JointInformation, STATE};
 use crate::estimate::sequence::snapshot::{Energies, Engine, LocalQuadratic, Snapshot};
-use crate::estimate::sequence::target::Target;
+use crate::estimate::sequence::target::{Light, Target};
 
 /// Damping λ: first value and range, as in the fit of one frame.
 const LAMBDA_START: f64 = 1e-3;
@@ -73,6 +73,18 @@ impl Window {
         (0..self.len()).filter(|&e| self.targets[e].is_in(time_s)).collect()
     }
 
+    /// The target's position, σ.
+    pub fn place(&self, e: usize) -> [f64; 2] {
+        [self.state[STATE * e], self.state[STATE * e + 1]]
+    }
+
+    /// Who of the present targets overlaps with a spot at one of these places.
+    pub fn beside(&self, places: &[[f64; 2]]) -> Vec<usize> {
+        let is_near = |[x, y]: [f64; 2]| places.iter().any(|at| (x - at[0]).hypot(y - at[1]) < OVERLAPPING);
+        let present = self.present(self.time_s).into_iter();
+        present.filter(|&e| is_near(self.place(e))).collect()
+    }
+
     /// Positions of the targets that a frame at `time_s` may hold.
     pub fn positions(&self, state: &DVector<f64>, time_s: f64) -> DVector<f64> {
         let dt = time_s - self.time_s;
@@ -122,14 +134,20 @@ impl Window {
         self.total.marginalise(e);
     }
 
-    /// Moves the `count` oldest snapshots into the prior.
-    pub fn fold(&mut self, count: usize) {
+    /// Moves the `count` oldest snapshots into the prior. Returns what this takes off the cost of the state.
+    pub fn fold(&mut self, count: usize) -> f64 {
         let mut prior = std::mem::take(&mut self.prior);
+        let mut cost = prior.cost(&self.state);
         prior.recentre(&self.state);
         for snapshot in self.snapshots.drain(..count).collect::<Vec<_>>() {
+            cost += snapshot.local.cost(&self.positions(&self.state, snapshot.time_s));
             self.absorb(&mut prior, &snapshot.local, snapshot.time_s);
+            for (e, light) in self.present(snapshot.time_s).into_iter().zip(snapshot.local.lights()) {
+                self.targets[e].folded.add(light);
+            }
         }
         self.prior = prior;
+        cost
     }
 
     /// Forgets who died before the first snapshot that is left.
@@ -267,17 +285,19 @@ impl Window {
         Some(self.total.factor(1e-13)?.inverse())
     }
 
-    /// Number of snapshots that each target lights.
-    pub fn lit(&self) -> Vec<f64> {
-        let mut lit = vec![self.dropped; self.len()];
+    /// What the light of each target weighs in the snapshots.
+    pub fn lights(&self) -> Vec<Light> {
+        let dropped = Light {
+            evidence: 0.0,
+            lit: self.dropped,
+        };
+        let mut sums = vec![dropped; self.len()];
         for s in &self.snapshots {
-            // A snapshot that was not linearised yet says nothing of its energies.
-            let is_lit = s.local.is_lit.iter().map(|l| f64::from(*l));
-            for (e, share) in self.present(s.time_s).into_iter().zip(is_lit) {
-                lit[e] += share;
+            for (e, light) in self.present(s.time_s).into_iter().zip(s.local.lights()) {
+                sums[e].add(light);
             }
         }
-        lit
+        sums
     }
 
     /// Whether noise alone explains what the newest snapshot leaves.

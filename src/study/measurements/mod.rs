@@ -31,15 +31,19 @@ pub struct Measurement {
 
 enum Run {
     Whole(fn(stories: u64, seed: u64) -> Measured),
+    /// Of the program with an estimator, the default one where none is named.
+    With(fn(stories: u64, seed: u64, estimator: Option<&str>) -> Measured),
     /// Of the rows that are named; each is said as soon as it is measured.
     Rows(fn(stories: u64, seed: u64, only: &[String], say: Say) -> Measured),
 }
 
 impl Measurement {
-    /// Measures `stories` stories, whose seeds begin with `seed`; where a measurement has rows, those that `only` names, and says each.
-    pub fn run(&self, stories: u64, seed: u64, only: &[String], say: Say) -> Measured {
+    /// Measures `stories` stories, whose seeds begin with `seed`; where a measurement has rows, those that `only` names, and says each; where
+    /// frames are of pixels, with the named estimator.
+    pub fn run(&self, stories: u64, seed: u64, only: &[String], estimator: Option<&str>, say: Say) -> Measured {
         match self.run {
             Run::Whole(run) => run(stories, seed),
+            Run::With(run) => run(stories, seed, estimator),
             Run::Rows(run) => run(stories, seed, only, say),
         }
     }
@@ -56,12 +60,12 @@ pub const ALL: &[Measurement] = &[
     measurement("lamps", 40, lamps::lamps),
     measurement("headlights", 40, lamps::headlights),
     measurement("zones", 40, zones::known_lights_and_zones),
-    measurement("honest-pixels", 15, pixels::honest_users),
-    measurement("honest-crowd", 15, pixels::honest_crowd),
-    measurement("stranger", 1500, pixels::strangers),
-    measurement("stranger-near", 300, pixels::strangers_near),
-    measurement("stranger-in-crowd", 200, pixels::strangers_in_crowd),
-    measurement("shadow", 10, pixels::shadows),
+    with("honest-pixels", 15, pixels::honest_users),
+    with("honest-crowd", 15, pixels::honest_crowd),
+    with("stranger", 1500, pixels::strangers),
+    with("stranger-near", 300, pixels::strangers_near),
+    with("stranger-in-crowd", 200, pixels::strangers_in_crowd),
+    with("shadow", 10, pixels::shadows),
     measurement("flights", 10, flights::flights),
     measurement("calibration", 5, calibration::error_left),
     rows("lens", 40, lens::uncalibrated),
@@ -78,6 +82,14 @@ const fn measurement(name: &'static str, stories: u64, run: fn(u64, u64) -> Meas
         name,
         stories,
         run: Run::Whole(run),
+    }
+}
+
+const fn with(name: &'static str, stories: u64, run: fn(u64, u64, Option<&str>) -> Measured) -> Measurement {
+    Measurement {
+        name,
+        stories,
+        run: Run::With(run),
     }
 }
 

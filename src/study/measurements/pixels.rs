@@ -34,28 +34,35 @@ const SHADOW_COMES_S: f64 = 60.0;
 const GOAL: f64 = 0.998;
 
 /// The four users and whom `toml` names, for so long; what was raised, by seed.
-fn told(stories: u64, seed: u64, seconds: f64, toml: impl Fn(u64) -> String + Sync) -> Vec<(u64, Raised)> {
+fn told(
+    stories: u64,
+    seed: u64,
+    estimator: Option<&str>,
+    seconds: f64,
+    toml: impl Fn(u64) -> String + Sync,
+) -> Vec<(u64, Raised)> {
     let seeds = (seed..seed + stories).into_par_iter();
     let tell = |k| {
         let mut story = PixelStory::with(k, &toml(k));
         story.seconds = seconds;
+        story.config.estimator.name = estimator.map(str::to_owned);
         (k, review(&story).raised())
     };
     seeds.map(tell).collect()
 }
 
 /// Users of whom two roam near each other and one drives raise nothing.
-pub fn honest_users(stories: u64, seed: u64) -> Measured {
-    peace(stories, seed, BUSY)
+pub fn honest_users(stories: u64, seed: u64, estimator: Option<&str>) -> Measured {
+    peace(stories, seed, estimator, BUSY)
 }
 
 /// Users who stand so near each other that a frame hardly ever tells them all apart raise nothing.
-pub fn honest_crowd(stories: u64, seed: u64) -> Measured {
-    peace(stories, seed, CROWD)
+pub fn honest_crowd(stories: u64, seed: u64, estimator: Option<&str>) -> Measured {
+    peace(stories, seed, estimator, CROWD)
 }
 
-fn peace(stories: u64, seed: u64, toml: &str) -> Measured {
-    let mut raised = told(stories, seed, HONEST_S, |_| toml.to_owned());
+fn peace(stories: u64, seed: u64, estimator: Option<&str>, toml: &str) -> Measured {
+    let mut raised = told(stories, seed, estimator, HONEST_S, |_| toml.to_owned());
     raised.retain(|(_, raised)| !raised.is_empty());
     let frames = stories as f64 * HONEST_S * RATE_HZ;
     Measured {
@@ -89,8 +96,8 @@ fn within(delays: &[f64], s: f64) -> usize {
 }
 
 /// A stranger anywhere in view, as strong as the users.
-pub fn strangers(stories: u64, seed: u64) -> Measured {
-    let mut raised = told(stories, seed, STRANGER_S, |k| {
+pub fn strangers(stories: u64, seed: u64, estimator: Option<&str>) -> Measured {
+    let mut raised = told(stories, seed, estimator, STRANGER_S, |k| {
         let mut rng = ChaCha8Rng::seed_from_u64(k);
         let [x, y] = [0; 2].map(|_| rng.random_range(-120.0..120.0f64));
         intruder(COMES_S, 1.0, &format!("still = [{x}, {y}]"))
@@ -111,7 +118,7 @@ pub fn strangers(stories: u64, seed: u64) -> Measured {
 }
 
 /// The same within 5 m of one of the users, uniformly over that ground.
-pub fn strangers_near(stories: u64, seed: u64) -> Measured {
+pub fn strangers_near(stories: u64, seed: u64, estimator: Option<&str>) -> Measured {
     let place = |k: u64| {
         let mut rng = ChaCha8Rng::seed_from_u64(k);
         let (r, angle) = (
@@ -120,7 +127,7 @@ pub fn strangers_near(stories: u64, seed: u64) -> Measured {
         );
         (r, angle, rng.random_range(1..=4))
     };
-    let raised = told(stories, seed, STRANGER_S, |k| {
+    let raised = told(stories, seed, estimator, STRANGER_S, |k| {
         let (r, angle, user) = place(k);
         let offset_m = [r * angle.cos(), r * angle.sin()];
         intruder(COMES_S, 1.0, &beside(&format!("u-{user}"), offset_m))
@@ -142,8 +149,8 @@ pub fn strangers_near(stories: u64, seed: u64) -> Measured {
 }
 
 /// A stranger within 20 m of the middle of a crowd.
-pub fn strangers_in_crowd(stories: u64, seed: u64) -> Measured {
-    let raised = told(stories, seed, COMES_IN_CROWD_S + 20.0, |k| {
+pub fn strangers_in_crowd(stories: u64, seed: u64, estimator: Option<&str>) -> Measured {
+    let raised = told(stories, seed, estimator, COMES_IN_CROWD_S + 20.0, |k| {
         let mut rng = ChaCha8Rng::seed_from_u64(k);
         let (r, angle) = (
             20.0 * rng.random::<f64>().sqrt(),
@@ -176,13 +183,13 @@ pub fn strangers_in_crowd(stories: u64, seed: u64) -> Measured {
 
 /// A stranger who comes on beside a user and stays, by distance and by power as a share of the user's: how many are alerted within
 /// 20 s, and the median and longest delay. From how far all are found is a requirement; so is that nothing else is raised.
-pub fn shadows(stories: u64, seed: u64) -> Measured {
+pub fn shadows(stories: u64, seed: u64, estimator: Option<&str>) -> Measured {
     let mut text = "| power | m from the user | found | median s | longest s | something else first |\n".to_owned();
     text += "|---|---|---|---|---|---|\n";
     let mut holds = true;
     for (power_w, found_from_m) in [(1.0, 0.0), (0.5, 2.0), (0.25, 3.0)] {
         for beside_m in [0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 6.0] {
-            let raised = told(stories, seed, SHADOW_COMES_S + 20.0, |k| {
+            let raised = told(stories, seed, estimator, SHADOW_COMES_S + 20.0, |k| {
                 let angle = 2.4 * k as f64;
                 let offset_m = [beside_m * angle.cos(), beside_m * angle.sin()];
                 intruder(SHADOW_COMES_S, power_w, &beside("u-2", offset_m))
