@@ -85,6 +85,29 @@ fn an_eavesdropper_that_follows_a_walking_user_is_alerted() {
     }
 }
 
+/// Half a user's light, 2 m away: a frame alone hardly shows it, and the user's brightness tells only after some seven seconds.
+#[test]
+fn frames_together_show_an_eavesdropper_in_a_users_spot() {
+    let mut delays: Vec<f64> = (0..5)
+        .map(|seed| {
+            let mut story = Story::with(
+                seed,
+                "[[intruder]]\nname = \"shadow\"\npower_w = 0.5\n\
+                 motion.beside = { user = \"u-2\", offset_m = [1.4, 1.4] }\npresent = { from_s = 30 }",
+            );
+            story.config.estimator.name = Some("sequence".to_owned());
+            story.seconds = 50.0;
+            let raised = review(&story).raised();
+            let [(UnclaimedEmitter, None, at)] = raised[..] else {
+                panic!("{raised:?}");
+            };
+            at - 30.0
+        })
+        .collect();
+    delays.sort_by(f64::total_cmp);
+    assert!(delays[0] > 0.0 && delays[2] < 4.0, "{delays:?}");
+}
+
 #[test]
 fn a_slow_drift_away_from_a_claim_is_one_mismatch() {
     for seed in 0..3 {

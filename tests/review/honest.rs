@@ -89,6 +89,17 @@ fn a_crowd_raises_nothing() {
     }
 }
 
+/// Seeds at which a newcomer beside somebody who bends their way was taken for a stranger for seconds.
+#[test]
+fn a_crowd_that_bends_its_ways_raises_nothing_with_frames_together() {
+    for (seed, seconds) in [(5, 20.0), (8, 30.0), (13, 30.0), (15, 50.0)] {
+        let mut story = Story::with(seed, CROWD);
+        story.config.estimator.name = Some("sequence".to_owned());
+        story.seconds = seconds;
+        review(&story).expect(&[]);
+    }
+}
+
 #[test]
 fn claims_late_and_lost_raise_nothing() {
     for seed in 0..3 {

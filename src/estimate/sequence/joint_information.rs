@@ -36,6 +36,29 @@ impl JointInformation {
         self.at.copy_from(state);
     }
 
+    /// Adds what a frame `dt` seconds later says of the positions of some emitters: its gradient at `at` and its information.
+    pub fn absorb(&mut self, emitters: &[usize], dt: f64, gradient: &DVector<f64>, information: &DMatrix<f64>) {
+        for (i, &e) in emitters.iter().enumerate() {
+            for k in 0..2 {
+                let row = STATE * e + k;
+                self.gradient[row] += gradient[2 * i + k];
+                self.gradient[row + 2] += dt * gradient[2 * i + k];
+            }
+            for (j, &f) in emitters.iter().enumerate() {
+                for k in 0..2 {
+                    for l in 0..2 {
+                        let v = information[(2 * i + k, 2 * j + l)];
+                        let (r, c) = (STATE * e + k, STATE * f + l);
+                        self.information[(r, c)] += v;
+                        self.information[(r + 2, c)] += dt * v;
+                        self.information[(r, c + 2)] += dt * v;
+                        self.information[(r + 2, c + 2)] += dt * dt * v;
+                    }
+                }
+            }
+        }
+    }
+
     /// Adds an emitter of which only the variances of position and velocity are known.
     pub fn insert(&mut self, state: [f64; STATE], variance: [f64; 2]) {
         let n = self.at.len();

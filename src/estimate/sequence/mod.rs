@@ -5,6 +5,7 @@
 //! Recent frames are kept as a window that is fitted anew where its linearisation no longer holds; older ones leave it as information on
 //! all positions and velocities together.
 
+mod chances;
 mod joint_information;
 mod motion;
 mod report;
@@ -17,6 +18,7 @@ mod snapshot;
 mod straying;
 mod subspace;
 mod target;
+mod upkeep;
 mod window;
 
 pub(crate) use sequence_estimator::SequenceEstimator;

@@ -4,9 +4,11 @@ use nalgebra::{DMatrix, DVector, Matrix2, Vector2};
 
 use crate::estimate::emitter::Velocity;
 use crate::estimate::sequence::joint_information::{JointInformation, STATE};
-use crate::estimate::sequence::window::{SPEED_STD_M_S, Window};
+use crate::estimate::sequence::window::Window;
 use crate::optics::Camera;
 
+/// Standard deviation of a speed that is not known, m/s: cars in town. It only keeps the first frames' normal equations regular.
+pub(crate) const SPEED_STD_M_S: f64 = 8.0;
 /// Standard deviations of a speed along an axis, m/s, that emitters of a scene may have: all stand still, walk, cycle, drive.
 const SPEEDS_M_S: [f64; 4] = [0.01, 0.7, 2.5, SPEED_STD_M_S];
 /// Standard deviation of a change of velocity, m/s: a walker who turns round; a car changes its by as much within two seconds.

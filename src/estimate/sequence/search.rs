@@ -3,8 +3,9 @@
 
 use crate::estimate::detect::matched_filter::MatchedFilter;
 use crate::estimate::model::hypothesis::{Nuisances, OVERLAPPING};
+use crate::estimate::sequence::chances::Chances;
 use crate::estimate::sequence::joint_information::STATE;
-use crate::estimate::sequence::motion::{courses, open};
+use crate::estimate::sequence::motion::open;
 use crate::estimate::sequence::residual_map::{ResidualSum, peaks, residual_map};
 use crate::estimate::sequence::snapshot::{Energies, Engine, LocalQuadratic, Snapshot};
 use crate::estimate::sequence::straying::Straying;
@@ -12,6 +13,8 @@ use crate::estimate::sequence::subspace::Subspace;
 use crate::estimate::sequence::target::Target;
 use crate::estimate::sequence::window::Window;
 
+/// Steps of a fit of the whole window.
+pub(crate) const WINDOW_STEPS: usize = 30;
 /// Steps of a fit before a hypothesis is compared, and before it is kept.
 pub(crate) const TRIAL_STEPS: usize = 40;
 pub(crate) const CONVERGE_STEPS: usize = 100;
@@ -29,51 +32,6 @@ pub(crate) const TURN_PENALTY: f64 = 6.0;
 const ROUNDS: usize = 12;
 /// Targets that are moved to the residual's peaks, the weakest first.
 pub(crate) const RELOCATED: usize = 3;
-
-/// Least decrease of the deviance that a source must bring when its energy is free in each of `frames` frames: the bound of χ² with that
-/// many degrees of freedom (Laurent and Massart, 2000, eq. 4.3) that one frame exceeds as rarely as `single`, the penalty in a lone frame.
-pub(crate) fn penalty(single: f64, frames: f64) -> f64 {
-    let root = 0.5 * ((2.0 * single - 1.0).sqrt() - 1.0);
-    frames + 2.0 * frames.sqrt() * root + 2.0 * root * root
-}
-
-/// The chances that noise has to look like an emitter in the frames of a window.
-pub(crate) struct Chances {
-    /// The penalty of a source in a lone frame.
-    single: f64,
-    /// Standard deviation of an unknown speed, σ/s.
-    speed_std: f64,
-    /// Times of the window's frames, s.
-    times_s: Vec<f64>,
-    now_s: f64,
-}
-
-impl Chances {
-    pub fn new(window: &Window, single: f64) -> Self {
-        Self {
-            single,
-            speed_std: window.unknown[1].sqrt(),
-            times_s: window.snapshots.iter().map(|s| s.time_s).collect(),
-            now_s: window.time_s,
-        }
-    }
-
-    /// The penalty of a source born at `born_s` that lights `lit` frames. It pays for the straight courses it may have taken, and what many
-    /// frames take for an emitter stays as long as they do.
-    pub fn penalty(&self, born_s: f64, lit: f64) -> f64 {
-        let first_s = self.times_s.first().map_or(self.now_s, |first| first.max(born_s));
-        let frames = self.times_s.iter().filter(|t| **t >= born_s).count().max(1) as f64;
-        let courses = courses(self.speed_std, self.now_s - first_s);
-        penalty(self.single + 2.0 * (courses * frames).ln(), lit)
-    }
-
-    /// The height of a residual map of `frames` frames from which an emitter born at `born_s` is tried: its noise, and this share of what a
-    /// source must bring beyond it.
-    fn beyond_noise(&self, born_s: f64, frames: f64, energies: Energies, share: f64) -> f64 {
-        let lit = energies.lit_by_noise() * frames;
-        lit + share * (self.penalty(born_s, lit) - lit)
-    }
-}
 
 /// A search of one window.
 pub(crate) struct WindowSearch<'s, 'a, 'b> {

@@ -13,31 +13,23 @@ use crate::estimate::estimators::list::EstimatorSpec;
 use crate::estimate::fit::work_budget::WorkBudget;
 use crate::estimate::model::hypothesis::Nuisances;
 use crate::estimate::rules::Rules;
+use crate::estimate::sequence::chances::Chances;
 use crate::estimate::sequence::joint_information::{JointInformation, STATE};
-use crate::estimate::sequence::motion::{open, surprised};
+use crate::estimate::sequence::motion::{SPEED_STD_M_S, open, surprised};
 use crate::estimate::sequence::report::report;
 use crate::estimate::sequence::residual_map::ResidualSum;
 use crate::estimate::sequence::revision_schedule::{RevisionSchedule, YOUNG};
-use crate::estimate::sequence::search::{Chances, TURN_PENALTY, WindowSearch};
+use crate::estimate::sequence::search::{TURN_PENALTY, WINDOW_STEPS, WindowSearch};
 use crate::estimate::sequence::snapshot::{Engine, LocalQuadratic, Snapshot};
 use crate::estimate::sequence::straying::{SURPRISE, Straying};
 use crate::estimate::sequence::target::Target;
-use crate::estimate::sequence::window::{SPEED_STD_M_S, Window};
+use crate::estimate::sequence::upkeep::{MAX_SNAPSHOTS, bury, most_snapshots, refresh};
+use crate::estimate::sequence::window::Window;
 use crate::frame::Frame;
 use crate::optics::{Camera, Smear};
 
-/// Evidence, ln, that a target has gone dark before it is dropped: false once in a million.
-const DARK: f64 = 14.0;
-/// Frames nearer in time than this count as one draw of the fading, s: the coherence time of a turbulent atmosphere.
-const COHERENCE_S: f64 = 0.01;
-/// Frames of the window, and the numbers that all of them may hold: bounds memory, and the time of a fit of the whole window.
-const MAX_SNAPSHOTS: usize = 128;
-const MAX_NUMBERS: usize = 1 << 20;
-/// Steps of a fit to a new frame, and of the whole window.
+/// Steps of a fit to a new frame.
 const FRAME_STEPS: usize = 12;
-const WINDOW_STEPS: usize = 30;
-/// Snapshots that are linearised anew with a frame: more follow a change sooner, each costs as much as a step of the frame's own fit.
-const REFRESHED: usize = 8;
 /// Who stands beside a newcomer may have turned in so many frames instead.
 const LATELY: f64 = 8.0;
 /// Work of a search that has to end with its frame, in frames' searches: where what is remembered explains nothing.
@@ -117,9 +109,7 @@ impl Estimator for SequenceEstimator {
         if let Some(alone) = self.take(time_s, elapsed, scale, is_over) {
             return Ok(alone);
         }
-        self.bury(elapsed, is_over);
-        self.drop_unconfirmed(is_over);
-        self.tend(is_over);
+        self.tend(elapsed, is_over);
         self.revise(is_over);
         let name = self.spec.name;
         Ok(report(
@@ -337,53 +327,19 @@ impl SequenceEstimator {
         is_explained.then_some(fresh)
     }
 
-    /// Ends targets that have gone dark or left the view: frames before hold them still.
-    fn bury(&mut self, elapsed: f64, is_over: &dyn Fn() -> bool) {
-        let (space, _, _) = self.single.loaded();
-        let ends = space.bases.axes().map(|b| b.min_position()..b.max_position());
-        let window = &mut self.window;
-        let Some(last) = window.snapshots.last() else { return };
-        let (time_s, weight) = (last.time_s, (elapsed / COHERENCE_S).clamp(0.0, 1.0));
-        let mut has_died = false;
-        for (i, e) in window.present(time_s).into_iter().enumerate() {
-            let target = &mut window.targets[e];
-            target.weigh(last.local.energies[i], last.local.energy_variances[i], weight);
-            let has_left = (0..2).any(|k| !ends[k].contains(&window.state[STATE * e + k]));
-            if target.darkness > DARK || has_left {
-                target.died_s = time_s;
-                has_died = true;
-            }
-        }
-        if has_died {
-            let mut budget = WorkBudget::new(is_over);
-            self.with_search(&mut budget, |window, search| window.relinearise_last(search.engine));
-        }
-    }
-
-    /// Forgets newcomers that the frames since have not confirmed.
-    fn drop_unconfirmed(&mut self, is_over: &dyn Fn() -> bool) {
+    /// Ends targets that are gone, forgets newcomers that were noise, and keeps the window within its bounds and linearised.
+    fn tend(&mut self, elapsed: f64, is_over: &dyn Fn() -> bool) {
+        let (space, compressed, _) = self.single.loaded();
+        let view = space.bases.axes().map(|b| b.min_position()..b.max_position());
+        let most = most_snapshots(compressed.mx * compressed.my);
         let mut budget = WorkBudget::new(is_over);
         self.with_search(&mut budget, |window, search| {
-            let targets = search.unconfirmed(window);
-            window.discard(search.engine, &targets);
+            bury(window, search.engine, &view, elapsed);
+            let noise = search.unconfirmed(window);
+            window.discard(search.engine, &noise);
         });
-    }
-
-    /// Keeps the window within its bounds, and linearised.
-    fn tend(&mut self, is_over: &dyn Fn() -> bool) {
-        let (_, compressed, _) = self.single.loaded();
-        let numbers = (compressed.mx * compressed.my).max(1);
-        let most = MAX_SNAPSHOTS.min(MAX_NUMBERS / numbers).max(2);
         let mut budget = WorkBudget::of_frames(SEARCH_WORK, is_over);
-        self.with_search(&mut budget, |window, search| {
-            if window.snapshots.len() > most {
-                window.fold(window.snapshots.len() - most);
-            }
-            window.forget_dead();
-            if window.refresh(search.engine, REFRESHED) && window.snapshots.len() <= REFRESHED {
-                window.fit(search.engine, WINDOW_STEPS);
-            }
-        });
+        self.with_search(&mut budget, |window, search| refresh(window, search.engine, most));
     }
 
     /// Searches the window for another number of emitters: begins when it has grown, and goes on with each frame for a share of its time.

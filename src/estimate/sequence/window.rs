@@ -15,8 +15,6 @@ const LAMBDA_CEILING: f64 = 1e8;
 const NEGLIGIBLE_DECREASE: f64 = 1e-3;
 /// Longest step of a position in one iteration, σ: the model is not linear farther out.
 const LONGEST_STEP: f64 = 0.5;
-/// Standard deviation of a speed that is not known, m/s: cars in town. It only keeps the first frames' normal equations regular.
-pub(crate) const SPEED_STD_M_S: f64 = 8.0;
 
 /// Standard deviations of χ² from which a frame contradicts what is remembered, as the flag `poor_fit` of one frame: nearer, noise alone would end the
 /// memory within hours.
@@ -81,8 +79,9 @@ impl Window {
     /// Who of the present targets overlaps with a spot at one of these places.
     pub fn beside(&self, places: &[[f64; 2]]) -> Vec<usize> {
         let is_near = |[x, y]: [f64; 2]| places.iter().any(|at| (x - at[0]).hypot(y - at[1]) < OVERLAPPING);
-        let present = self.present(self.time_s).into_iter();
-        present.filter(|&e| is_near(self.place(e))).collect()
+        let mut beside = self.present(self.time_s);
+        beside.retain(|&e| is_near(self.place(e)));
+        beside
     }
 
     /// Positions of the targets that a frame at `time_s` may hold.
@@ -164,29 +163,14 @@ impl Window {
 
     /// Adds a snapshot's likelihood to `knowledge`.
     pub fn absorb(&self, knowledge: &mut JointInformation, local: &LocalQuadratic, time_s: f64) {
-        let present = self.present(time_s);
-        let dt = time_s - self.time_s;
         let shift = self.positions(&knowledge.at, time_s) - &local.positions;
         let gradient = &local.gradient - &local.information * shift;
-        for (i, &e) in present.iter().enumerate() {
-            for k in 0..2 {
-                let row = STATE * e + k;
-                knowledge.gradient[row] += gradient[2 * i + k];
-                knowledge.gradient[row + 2] += dt * gradient[2 * i + k];
-            }
-            for (j, &f) in present.iter().enumerate() {
-                for k in 0..2 {
-                    for l in 0..2 {
-                        let v = local.information[(2 * i + k, 2 * j + l)];
-                        let (r, c) = (STATE * e + k, STATE * f + l);
-                        knowledge.information[(r, c)] += v;
-                        knowledge.information[(r + 2, c)] += dt * v;
-                        knowledge.information[(r, c + 2)] += dt * v;
-                        knowledge.information[(r + 2, c + 2)] += dt * dt * v;
-                    }
-                }
-            }
-        }
+        knowledge.absorb(
+            &self.present(time_s),
+            time_s - self.time_s,
+            &gradient,
+            &local.information,
+        );
     }
 
     /// Linearises all snapshots at `state`. Returns −2 ln L, and prior and snapshots together.
@@ -361,10 +345,8 @@ impl Window {
 
     /// Linearises the newest snapshot anew, as when one of its targets has turned out to be dark.
     pub fn relinearise_last(&mut self, engine: &mut Engine) {
-        if let Some(last) = self.snapshots.len().checked_sub(1) {
-            self.relinearise(engine, last);
-            self.step();
-        }
+        self.relinearise(engine, self.snapshots.len() - 1);
+        self.step();
     }
 
     /// Adds up the prior and the snapshots as they are linearised, and takes a Gauss–Newton step.
