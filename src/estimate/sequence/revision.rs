@@ -4,7 +4,7 @@
 use std::collections::VecDeque;
 
 use crate::estimate::sequence::search::{
-    CONVERGE_STEPS, RELOCATED, TRIAL_STEPS, TURN_PENALTY, WindowSearch, is_ambiguous,
+    BESIDE, CONVERGE_STEPS, RELOCATED, TRIAL_STEPS, TURN_PENALTY, WindowSearch, is_ambiguous,
 };
 use crate::estimate::sequence::straying::SURPRISE;
 use crate::estimate::sequence::target::Target;
@@ -71,7 +71,7 @@ impl Revision {
     pub fn begin(window: &Window, search: &WindowSearch, births: Vec<[f64; 2]>) -> Option<Self> {
         let mut proposals = VecDeque::from([Proposal::Same]);
         if !births.is_empty() {
-            proposals.push_back(Proposal::Turn(window.beside(&births)));
+            proposals.push_back(Proposal::Turn(window.beside(&births, BESIDE)));
         }
         proposals.extend(births.into_iter().map(Proposal::Birth));
         let is_ambiguous = is_ambiguous(window);

@@ -26,6 +26,9 @@ const TRIED_ALONE: f64 = 0.9;
 const PEAKS: usize = 3;
 /// Pairs nearer than this many standard deviations of their difference are ambiguous: the window is searched again.
 const AMBIGUOUS: f64 = 4.0;
+/// Distance, σ, within which who bends their way may be taken for a newcomer: farther, too many of melted scenes lose their velocities,
+/// nearer, those who cross are missed.
+pub(crate) const BESIDE: f64 = 1.5;
 /// Penalty of a change of velocity that explains what a newcomer would: walkers turn every some hundred frames.
 pub(crate) const TURN_PENALTY: f64 = 6.0;
 /// Rounds of births and deaths.

@@ -19,7 +19,7 @@ use crate::estimate::sequence::motion::{SPEED_STD_M_S, open, surprised};
 use crate::estimate::sequence::report::report;
 use crate::estimate::sequence::residual_map::ResidualSum;
 use crate::estimate::sequence::revision_schedule::{RevisionSchedule, YOUNG};
-use crate::estimate::sequence::search::{TURN_PENALTY, WINDOW_STEPS, WindowSearch};
+use crate::estimate::sequence::search::{BESIDE, TURN_PENALTY, WINDOW_STEPS, WindowSearch};
 use crate::estimate::sequence::snapshot::{Engine, LocalQuadratic, Snapshot};
 use crate::estimate::sequence::straying::{SURPRISE, Straying};
 use crate::estimate::sequence::target::Target;
@@ -222,7 +222,7 @@ impl SequenceEstimator {
     ) {
         let (mut who, mut since_s) = (who.to_vec(), 0.5 * elapsed);
         let newcomers: Vec<[f64; 2]> = (self.window.len()..grown.len()).map(|e| grown.place(e)).collect();
-        let mut doubted = fresh.beside(&newcomers);
+        let mut doubted = fresh.beside(&newcomers, BESIDE);
         doubted.retain(|e| !who.contains(e));
         if !doubted.is_empty() {
             doubted.extend(&who);

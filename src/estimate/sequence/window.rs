@@ -76,9 +76,9 @@ impl Window {
         [self.state[STATE * e], self.state[STATE * e + 1]]
     }
 
-    /// Who of the present targets overlaps with a spot at one of these places.
-    pub fn beside(&self, places: &[[f64; 2]]) -> Vec<usize> {
-        let is_near = |[x, y]: [f64; 2]| places.iter().any(|at| (x - at[0]).hypot(y - at[1]) < OVERLAPPING);
+    /// Who of the present targets is within `reach`, σ, of one of these places.
+    pub fn beside(&self, places: &[[f64; 2]], reach: f64) -> Vec<usize> {
+        let is_near = |[x, y]: [f64; 2]| places.iter().any(|at| (x - at[0]).hypot(y - at[1]) < reach);
         let mut beside = self.present(self.time_s);
         beside.retain(|&e| is_near(self.place(e)));
         beside

@@ -187,7 +187,7 @@ pub fn shadows(stories: u64, seed: u64, estimator: Option<&str>) -> Measured {
     let mut text = "| power | m from the user | found | median s | longest s | something else first |\n".to_owned();
     text += "|---|---|---|---|---|---|\n";
     let mut holds = true;
-    for (power_w, found_from_m) in [(1.0, 0.0), (0.5, 2.0), (0.25, 3.0)] {
+    for (power_w, found_from_m) in [(1.0, 0.0), (0.5, 2.0), (0.25, 3.0), (0.1, f64::INFINITY)] {
         for beside_m in [0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 6.0] {
             let raised = told(stories, seed, estimator, SHADOW_COMES_S + 20.0, |k| {
                 let angle = 2.4 * k as f64;
