@@ -93,9 +93,11 @@ pub(crate) fn velocity_on_ground(camera: &Camera, sensor_m: [f64; 2], velocity: 
     }
 }
 
-/// The targets of the fitted newest frame, on top of what was `known` before, that it or the frames before show elsewhere than straight on. The
-/// covariance of a change of position is what the variance falls by (Kalman, 1960), and successive changes are independent.
-pub(crate) fn surprised(known: &JointInformation, fresh: &mut Window) -> Vec<usize> {
+/// The targets of the fitted newest frame, `elapsed` seconds after what was `known` before, that it or the frames before show elsewhere than
+/// straight on. The covariance of a change of position is what the variance falls by (Kalman, 1960), and successive changes are independent.
+/// `unit` is 1 m/s in σ/s.
+pub(crate) fn surprised(known: &JointInformation, fresh: &mut Window, elapsed: f64, unit: f64) -> Vec<usize> {
+    let reach = MANOEUVRE_M_S * elapsed * unit;
     let of = |knowledge: &JointInformation| {
         let covariance = knowledge.factor(1e-13)?.inverse();
         Some((&knowledge.at + &covariance * &knowledge.gradient, covariance))
@@ -122,7 +124,7 @@ pub(crate) fn surprised(known: &JointInformation, fresh: &mut Window) -> Vec<usi
         let (Some(change), Some(left)) = (change, left) else {
             return false;
         };
-        fresh.targets[*e].straying.add(change, left)
+        fresh.targets[*e].straying.add(change, left, reach)
     };
     present.into_iter().filter(|e| is_surprised(e)).collect()
 }

@@ -42,13 +42,15 @@ pub(crate) struct Straying {
     sums: [Sum; MEMORIES.len()],
     /// The error that is left in the position, σ, where a frame has changed it by a standard deviation.
     left: Matrix2<f64>,
+    /// How far a turn leads astray in a frame, σ.
+    reach: f64,
 }
 
 impl Straying {
-    /// Takes a new frame's change, in its standard deviations, and what error it leaves for each of these, σ. Whether chance does not explain
-    /// the changes of some memory.
-    pub fn add(&mut self, change: Vector2<f64>, left: Matrix2<f64>) -> bool {
-        self.left = left;
+    /// Takes a new frame's change, in its standard deviations, what error it leaves for each of these, and how far a turn leads astray in a
+    /// frame, σ. Whether chance does not explain the changes of some memory.
+    pub fn add(&mut self, change: Vector2<f64>, left: Matrix2<f64>, reach: f64) -> bool {
+        (self.left, self.reach) = (left, reach);
         for (sum, frames) in self.sums.iter_mut().zip(MEMORIES) {
             sum.add(change, 1.0 - 1.0 / frames);
         }
@@ -66,7 +68,9 @@ impl Straying {
         let odds = (LN_ODDS + 0.5 * gain * most.z2() - (1.0 + SPREAD).ln()).exp();
         let mean = gain / most.frames * (self.left * most.changes);
         let own = gain * most.variance / most.frames.powi(2) * self.left * self.left.transpose();
-        odds / (1.0 + odds) * (own + mean * mean.transpose())
+        let error = own + mean * mean.transpose();
+        let farthest = (self.reach * most.frames).powi(2);
+        odds / (1.0 + odds) * (farthest / error.trace()).min(1.0) * error
     }
 }
 
@@ -85,12 +89,12 @@ mod tests {
         let mut noise = || Vector2::from_fn(|_, _| StandardNormal.sample(&mut rng));
         let mut straying = Straying::default();
         let by_chance = (0..20_000)
-            .filter(|_| straying.add(noise(), Matrix2::identity()))
+            .filter(|_| straying.add(noise(), Matrix2::identity(), 1.0))
             .count();
         assert!(by_chance <= 2, "{by_chance} times by chance");
         let frames_until = |bias: f64, noise: &mut dyn FnMut() -> Vector2<f64>| {
             let mut straying = Straying::default();
-            (1..100).find(|_| straying.add(noise() + Vector2::new(bias, 0.0), Matrix2::identity()))
+            (1..100).find(|_| straying.add(noise() + Vector2::new(bias, 0.0), Matrix2::identity(), 1.0))
         };
         assert_eq!(frames_until(9.0, &mut noise), Some(1));
         // Two standard deviations a frame are 5.3 of eight frames.
@@ -103,19 +107,23 @@ mod tests {
         // One coordinate, filtered with a gain of a tenth: a change has a standard deviation of 0.316 of the measurement's, and leaves 0.9 of
         // the error that it is a tenth of.
         let (gain, std) = (0.1, 0.1f64.sqrt());
-        let lag_of = |error: f64| {
+        let lag_of = |error: f64, reach: f64| {
             let mut straying = Straying::default();
             for _ in 0..8 {
                 straying.add(
                     Vector2::new(gain * error / std, 0.0),
                     Matrix2::identity() * std * (1.0 - gain) / gain,
+                    reach,
                 );
             }
             straying.lag()
         };
-        let far = lag_of(8.0)[(0, 0)].sqrt();
+        let far = lag_of(8.0, 10.0)[(0, 0)].sqrt();
         assert!((0.8..1.2).contains(&(far / (0.9 * 8.0))), "{far}");
-        let near = lag_of(0.5)[(0, 0)].sqrt();
+        let near = lag_of(0.5, 10.0)[(0, 0)].sqrt();
         assert!(near < 0.3 * std && near < 0.1 * far, "{near}");
+        // Nobody gets farther astray in eight frames than they can.
+        let slow = lag_of(8.0, 0.1)[(0, 0)].sqrt();
+        assert!(slow < 0.8, "{slow}");
     }
 }
