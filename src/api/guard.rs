@@ -260,6 +260,7 @@ mod tests {
         assert!((10..=12).contains(&let_through), "{let_through}");
         let others = (1..=100u8).map(|k| Client::Ip(IpAddr::from([198, 51, 100, k])));
         let served = others.filter(|o| rates.excess(*o).is_none()).count();
-        assert!(served >= 99, "{served} of 100 others; one may share the bucket");
+        // Each shares the bucket with a chance of 1 in 1024: more than six of a hundred once in 10¹¹ runs.
+        assert!(served >= 94, "{served} of 100 others");
     }
 }
