@@ -8,7 +8,6 @@ use crate::estimate::sequence::joint_information::STATE;
 use crate::estimate::sequence::motion::open;
 use crate::estimate::sequence::residual_map::{ResidualSum, peaks, residual_map};
 use crate::estimate::sequence::snapshot::{Energies, Engine, LocalQuadratic, Snapshot};
-use crate::estimate::sequence::straying::Straying;
 use crate::estimate::sequence::subspace::Subspace;
 use crate::estimate::sequence::target::Target;
 use crate::estimate::sequence::window::Window;
@@ -223,8 +222,7 @@ impl WindowSearch<'_, '_, '_> {
         let before = penalties(window);
         let folded = window.fold(half) + before - penalties(window);
         open(&mut window.prior, who, since_s, self.speed_unit);
-        who.iter()
-            .for_each(|&e| window.targets[e].straying = Straying::default());
+        who.iter().for_each(|&e| window.targets[e].straying.turn());
         Some(folded)
     }
 

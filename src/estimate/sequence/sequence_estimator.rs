@@ -21,7 +21,7 @@ use crate::estimate::sequence::residual_map::ResidualSum;
 use crate::estimate::sequence::revision_schedule::{RevisionSchedule, YOUNG};
 use crate::estimate::sequence::search::{BESIDE, TURN_PENALTY, WINDOW_STEPS, WindowSearch};
 use crate::estimate::sequence::snapshot::{Engine, LocalQuadratic, Snapshot};
-use crate::estimate::sequence::straying::{SURPRISE, Straying};
+use crate::estimate::sequence::straying::SURPRISE;
 use crate::estimate::sequence::target::Target;
 use crate::estimate::sequence::upkeep::{MAX_SNAPSHOTS, bury, most_snapshots, refresh};
 use crate::estimate::sequence::window::Window;
@@ -205,8 +205,7 @@ impl SequenceEstimator {
         let mut opened = self.window.total.clone();
         open(&mut opened, who, since_s, 1.0 / self.ground_m());
         let mut fresh = self.fresh(opened, self.window.time_s);
-        who.iter()
-            .for_each(|&e| fresh.targets[e].straying = Straying::default());
+        who.iter().for_each(|&e| fresh.targets[e].straying.turn());
         self.fit(fresh, budget)
     }
 

@@ -8,9 +8,11 @@ const MEMORIES: [f64; 3] = [1.0, 8.0, 32.0];
 /// the knowledge of one velocity. More leaves bends to the search of the window, which takes them for newcomers; 18 loses melted emitters.
 pub(crate) const SURPRISE: f64 = 25.0;
 
-/// ln of the prior odds that an emitter is leaving its straight course, and the variance of the sum's mean where it is, in units of the sum's
-/// own. Higher odds give standing users errors that are not there, lower ones walkers too small ones at corners.
-const LN_ODDS: f64 = -4.0;
+/// Turns for each that shows as one of `SURPRISE`, and the frames in which so many happen to somebody who is not known for it. Fewer turns leave
+/// walkers too small errors at corners, more give standing users errors that are not there.
+const TURNS: f64 = 4.0;
+const FRAMES: f64 = 1600.0;
+/// The variance of a sum's mean where an emitter has turned, in units of the sum's own.
 const SPREAD: f64 = 10.0;
 
 /// Changes added up over a memory: the older, the less they count.
@@ -40,6 +42,9 @@ impl Sum {
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Straying {
     sums: [Sum; MEMORIES.len()],
+    /// How many turns have shown, and in how many frames.
+    shown: f64,
+    frames: f64,
     /// The error that is left in the position, σ, where a frame has changed it by a standard deviation.
     left: Matrix2<f64>,
     /// How far a turn leads astray in a frame, σ.
@@ -51,21 +56,29 @@ impl Straying {
     /// frame, σ. Whether chance does not explain the changes of some memory.
     pub fn add(&mut self, change: Vector2<f64>, left: Matrix2<f64>, reach: f64) -> bool {
         (self.left, self.reach) = (left, reach);
+        self.frames += 1.0;
         for (sum, frames) in self.sums.iter_mut().zip(MEMORIES) {
             sum.add(change, 1.0 - 1.0 / frames);
         }
         self.sums.iter().any(|sum| sum.z2() > SURPRISE)
     }
 
+    /// The emitter has turned: what the frames have shown so far is of its course before.
+    pub fn turn(&mut self) {
+        self.sums = Default::default();
+        self.shown += 1.0;
+    }
+
     /// The second moment of how far the fitted position is behind, σ², over whether the emitter has left its course, by the memory that tells
-    /// most of it. The position itself stays: moved by the expected lag, those of straight walkers and of who stands would be worse.
+    /// most of it and by how often it has turned so far. The position itself stays: moved by the expected lag, those of straight walkers and of who stands would be worse.
     pub fn lag(&self) -> Matrix2<f64> {
         let most = self.sums.iter().max_by(|a, b| a.z2().total_cmp(&b.z2()));
         let Some(most) = most.filter(|sum| sum.frames > 0.0) else {
             return Matrix2::zeros();
         };
         let gain = SPREAD / (1.0 + SPREAD);
-        let odds = (LN_ODDS + 0.5 * gain * most.z2() - (1.0 + SPREAD).ln()).exp();
+        let turns = TURNS * (1.0 + self.shown) / (FRAMES + self.frames) * most.frames;
+        let odds = turns * (0.5 * gain * most.z2()).exp() / (1.0 + SPREAD);
         let mean = gain / most.frames * (self.left * most.changes);
         let own = gain * most.variance / most.frames.powi(2) * self.left * self.left.transpose();
         let error = own + mean * mean.transpose();
