@@ -2,9 +2,15 @@
 
 use crate::estimate::sequence::straying::Straying;
 
-/// Frames from which a target's mean energy is known well enough to miss it, and over how many it is averaged.
-const FEW: f64 = 3.0;
+/// Frames over which a target's mean energy is averaged.
 const MANY: f64 = 100.0;
+/// Evidence, ln, that a target has gone dark before it is dropped: false once in a million.
+const DARK: f64 = 14.0;
+/// A newcomer below so many standard deviations of its energy may be noise until a frame shows it again by so many, and is dropped on less
+/// evidence. More keeps noise until it is a track, less drops newcomers who fade.
+const FAINT: f64 = 9.0;
+const AGAIN: f64 = 4.0;
+const DARK_NEWCOMER: f64 = 2.5;
 
 /// An emitter that the window follows.
 #[derive(Clone, Copy, Debug)]
@@ -13,11 +19,13 @@ pub(crate) struct Target {
     pub born_s: f64,
     /// This frame and later ones do not hold it, s; it is forgotten with the last frame that does.
     pub died_s: f64,
-    /// Mean energy of its frames, and their number up to the length of the memory.
-    pub mean_energy: f64,
-    pub frames: f64,
+    /// Mean energy of its frames, and their number up to [`MANY`].
+    mean_energy: f64,
+    frames: f64,
+    /// Whether it may be noise.
+    is_doubtful: bool,
     /// ln of the evidence that it has gone dark over that it has not, never below zero.
-    pub darkness: f64,
+    darkness: f64,
     pub straying: Straying,
     /// Of frames that have left the window.
     pub folded: Light,
@@ -44,6 +52,7 @@ impl Target {
             died_s: f64::INFINITY,
             mean_energy: 0.0,
             frames: 0.0,
+            is_doubtful: false,
             darkness: 0.0,
             straying: Straying::default(),
             folded: Light::default(),
@@ -55,11 +64,20 @@ impl Target {
         self.born_s <= time_s && time_s < self.died_s
     }
 
-    /// Takes the energy that a frame measured, with its variance, at `weight` of an independent draw of the fading. The evidence is
-    /// between no light and light that is exponentially distributed about its mean, which no fading exceeds by much in the dark.
-    pub fn weigh(&mut self, energy: f64, variance: f64, weight: f64) {
+    /// Whether it has gone dark, or was noise.
+    pub fn is_dark(&self) -> bool {
+        self.darkness > if self.is_doubtful { DARK_NEWCOMER } else { DARK }
+    }
+
+    /// Takes the energy that the frame at `time_s` measured, with its variance, at `weight` of an independent draw of the fading. The evidence
+    /// is between no light and light that is exponentially distributed about its mean, which no fading exceeds by much in the dark.
+    pub fn weigh(&mut self, time_s: f64, energy: f64, variance: f64, weight: f64) {
         let std = variance.sqrt();
-        if self.frames >= FEW && self.mean_energy > 0.0 && std.is_finite() {
+        self.is_doubtful = match self.frames > 0.0 {
+            false => self.born_s == time_s && energy < FAINT * std,
+            true => self.is_doubtful && energy < AGAIN * std,
+        };
+        if self.frames > 0.0 && self.mean_energy > 0.0 && std.is_finite() {
             let z = energy / std - std / self.mean_energy;
             // e^{z²/2}·Φ(z), by its asymptote where Φ underflows.
             let tail = if z < -6.0 {

@@ -6,8 +6,6 @@ use crate::estimate::sequence::search::WINDOW_STEPS;
 use crate::estimate::sequence::snapshot::Engine;
 use crate::estimate::sequence::window::Window;
 
-/// Evidence, ln, that a target has gone dark before it is dropped: false once in a million.
-const DARK: f64 = 14.0;
 /// Frames nearer in time than this count as one draw of the fading, s: the coherence time of a turbulent atmosphere.
 const COHERENCE_S: f64 = 0.01;
 /// Frames of the window, and the numbers that all of them may hold: bounds memory, and the time of a fit of the whole window.
@@ -29,9 +27,9 @@ pub(crate) fn bury(window: &mut Window, engine: &mut Engine, view: &[Range<f64>;
     for (i, e) in window.present(time_s).into_iter().enumerate() {
         let at = window.place(e);
         let target = &mut window.targets[e];
-        target.weigh(last.local.energies[i], last.local.energy_variances[i], weight);
+        target.weigh(time_s, last.local.energies[i], last.local.energy_variances[i], weight);
         let has_left = (0..2).any(|k| !view[k].contains(&at[k]));
-        if target.darkness > DARK || has_left {
+        if target.is_dark() || has_left {
             target.died_s = time_s;
             has_died = true;
         }
