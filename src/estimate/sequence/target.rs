@@ -6,6 +6,8 @@ use crate::estimate::sequence::straying::Straying;
 const MANY: f64 = 100.0;
 /// Evidence, ln, that a target has gone dark before it is dropped: false once in a million.
 const DARK: f64 = 14.0;
+/// Evidence, ln, from which it is not reported.
+const NOT_SEEN: f64 = 6.0;
 /// A newcomer below so many standard deviations of its energy may be noise until a frame shows it again by so many, and is dropped on less
 /// evidence. More keeps noise until it is a track, less drops newcomers who fade.
 const FAINT: f64 = 9.0;
@@ -67,6 +69,11 @@ impl Target {
     /// Whether it has gone dark, or was noise.
     pub fn is_dark(&self) -> bool {
         self.darkness > if self.is_doubtful { DARK_NEWCOMER } else { DARK }
+    }
+
+    /// Whether it is still seen: what is gone would be followed as a beam until it is dropped.
+    pub fn is_seen(&self) -> bool {
+        self.darkness < NOT_SEEN
     }
 
     /// Takes the energy that the frame at `time_s` measured, with its variance, at `weight` of an independent draw of the fading. The evidence
