@@ -4,6 +4,8 @@ use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
 
 /// Numbers of an emitter's state: position (x, y) in σ and velocity in σ/s.
 pub(crate) const STATE: usize = 4;
+/// Share by which Λ's diagonal is raised where it is inverted: its rounding.
+const RIDGE: f64 = 1e-13;
 
 /// −2 ln L(x) = constant − 2 gᵀδ + δᵀΛδ with δ = x − `at`, over the states of all emitters at one time. Λ may be singular: what is not
 /// known has no information.
@@ -158,6 +160,20 @@ impl JointInformation {
         self.information *= 0.5;
     }
 
+    /// Λ⁻¹, where it is regular: half the time of the factor's own inverse, which does not know that its right-hand side is triangular.
+    pub fn covariance(&self) -> Option<DMatrix<f64>> {
+        let factor = self.factor(RIDGE)?.unpack();
+        let n = factor.nrows();
+        let mut root = DMatrix::identity(n, n);
+        for k in 0..n {
+            let left = n - k;
+            factor
+                .view((k, k), (left, left))
+                .solve_lower_triangular_mut(&mut root.view_mut((k, k), (left, 1)));
+        }
+        Some(root.tr_mul(&root))
+    }
+
     /// The Cholesky factor of Λ with its diagonal raised by `relative`.
     pub fn factor(&self, relative: f64) -> Option<Cholesky<f64, Dyn>> {
         let mut damped = self.information.clone();
@@ -166,5 +182,27 @@ impl JointInformation {
             damped[(k, k)] = d + relative * d.abs() + 1e-300;
         }
         Cholesky::new(damped)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::{DMatrix, DVector};
+
+    use super::JointInformation;
+
+    #[test]
+    fn the_covariance_is_the_inverse_and_what_is_not_known_has_none() {
+        let of = |information: DMatrix<f64>| JointInformation {
+            at: DVector::zeros(4),
+            gradient: DVector::zeros(4),
+            information,
+        };
+        let root = DMatrix::from_fn(4, 4, |r, c| 1.0 + (r * r + 3 * c) as f64 % 5.0);
+        let known = of(root.tr_mul(&root) + DMatrix::identity(4, 4));
+        let covariance = known.covariance().expect("regular");
+        assert!((&known.information * &covariance - DMatrix::identity(4, 4)).amax() < 1e-9);
+        assert!((&covariance - covariance.transpose()).amax() < 1e-15);
+        assert!(of(-DMatrix::identity(4, 4)).covariance().is_none());
     }
 }

@@ -32,7 +32,7 @@ pub(crate) fn posterior(total: &JointInformation, unit: f64) -> Option<Posterior
     if n == 0 {
         return None;
     }
-    let covariance = total.factor(1e-13)?.inverse();
+    let covariance = total.covariance()?;
     let state = &total.at + &covariance * &total.gradient;
     let velocity = |k: usize| STATE * (k / 2) + 2 + k % 2;
     let speeds = DVector::from_fn(2 * n, |k, _| state[velocity(k)]);
@@ -76,7 +76,7 @@ fn held(total: &JointInformation, speed: f64) -> Option<Posterior> {
             held.gradient[i] -= held.at[i] * precision;
         }
     }
-    let covariance = held.factor(1e-13)?.inverse();
+    let covariance = held.covariance()?;
     let state = &held.at + &covariance * &held.gradient;
     Some(Posterior { state, covariance })
 }
@@ -99,7 +99,7 @@ pub(crate) fn velocity_on_ground(camera: &Camera, sensor_m: [f64; 2], velocity: 
 pub(crate) fn surprised(known: &JointInformation, fresh: &mut Window, elapsed: f64, unit: f64) -> Vec<usize> {
     let reach = MANOEUVRE_M_S * elapsed * unit;
     let of = |knowledge: &JointInformation| {
-        let covariance = knowledge.factor(1e-13)?.inverse();
+        let covariance = knowledge.covariance()?;
         Some((&knowledge.at + &covariance * &knowledge.gradient, covariance))
     };
     let (Some((before, prior)), Some((state, posterior))) = (of(known), of(&fresh.total)) else {

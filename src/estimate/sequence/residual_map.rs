@@ -10,6 +10,7 @@ use crate::estimate::sequence::window::Window;
 /// Least share of a spot that lies outside the emitters' span for a birth there: nearer, it is the same emitter.
 const LEAST_OUTSIDE: f64 = 1e-6;
 /// Square of the overlap with all emitters below which a spot counts as outside their span: neglecting it underestimates a peak by as much.
+/// Half of it may be of emitters that are neglected in a whole row.
 const NEGLIGIBLE_OVERLAP: f64 = 1e-3;
 
 /// A spot of unit norm: its profiles along x and y in the coefficients of a snapshot.
@@ -105,23 +106,32 @@ fn divide_by_outside(filter: &MatchedFilter, spots: &[UnitSpot], sum: &mut [f64]
     let factor = factor.l();
     let along = |k: usize| -> Vec<Vec<f64>> { spots.iter().map(|s| filter.respond_along(k, &s.profiles[k])).collect() };
     let [x, y] = [along(0), along(1)];
-    let width = filter.width();
     let mut overlaps = vec![0.0; n];
-    for (k, total) in sum.iter_mut().enumerate() {
-        let (i, j) = (k % width, k / width);
-        for (c, (x, y)) in overlaps.iter_mut().zip(x.iter().zip(&y)) {
-            *c = x[i] * y[j];
+    let mut squares = vec![0.0; filter.width()];
+    for (j, row) in sum.chunks_exact_mut(filter.width()).enumerate() {
+        squares.fill(0.0);
+        for (x, y) in x.iter().zip(&y) {
+            let across = y[j] * y[j];
+            if across > NEGLIGIBLE_OVERLAP / (2 * n) as f64 {
+                let along = squares.iter_mut().zip(x);
+                along.for_each(|(square, x)| *square += across * x * x);
+            }
         }
-        if overlaps.iter().map(|c| c * c).sum::<f64>() < NEGLIGIBLE_OVERLAP {
-            continue;
+        for (i, total) in row.iter_mut().enumerate() {
+            if squares[i] < 0.5 * NEGLIGIBLE_OVERLAP {
+                continue;
+            }
+            for (c, (x, y)) in overlaps.iter_mut().zip(x.iter().zip(&y)) {
+                *c = x[i] * y[j];
+            }
+            let mut outside = 1.0;
+            for r in 0..n {
+                let known: f64 = (0..r).map(|c| factor[(r, c)] * overlaps[c]).sum();
+                overlaps[r] = (overlaps[r] - known) / factor[(r, r)];
+                outside -= overlaps[r] * overlaps[r];
+            }
+            *total = if outside > LEAST_OUTSIDE { *total / outside } else { 0.0 };
         }
-        let mut outside = 1.0;
-        for r in 0..n {
-            let known: f64 = (0..r).map(|c| factor[(r, c)] * overlaps[c]).sum();
-            overlaps[r] = (overlaps[r] - known) / factor[(r, r)];
-            outside -= overlaps[r] * overlaps[r];
-        }
-        *total = if outside > LEAST_OUTSIDE { *total / outside } else { 0.0 };
     }
 }
 

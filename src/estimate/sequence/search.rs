@@ -306,7 +306,7 @@ fn by_light(window: &Window) -> Vec<usize> {
 
 /// Whether a pair of emitters is not told apart for certain.
 pub(crate) fn is_ambiguous(window: &Window) -> bool {
-    let Some(covariance) = window.covariance() else {
+    let Some(covariance) = window.total.covariance() else {
         return true;
     };
     let present = window.present(window.time_s);

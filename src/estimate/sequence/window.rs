@@ -264,11 +264,6 @@ impl Window {
         progress
     }
 
-    /// Covariance of the state given all that is known; `None` where it is singular.
-    pub fn covariance(&self) -> Option<nalgebra::DMatrix<f64>> {
-        Some(self.total.factor(1e-13)?.inverse())
-    }
-
     /// What the light of each target weighs in the snapshots.
     pub fn lights(&self) -> Vec<Light> {
         let dropped = Light {
