@@ -104,6 +104,8 @@ fn divide_by_outside(filter: &MatchedFilter, spots: &[UnitSpot], sum: &mut [f64]
         return;
     };
     let factor = factor.l();
+    let scales: Vec<f64> = factor.diagonal().iter().map(|d| 1.0 / d).collect();
+    let rows: Vec<Vec<f64>> = factor.row_iter().map(|row| row.iter().copied().collect()).collect();
     let along = |k: usize| -> Vec<Vec<f64>> { spots.iter().map(|s| filter.respond_along(k, &s.profiles[k])).collect() };
     let [x, y] = [along(0), along(1)];
     let mut overlaps = vec![0.0; n];
@@ -125,10 +127,11 @@ fn divide_by_outside(filter: &MatchedFilter, spots: &[UnitSpot], sum: &mut [f64]
                 *c = x[i] * y[j];
             }
             let mut outside = 1.0;
-            for r in 0..n {
-                let known: f64 = (0..r).map(|c| factor[(r, c)] * overlaps[c]).sum();
-                overlaps[r] = (overlaps[r] - known) / factor[(r, r)];
-                outside -= overlaps[r] * overlaps[r];
+            for (r, row) in rows.iter().enumerate() {
+                let (before, after) = overlaps.split_at_mut(r);
+                let known: f64 = row.iter().zip(&*before).map(|(l, c)| l * c).sum();
+                after[0] = (after[0] - known) * scales[r];
+                outside -= after[0] * after[0];
             }
             *total = if outside > LEAST_OUTSIDE { *total / outside } else { 0.0 };
         }
