@@ -110,9 +110,13 @@ def frames_of(program, folder, sigma_m, n, noise, frames):
     subprocess.run([program, "simulate", *arguments], check=True, capture_output=True)
     optics = re.search(r"(?ms)^\[optics\].*?(?=^\[)", text)[0]
     (folder / "config.toml").write_text(optics)
+    return np.load(folder / "frames.npy").astype(float), truth_of(folder)
+
+
+def truth_of(folder):
+    """Positions of each frame's emitters, m."""
     lines = (folder / "truth.ndjson").read_text().splitlines()
-    truth = [np.array([[e["x_m"], e["y_m"]] for e in json.loads(line)["emitters"]]) for line in lines]
-    return np.load(folder / "frames.npy").astype(float), truth
+    return [np.array([[e["x_m"], e["y_m"]] for e in json.loads(line)["emitters"]]) for line in lines]
 
 
 def oapwatch(program, folder, estimator):
