@@ -6,8 +6,10 @@ use crate::estimate::sequence::straying::Straying;
 const MANY: f64 = 100.0;
 /// Evidence, ln, that a target has gone dark before it is dropped: false once in a million.
 const DARK: f64 = 14.0;
-/// Evidence, ln, from which it is not reported.
-const NOT_SEEN: f64 = 6.0;
+/// Evidence, ln, from which one that a single frame has shown is not reported, more by ln n for one of n frames; and most of it that one frame
+/// brings: a deep fade is not the end.
+const NOT_SEEN: f64 = 5.0;
+const OF_A_FRAME: f64 = 4.0;
 /// A newcomer below so many standard deviations of its energy may be noise until a frame shows it again by so many, and is dropped on less
 /// evidence. More keeps noise until it is a track, less drops newcomers who fade.
 const FAINT: f64 = 9.0;
@@ -73,7 +75,7 @@ impl Target {
 
     /// Whether it is still seen: what is gone would be followed as a beam until it is dropped.
     pub fn is_seen(&self) -> bool {
-        self.darkness < NOT_SEEN
+        self.darkness < NOT_SEEN + self.frames.max(1.0).ln()
     }
 
     /// Takes the energy that the frame at `time_s` measured, with its variance, at `weight` of an independent draw of the fading. The evidence
@@ -93,7 +95,7 @@ impl Target {
                 (0.5 * z * z).min(600.0).exp() * 0.5 * libm::erfc(-z * std::f64::consts::FRAC_1_SQRT_2)
             };
             let alive = ((2.0 * std::f64::consts::PI).sqrt() * std / self.mean_energy * tail).ln();
-            self.darkness = (self.darkness - weight * alive).max(0.0);
+            self.darkness = (self.darkness + weight * (-alive).min(OF_A_FRAME)).max(0.0);
         }
         self.frames = (self.frames + 1.0).min(MANY);
         self.mean_energy += (energy - self.mean_energy) / self.frames;
