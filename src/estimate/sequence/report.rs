@@ -46,6 +46,7 @@ pub(crate) fn report(
             }
         }
         let last = window.snapshots.last().map(|s| &s.local.information);
+        let last = last.filter(|information| information.nrows() == 2 * n);
         if let (Some(information), Some(last)) = (own.cholesky().map(|c| c.inverse()), last) {
             known = information - last;
         }

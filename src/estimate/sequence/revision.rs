@@ -24,7 +24,7 @@ enum Proposal {
     Birth([f64; 2]),
     Death(usize),
     /// An emitter that has been removed from the window, at another place.
-    Move(Box<Window>, Target, [f64; 2]),
+    Move(Box<(Window, Target)>, [f64; 2]),
     /// What the principal components of all frames show.
     Restart,
 }
@@ -147,8 +147,9 @@ impl Revision {
                 without = Some(window.targets[e]);
                 window.remove(e);
             }
-            Proposal::Move(rest, target, at) => {
-                window = *rest;
+            Proposal::Move(rest, at) => {
+                let (rest, target) = *rest;
+                window = rest;
                 window.insert(target, at, [0.0; 2]);
             }
             Proposal::Restart => {
@@ -195,7 +196,7 @@ impl Revision {
             let peaks = search.residual_peaks(&window, 0.0);
             for (_, at) in peaks.into_iter().take(MOVES) {
                 self.proposals
-                    .push_back(Proposal::Move(Box::new(window.clone()), target, at));
+                    .push_back(Proposal::Move(Box::new((window.clone(), target)), at));
             }
         }
         None

@@ -70,7 +70,8 @@ impl Straying {
     }
 
     /// The second moment of how far the fitted position is behind, σ², over whether the emitter has left its course, by the memory that tells
-    /// most of it and by how often it has turned so far. The position itself stays: moved by the expected lag, those of straight walkers and of who stands would be worse.
+    /// most of it and by how often it has turned so far. The position itself stays: moved by the expected lag, those of straight walkers and of
+    /// who stands would be worse.
     pub fn lag(&self) -> Matrix2<f64> {
         let most = self.sums.iter().max_by(|a, b| a.z2().total_cmp(&b.z2()));
         let Some(most) = most.filter(|sum| sum.frames > 0.0) else {
@@ -138,5 +139,23 @@ mod tests {
         // Nobody gets farther astray in eight frames than they can.
         let slow = lag_of(8.0, 0.1)[(0, 0)].sqrt();
         assert!(slow < 0.8, "{slow}");
+    }
+
+    #[test]
+    fn who_is_known_to_turn_may_have_turned_and_who_is_known_to_stand_has_not() {
+        let lag_after = |turns: usize, frames: usize| {
+            let mut straying = Straying::default();
+            for _ in 0..frames {
+                straying.add(Vector2::zeros(), Matrix2::identity(), 1.0);
+            }
+            (0..turns).for_each(|_| straying.turn());
+            straying.add(Vector2::new(3.0, 0.0), Matrix2::identity(), 1.0);
+            straying.lag()[(0, 0)]
+        };
+        let (unknown, stands, roams) = (lag_after(0, 0), lag_after(0, 100_000), lag_after(200, 2000));
+        assert!(
+            stands < 0.05 * unknown && roams > 5.0 * unknown,
+            "{stands} {unknown} {roams}"
+        );
     }
 }

@@ -101,3 +101,38 @@ impl Target {
         self.mean_energy += (energy - self.mean_energy) / self.frames;
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::Target;
+
+    /// One born at 0 whose energy is measured as `energies`, with a standard deviation of 1.
+    fn target(energies: &[f64]) -> Target {
+        let mut target = Target::born(0.0);
+        for (time_s, energy) in (0u8..).zip(energies) {
+            target.weigh(f64::from(time_s), *energy, 1.0, 1.0);
+        }
+        target
+    }
+
+    #[test]
+    fn a_faint_newcomer_who_does_not_come_again_was_noise() {
+        assert!(!target(&[7.0, 0.0]).is_dark());
+        assert!(target(&[7.0, 0.0, 0.0]).is_dark());
+        assert!(!target(&[7.0, 5.0, 0.0, 0.0]).is_dark(), "it came again");
+        assert!(!target(&[70.0, 0.0, 0.0]).is_dark(), "noise is not that bright");
+    }
+
+    #[test]
+    fn a_deep_fade_hides_nobody_and_who_has_gone_is_dropped() {
+        let mut seen = vec![100.0; 50];
+        let after = |dark: usize, seen: &mut Vec<f64>| {
+            seen.resize(50 + dark, 0.0);
+            let target = target(seen);
+            (target.is_seen(), target.is_dark())
+        };
+        assert_eq!(after(2, &mut seen), (true, false));
+        assert_eq!(after(3, &mut seen), (false, false));
+        assert_eq!(after(4, &mut seen), (false, true));
+    }
+}
