@@ -10,7 +10,7 @@ use crate::estimate::model::hypothesis::Nuisances;
 use crate::estimate::rules::Rules;
 use crate::estimate::sequence::joint_information::STATE;
 use crate::estimate::sequence::motion::{Posterior, posterior, velocity_on_ground};
-use crate::estimate::sequence::snapshot::hypothesis;
+use crate::estimate::sequence::snapshot::{Engine, LocalQuadratic, hypothesis};
 use crate::estimate::sequence::window::Window;
 use crate::estimate::uncertainty::localise::localise;
 use crate::optics::Camera;
@@ -45,10 +45,21 @@ pub(crate) fn report(
                 }
             }
         }
-        let last = window.snapshots.last().map(|s| &s.local.information);
-        let last = last.filter(|information| information.nrows() == 2 * n);
-        if let (Some(information), Some(last)) = (own.cholesky().map(|c| c.inverse()), last) {
-            known = information - last;
+        let mut engine = Engine {
+            bases: &space.bases,
+            rules,
+            budget: &mut budget,
+            workspace: &mut space.workspace,
+        };
+        let local = LocalQuadratic::new(
+            &mut engine,
+            compressed,
+            window.energies,
+            Nuisances::default(),
+            positions.clone(),
+        );
+        if let Some(information) = own.cholesky().map(|c| c.inverse()) {
+            known = information - local.information;
         }
     }
     let mut hypothesis = hypothesis(&positions, window.energies, Nuisances::default());
