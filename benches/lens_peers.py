@@ -2,7 +2,8 @@
 """oapwatch beside photutils on spots that no lens makes Gaussian: both learn the spot from the same frames without positions.
 
 Usage: lens_peers.py OAPWATCH [FRAMES]. Needs numpy, scipy, sep, trackpy and photutils. photutils builds an effective PSF (Anderson and
-King, 2000) from the five brightest peaks of each frame of the calibration, and fits with it by iterative PSF photometry. Prints a Markdown table as peers.py does, on frames with five spots apart.
+King, 2000) from the five brightest peaks of each frame of the calibration, and fits with it by iterative PSF photometry. Prints a
+Markdown table as peers.py does, on frames with five spots apart.
 """
 
 import pathlib
@@ -15,11 +16,10 @@ import warnings
 
 import numpy as np
 import peers
-from astropy.modeling.fitting import LMLSQFitter
 from astropy.nddata import NDData
 from astropy.table import Table
 from photutils.detection import DAOStarFinder
-from photutils.psf import EPSFBuilder, EPSFStars, IterativePSFPhotometry, SourceGrouper, extract_stars
+from photutils.psf import EPSFBuilder, EPSFStars, extract_stars
 
 PIXELS, SIGMA_M, NOISE_J = 64, 7.5e-4, 1e-6
 SIGMA = SIGMA_M / peers.SIDE_M * PIXELS
@@ -79,26 +79,6 @@ def effective_psf(frames):
     return builder(EPSFStars(stars))[0], len(stars)
 
 
-def photutils_fit(model):
-    fit = IterativePSFPhotometry(
-        model,
-        fit_shape=2 * int(2.5 * SIGMA) + 1,
-        finder=DAOStarFinder(threshold=5 * NOISE_J / (2 * np.sqrt(np.pi) * SIGMA), fwhm=2.3548 * SIGMA),
-        grouper=SourceGrouper(3 * SIGMA),
-        fitter=LMLSQFitter(),
-        aperture_radius=2 * SIGMA,
-        maxiters=2,
-        progress_bar=False,
-    )
-
-    def run(frame):
-        table = fit(frame, error=np.full_like(frame, NOISE_J))
-        keep = table["flux_fit"] > 5 * 2 * np.sqrt(np.pi) * SIGMA * NOISE_J
-        return np.column_stack([table["x_fit"][keep], table["y_fit"][keep]])
-
-    return run
-
-
 def main():
     program = sys.argv[1]
     count = int(sys.argv[2]) if len(sys.argv) > 2 else 40
@@ -125,7 +105,7 @@ def main():
             began = time.perf_counter()
             model, stars = effective_psf(learning)
             built_s = time.perf_counter() - began
-            run = photutils_fit(model)
+            run = peers.photutils_fit(SIGMA, NOISE_J, model)
             found, times = [], []
             for frame in frames:
                 began = time.perf_counter()

@@ -35,12 +35,11 @@ SCENE = pathlib.Path(__file__).parent.parent / "config/scenes/paper.toml"
 CASES = [(1e-3, 64, 1e-6), (2e-3, 64, 1e-6)]
 
 
-def photutils_fit(sigma, noise):
-    """Peaks, then groups of overlapping spots fitted together, and residual peaks once more."""
+def photutils_fit(sigma, noise, model=None):
+    """Peaks, then groups of overlapping spots fitted together, and residual peaks once more; by a Gaussian without `model`."""
     finder = DAOStarFinder(threshold=5 * noise / (2 * np.sqrt(np.pi) * sigma), fwhm=2.3548 * sigma)
-    model = GaussianPRF(x_fwhm=2.3548 * sigma, y_fwhm=2.3548 * sigma)
     fit = IterativePSFPhotometry(
-        model,
+        model or GaussianPRF(x_fwhm=2.3548 * sigma, y_fwhm=2.3548 * sigma),
         fit_shape=2 * int(2.5 * sigma) + 1,
         finder=finder,
         grouper=SourceGrouper(3 * sigma),

@@ -46,7 +46,8 @@ def main():
     background = sep.Background(picture)
     noise = background.globalrms
     places, ms = located(sys.argv[1], (picture - np.median(picture)) / noise * NOISE_J)
-    print(f"{len(places)} emitters in {ms:.0f} ms\n")
+    peak = (picture.max() - np.median(picture)) / noise
+    print(f"{len(places)} emitters in {ms:.0f} ms; the highest pixel is {peak:.0f} times the noise\n")
     print("| sep's threshold, σ | objects | of these found | emitters with an object |\n|---|---|---|---|")
     for threshold in THRESHOLDS:
         objects = sep.extract(picture - background.back(), threshold, err=noise)
