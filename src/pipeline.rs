@@ -21,11 +21,6 @@ use crate::pose::Pose;
 pub enum Error {
     #[error(transparent)]
     Estimator(#[from] estimate::ConfigError),
-    #[error(
-        "estimator.name: expected one that takes each frame for itself (\"ml\") with platform.kind = {kind:?}, found \"sequence\", which \
-         takes the platform for still"
-    )]
-    MovingPlatform { kind: &'static str },
     #[error(transparent)]
     Monitor(#[from] monitor::ConfigError),
     #[error("{0}")]
@@ -99,11 +94,6 @@ pub struct Step {
 
 impl Pipeline {
     pub fn new(config: &Config, camera: &Camera) -> Result<Self, Error> {
-        let is_moving = config.platform.kind != platform::Kind::Fixed;
-        if is_moving && config.estimator.name.as_deref() == Some("sequence") {
-            let kind = config.platform.kind.name();
-            return Err(Error::MovingPlatform { kind });
-        }
         config.monitor.validate()?;
         config.claims.validate()?;
         let file = (config.source.kind == SourceKind::Replay)
@@ -167,6 +157,7 @@ impl Pipeline {
             .exposure_s
             .and_then(|s| self.platform.smear(&placement, &self.camera, frame.time, s));
         self.estimator.set_smear(smear.as_ref());
+        self.estimator.set_sight(self.platform.passing_sight(&placement));
         let digested = Instant::now();
         let is_over = || self.budget.is_some_and(|budget| digested.elapsed() >= budget);
         let estimate = match self.blinding_share(frame) {
@@ -233,31 +224,5 @@ impl Pipeline {
     /// A frame that the source could not deliver whole.
     pub fn unusable(&mut self, index: u64, time: Timestamp, reason: &str) -> Report {
         self.monitor.unusable(index, time, reason, &mut self.claims)
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn frames_together_are_refused_on_a_platform_that_moves() {
-        for (estimator, kind, is_refused) in [
-            ("sequence", platform::Kind::Mavlink, true),
-            ("sequence", platform::Kind::Replay, true),
-            ("sequence", platform::Kind::Fixed, false),
-            ("ml", platform::Kind::Mavlink, false),
-        ] {
-            let mut config = Config::default();
-            config.estimator.name = Some(estimator.to_owned());
-            config.platform.kind = kind;
-            config.platform.endpoint = Some("udp://127.0.0.1:0".to_owned());
-            let camera = config.camera().expect("the built-in camera");
-            let refused = Pipeline::new(&config, &camera).err().map(|e| e.to_string());
-            let is_as_expected = refused
-                .as_deref()
-                .is_some_and(|e| e.contains("takes the platform for still"));
-            assert_eq!(is_as_expected, is_refused, "{estimator} {kind:?}: {refused:?}");
-        }
     }
 }

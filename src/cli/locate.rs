@@ -172,6 +172,7 @@ pub fn run(args: Args) -> Outcome {
         let energy_scale = frame.as_ref().map_or(1.0, |frame| frame.energy_scale);
         let estimate = frame.and_then(|frame| {
             estimator.set_smear(locator.smear(&placement, &frame).as_ref());
+            estimator.set_sight(locator.platform.passing_sight(&placement));
             estimator.estimate_until(&frame, &is_over).map_err(|e| e.to_string())
         });
         let located = match &estimate {

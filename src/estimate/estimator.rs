@@ -3,6 +3,7 @@
 use crate::estimate::emitter::Estimate;
 use crate::estimate::error::Error;
 use crate::frame::Frame;
+use crate::geo::Sight;
 use crate::optics::Smear;
 
 /// Turns a frame into emitters. Holds its scratch memory, so that a frame allocates nothing on the hot path. Deterministic: the
@@ -17,6 +18,9 @@ pub trait Estimator: Send {
 
     /// How spots move during the exposures of the frames from now on; `None`: as good as not at all.
     fn set_smear(&mut self, smear: Option<&Smear>);
+
+    /// Where the camera of a moving platform is and looks in the next frame; `None`: it stands still. For estimators that remember frames.
+    fn set_sight(&mut self, _sight: Option<&Sight>) {}
 
     /// [`Estimator::estimate_until`] without a limit of time.
     fn estimate(&mut self, frame: &Frame) -> Result<Estimate, Error> {

@@ -66,6 +66,11 @@ impl Sight {
         }
     }
 
+    /// Ground metres per sensor metre straight below.
+    pub fn ground_scale(&self, camera: &Camera) -> f64 {
+        self.height_m() / (camera.plane_distance_m * camera.distortion.focal_scale)
+    }
+
     pub fn has_terrain(&self) -> bool {
         self.terrain.is_some()
     }

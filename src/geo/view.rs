@@ -109,7 +109,7 @@ impl View {
     pub fn ground_scale(&self) -> f64 {
         match &self.sight {
             None => self.camera.ground_scale(),
-            Some(sight) => sight.height_m() / (self.camera.plane_distance_m * self.camera.distortion.focal_scale),
+            Some(sight) => sight.ground_scale(&self.camera),
         }
     }
 

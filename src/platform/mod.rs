@@ -263,6 +263,14 @@ impl Platform {
         smear.matters(camera).then_some(smear)
     }
 
+    /// The sight of a placed camera, where it may be another in the next frame.
+    pub fn passing_sight<'p>(&self, placement: &'p Placement) -> Option<&'p Sight> {
+        match (placement, &self.source) {
+            (Placement::At { sight, .. }, Source::Replay(..) | Source::Live(..)) => Some(sight),
+            _ => None,
+        }
+    }
+
     /// Where the camera is at a frame's `time`, by the poses received.
     pub fn at(&mut self, time: Timestamp) -> Placement {
         let stamp = self.stamp(time);

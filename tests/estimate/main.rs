@@ -3,5 +3,6 @@
 mod bound;
 mod frames;
 mod lens;
+mod moving;
 mod sequence;
 mod windows;

@@ -6,6 +6,7 @@ use crate::estimate::emitter::Estimate;
 use crate::estimate::error::Error;
 use crate::estimate::estimator::Estimator;
 use crate::frame::Frame;
+use crate::geo::Sight;
 use crate::optics::{PixelMaps, Smear};
 
 /// An estimator that is given corrected frames.
@@ -34,6 +35,10 @@ impl Estimator for PixelCorrected {
 
     fn set_smear(&mut self, smear: Option<&Smear>) {
         self.inner.set_smear(smear);
+    }
+
+    fn set_sight(&mut self, sight: Option<&Sight>) {
+        self.inner.set_sight(sight);
     }
 
     fn estimate_until(&mut self, frame: &Frame, is_over: &dyn Fn() -> bool) -> Result<Estimate, Error> {

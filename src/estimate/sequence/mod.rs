@@ -7,8 +7,11 @@
 
 mod chances;
 mod joint_information;
+mod local_quadratic;
 mod motion;
+mod outlook;
 mod report;
+mod reprojection;
 mod residual_map;
 mod revision;
 mod revision_schedule;

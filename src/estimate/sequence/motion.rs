@@ -94,8 +94,8 @@ pub(crate) fn velocity_on_ground(camera: &Camera, sensor_m: [f64; 2], velocity: 
 }
 
 /// The targets of the fitted newest frame, `elapsed` seconds after what was `known` before, that it or the frames before show elsewhere than
-/// straight on. The covariance of a change of position is what the variance falls by (Kalman, 1960), and successive changes are independent.
-/// `unit` is 1 m/s in σ/s.
+/// straight on. The covariance of a change of position is what the covariance falls by (Kalman, 1960), and successive changes are independent.
+/// What all change alike is the pose's. `unit` is 1 m/s in σ/s.
 pub(crate) fn surprised(known: &JointInformation, fresh: &mut Window, elapsed: f64, unit: f64) -> Vec<usize> {
     let reach = MANOEUVRE_M_S * elapsed * unit;
     let of = |knowledge: &JointInformation| {
@@ -106,27 +106,53 @@ pub(crate) fn surprised(known: &JointInformation, fresh: &mut Window, elapsed: f
         return Vec::new();
     };
     let present = fresh.present(fresh.time_s);
-    let mut is_surprised = |e: &usize| {
-        let at = STATE * e;
-        let moved = Vector2::from_fn(|k, _| state[at + k] - before[at + k]);
-        let cov = |k: usize, l: usize| prior[(at + k, at + l)] - posterior[(at + k, at + l)];
-        let least = |k: usize| ROUNDING * prior[(at + k, at + k)];
-        let mut errors = Matrix2::from_fn(cov);
-        for k in 0..2 {
-            errors[(k, k)] = errors[(k, k)].max(0.0) + least(k);
-        }
-        let Some(std) = errors.cholesky().map(|c| c.l()) else {
+    let n = 2 * present.len();
+    let place = |k: usize| STATE * present[k / 2] + k % 2;
+    let mut change = DVector::from_fn(n, |k, _| state[place(k)] - before[place(k)]);
+    let mut now = DMatrix::from_fn(n, n, |r, c| posterior[(place(r), place(c))]);
+    let mut errors = DMatrix::from_fn(n, n, |r, c| prior[(place(r), place(c))] - now[(r, c)]);
+    for k in 0..n {
+        errors[(k, k)] = errors[(k, k)].max(0.0) + ROUNDING * prior[(place(k), place(k))];
+    }
+    let newest = fresh.snapshots.last();
+    if let Some(outlook) = newest.and_then(|s| s.outlook.as_ref()) {
+        let shared = outlook.shared(&fresh.places(&fresh.state, fresh.time_s));
+        take_out(&shared, &mut now, &mut DVector::zeros(n));
+        take_out(&shared, &mut errors, &mut change);
+    }
+    let mut is_surprised = |i: usize, e: usize| {
+        let block = |m: &DMatrix<f64>| Matrix2::from_fn(|k, l| m[(2 * i + k, 2 * i + l)]);
+        let Some(std) = block(&errors).cholesky().map(|c| c.l()) else {
             return false;
         };
-        let now = Matrix2::from_fn(|k, l| posterior[(at + k, at + l)]);
+        let now = block(&now);
         let left = std.solve_lower_triangular(&now).map(|left| left.transpose());
-        let change = std.solve_lower_triangular(&moved);
+        let change = std.solve_lower_triangular(&Vector2::new(change[2 * i], change[2 * i + 1]));
         let (Some(change), Some(left)) = (change, left) else {
             return false;
         };
-        fresh.targets[*e].straying.add(change, left, reach)
+        fresh.targets[e].straying.add(change, left, 0.5 * now.trace(), reach)
     };
-    present.into_iter().filter(|e| is_surprised(e)).collect()
+    let shown = present.iter().enumerate().filter(|(i, e)| is_surprised(*i, **e));
+    shown.map(|(_, e)| *e).collect()
+}
+
+/// Takes what the columns of `shared` span out of `change` and its covariance `cov`: what is left where that much is common to all.
+fn take_out(shared: &DMatrix<f64>, cov: &mut DMatrix<f64>, change: &mut DVector<f64>) {
+    let Some(factor) = cov.clone().cholesky() else { return };
+    let weighted = factor.solve(shared);
+    let mut information = shared.tr_mul(&weighted);
+    for k in 0..information.nrows() {
+        information[(k, k)] *= 1.0 + ROUNDING;
+    }
+    let Some(inverse) = information.cholesky() else { return };
+    let fitted = inverse.solve(&weighted.tr_mul(change));
+    *change -= shared * fitted;
+    *cov -= shared * inverse.solve(&shared.transpose());
+    // Nothing is left of few emitters.
+    for k in 0..cov.nrows() {
+        cov[(k, k)] = cov[(k, k)].max(0.0);
+    }
 }
 
 /// Adds to `knowledge` that these emitters may have changed their velocity about `since_s` seconds ago. `unit` is 1 m/s in σ/s.
@@ -148,8 +174,46 @@ pub(crate) fn open(knowledge: &mut JointInformation, who: &[usize], since_s: f64
     }
 }
 
+/// Covariance of a state, σ and s, `lag_s` after a time `dt` in which its acceleration had this density, σ²/s³ (Bar-Shalom, Li and Kirubarajan,
+/// 2001, eq. 6.2.2-12).
+pub(crate) fn accelerated(density: f64, dt: f64, lag_s: f64) -> DMatrix<f64> {
+    let place = dt.powi(3) / 3.0 + dt * dt * lag_s + dt * lag_s * lag_s;
+    let both = 0.5 * dt * dt + dt * lag_s;
+    DMatrix::from_fn(STATE, STATE, |r, c| match (r / 2, c / 2) {
+        _ if r % 2 != c % 2 => 0.0,
+        (0, 0) => density * place,
+        (1, 1) => density * dt,
+        _ => density * both,
+    })
+}
+
 /// Straight courses over `span_s` that end a σ apart, of speeds with this standard deviation along each axis, σ/s: so many more chances than in
 /// a lone frame has noise to look like an emitter.
 pub(crate) fn courses(speed_std: f64, span_s: f64) -> f64 {
     (1.0 + 2.0 * speed_std * span_s).powi(2)
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::{DMatrix, DVector, Matrix4};
+
+    use super::{accelerated, take_out};
+
+    #[test]
+    fn accelerations_of_two_spans_add_up_to_that_of_both() {
+        let of = |dt: f64, lag_s: f64| Matrix4::from_iterator(accelerated(0.7, dt, lag_s).iter().copied());
+        let (first, second, both) = (of(0.3, 1.5), of(0.5, 1.0), of(0.8, 1.0));
+        assert!((first + second - both).amax() < 1e-12, "{first} {second} {both}");
+    }
+
+    #[test]
+    fn what_all_change_alike_is_nobody_s_own_change() {
+        let shared = DMatrix::from_column_slice(6, 2, &[1.0, 0.0, 1.0, 0.0, 1.0, 0.0, 0.0, 1.0, 0.0, 1.0, 0.0, 1.0]);
+        let mut cov = DMatrix::identity(6, 6) * 0.01;
+        let mut change = DVector::from_column_slice(&[5.0, -3.0, 5.0, -3.0, 5.3, -3.0]);
+        take_out(&shared, &mut cov, &mut change);
+        let expected = DVector::from_column_slice(&[-0.1, 0.0, -0.1, 0.0, 0.2, 0.0]);
+        assert!((&change - expected).amax() < 1e-4, "{change}");
+        assert!((cov[(0, 0)] - 0.01 * 2.0 / 3.0).abs() < 1e-6, "{cov}");
+    }
 }

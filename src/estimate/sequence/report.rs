@@ -9,8 +9,9 @@ use crate::estimate::fit::work_budget::WorkBudget;
 use crate::estimate::model::hypothesis::Nuisances;
 use crate::estimate::rules::Rules;
 use crate::estimate::sequence::joint_information::STATE;
+use crate::estimate::sequence::local_quadratic::{Engine, hypothesis};
 use crate::estimate::sequence::motion::{Posterior, posterior, velocity_on_ground};
-use crate::estimate::sequence::snapshot::{Engine, LocalQuadratic, hypothesis};
+
 use crate::estimate::sequence::window::Window;
 use crate::estimate::uncertainty::localise::localise;
 use crate::optics::Camera;
@@ -20,6 +21,7 @@ pub(crate) fn report(
     single: &mut AnalyticEstimator,
     window: &Window,
     camera: &Camera,
+    unit_m: f64,
     rules: Rules,
     name: &'static str,
     scale: f64,
@@ -28,13 +30,13 @@ pub(crate) fn report(
     let sigma = camera.spot_sigma_m;
     let present = window.present(window.time_s);
     let n = present.len();
-    let posterior = posterior(&window.total, 1.0 / (camera.ground_scale() * sigma));
-    let mut known = DMatrix::zeros(2 * n, 2 * n);
-    let mut positions = window.positions(&window.state, window.time_s);
+    let is_still = window.snapshots.last().is_none_or(|s| s.outlook.is_none());
+    let posterior = posterior(&window.total, 1.0 / unit_m);
+    let mut cov = None;
     let mut budget = WorkBudget::new(is_over);
     let (space, compressed, frame) = single.loaded();
-    if let Some(Posterior { state, covariance }) = &posterior {
-        positions = window.positions(state, window.time_s);
+    let mut positions = window.positions(&space.bases);
+    if let (Some(Posterior { state, covariance }), Some(newest)) = (&posterior, window.snapshots.last()) {
         let place = |k: usize| STATE * present[k / 2] + k % 2;
         let mut own = DMatrix::from_fn(2 * n, 2 * n, |r, c| covariance[(place(r), place(c))]);
         for (i, &e) in present.iter().enumerate() {
@@ -51,16 +53,9 @@ pub(crate) fn report(
             budget: &mut budget,
             workspace: &mut space.workspace,
         };
-        let local = LocalQuadratic::new(
-            &mut engine,
-            compressed,
-            window.energies,
-            Nuisances::default(),
-            positions.clone(),
-        );
-        if let Some(information) = own.cholesky().map(|c| c.inverse()) {
-            known = information - local.information;
-        }
+        let places = window.places(state, window.time_s);
+        let (at, own) = newest.on_sensor(&mut engine, window.energies, places, own);
+        (positions, cov) = (at, Some(own));
     }
     let mut hypothesis = hypothesis(&positions, window.energies, Nuisances::default());
     hypothesis.converged = true;
@@ -79,11 +74,12 @@ pub(crate) fn report(
         camera,
         noise_j,
         None,
-        Some(&known),
+        cov.as_ref(),
     );
     for (e, emitter) in found.emitters.iter_mut().enumerate() {
         emitter.energy_j = emitter.energy_j.max(0.0);
-        if let Some(Posterior { state, .. }) = &posterior {
+        // The monitor filters the positions of a moving platform: what it takes over with a velocity it does not.
+        if let Some(Posterior { state, .. }) = posterior.as_ref().filter(|_| is_still) {
             let velocity = [2, 3].map(|k| state[STATE * present[e] + k] * sigma);
             emitter.velocity = Some(velocity_on_ground(camera, emitter.sensor_m, velocity));
         }

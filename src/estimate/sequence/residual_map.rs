@@ -1,10 +1,16 @@
 //! Where the residuals of a window's frames leave light for one more emitter.
 
+use std::borrow::Cow;
+use std::sync::Arc;
+
 use nalgebra::DMatrix;
 
 use crate::estimate::detect::matched_filter::MatchedFilter;
 use crate::estimate::model::bases::Bases;
-use crate::estimate::sequence::snapshot::{Energies, Engine, Snapshot, residual};
+use crate::estimate::sequence::local_quadratic::{Energies, Engine, residual};
+use crate::estimate::sequence::outlook::Outlook;
+use crate::estimate::sequence::reprojection::reprojected;
+use crate::estimate::sequence::snapshot::Snapshot;
 use crate::estimate::sequence::window::Window;
 
 /// Least share of a spot that lies outside the emitters' span for a birth there: nearer, it is the same emitter.
@@ -12,6 +18,9 @@ const LEAST_OUTSIDE: f64 = 1e-6;
 /// Square of the overlap with all emitters below which a spot counts as outside their span: neglecting it underestimates a peak by as much.
 /// Half of it may be of emitters that are neglected in a whole row.
 const NEGLIGIBLE_OVERLAP: f64 = 1e-3;
+
+/// Work of seeing a point of a map from elsewhere, in operations.
+const REPROJECTION_WORK: f64 = 40.0;
 
 /// A spot of unit norm: its profiles along x and y in the coefficients of a snapshot.
 struct UnitSpot {
@@ -43,44 +52,70 @@ impl UnitSpot {
     }
 }
 
-/// What the residuals of all frames leave for one more emitter at each point of the matched filter's grid, Σ (fᵀr)²/‖P⊥f‖²; what it
-/// would be below zero counts as nothing.
+/// A map of the sensor `from` one outlook as it is seen `to` another; the same where the platform stands still.
+fn seen<'m>(
+    filter: &MatchedFilter,
+    map: &'m [f64],
+    from: Option<&Arc<Outlook>>,
+    to: Option<&Arc<Outlook>>,
+) -> Cow<'m, [f64]> {
+    match (from, to) {
+        (Some(from), Some(to)) if !Arc::ptr_eq(from, to) => reprojected(filter, map, from, to).into(),
+        _ => map.into(),
+    }
+}
+
+/// What the residuals of all frames leave for one more emitter at each point of the matched filter's grid over the newest frame, Σ (fᵀr)²/‖P⊥f‖²;
+/// what it would be below zero counts as nothing.
 pub(crate) fn residual_map(engine: &mut Engine, filter: &mut MatchedFilter, window: &Window) -> Vec<f64> {
+    let Some(newest) = window.snapshots.last() else {
+        return Vec::new();
+    };
     let mut sum: Vec<f64> = Vec::new();
     for s in &window.snapshots {
-        let positions = window.positions(&window.state, s.time_s);
+        let positions = s.positions(engine.bases, window.places(&window.state, s.time_s));
         let (left, _) = residual(engine, &s.compressed, window.energies, s.nuisances, &positions);
         filter.respond(left, s.compressed.mx, s.compressed.my);
-        sum.resize(filter.map().len(), 0.0);
-        for (total, v) in sum.iter_mut().zip(filter.map()) {
+        if s.outlook.is_some() {
+            engine.budget.charge(REPROJECTION_WORK * filter.map().len() as f64);
+        }
+        let map = seen(filter, filter.map(), s.outlook.as_ref(), newest.outlook.as_ref());
+        sum.resize(map.len(), 0.0);
+        for (total, v) in sum.iter_mut().zip(map.iter()) {
             *total += match window.energies {
                 Energies::NonNegative => v.max(0.0).powi(2),
                 Energies::Signed => v * v,
             };
         }
     }
-    if let Some(last) = window.snapshots.last() {
-        let positions = window.positions(&window.state, last.time_s);
-        let spots = positions.as_slice().chunks_exact(2);
-        let spots: Vec<UnitSpot> = spots.map(|u| UnitSpot::new(engine.bases, last, [u[0], u[1]])).collect();
-        divide_by_outside(filter, &spots, &mut sum);
-    }
+    let positions = window.positions(engine.bases);
+    let spots = positions.as_slice().chunks_exact(2);
+    let spots: Vec<UnitSpot> = spots
+        .map(|u| UnitSpot::new(engine.bases, newest, [u[0], u[1]]))
+        .collect();
+    divide_by_outside(filter, &spots, &mut sum);
     sum
 }
 
 /// The residual maps of single frames added up, as long as they are of the same emitters: light that no frame shows alone.
 #[derive(Default)]
 pub(crate) struct ResidualSum {
+    /// As the last of them sees it.
     pub sum: Vec<f64>,
     pub frames: f64,
+    outlook: Option<Arc<Outlook>>,
 }
 
 impl ResidualSum {
     /// Adds a frame's map; older ones fade, so that about `most` count.
-    pub fn add(&mut self, map: &[f64], most: f64) {
+    pub fn add(&mut self, filter: &MatchedFilter, map: &[f64], outlook: Option<Arc<Outlook>>, most: f64) {
         let kept = 1.0 - 1.0 / most;
         self.frames = kept * self.frames + 1.0;
         self.sum.resize(map.len(), 0.0);
+        if let Cow::Owned(sum) = seen(filter, &self.sum, self.outlook.as_ref(), outlook.as_ref()) {
+            self.sum = sum;
+        }
+        self.outlook = outlook;
         for (sum, v) in self.sum.iter_mut().zip(map) {
             *sum = kept * *sum + v;
         }

@@ -43,7 +43,7 @@ impl RevisionSchedule {
 
     /// A frame's share of the work, in frames' searches.
     pub fn work(window: &Window) -> f64 {
-        let youth = SEARCH_AFTER as f64 / window.snapshots.len().max(1) as f64;
+        let youth = SEARCH_AFTER as f64 / window.age.max(1) as f64;
         REVISION_WORK * youth.clamp(1.0, YOUNG as f64)
     }
 

@@ -2,12 +2,13 @@
 //! target is no more than noise, and a start from the subspace where frames suffice.
 
 use crate::estimate::detect::matched_filter::MatchedFilter;
-use crate::estimate::model::hypothesis::{Nuisances, OVERLAPPING};
+use crate::estimate::model::hypothesis::OVERLAPPING;
 use crate::estimate::sequence::chances::Chances;
 use crate::estimate::sequence::joint_information::STATE;
+use crate::estimate::sequence::local_quadratic::{Energies, Engine};
 use crate::estimate::sequence::motion::open;
 use crate::estimate::sequence::residual_map::{ResidualSum, peaks, residual_map};
-use crate::estimate::sequence::snapshot::{Energies, Engine, LocalQuadratic, Snapshot};
+use crate::estimate::sequence::snapshot::Snapshot;
 use crate::estimate::sequence::subspace::Subspace;
 use crate::estimate::sequence::target::Target;
 use crate::estimate::sequence::window::Window;
@@ -60,27 +61,24 @@ impl WindowSearch<'_, '_, '_> {
             .collect()
     }
 
-    /// Maxima of at least `least` of the residual map, the highest first.
+    /// Places of the maxima of at least `least` of the residual map, the highest first.
     pub fn residual_peaks(&mut self, window: &Window, least: f64) -> Vec<(f64, [f64; 2])> {
         self.left = residual_map(self.engine, self.matched_filter, window);
-        peaks(self.matched_filter, &self.left, least)
+        on_ground(window, peaks(self.matched_filter, &self.left, least)).collect()
     }
 
-    /// Where the frames together show light that none shows alone.
+    /// Places where the frames together show light that none shows alone.
     pub fn births(&self, window: &Window, left: &ResidualSum) -> Vec<[f64; 2]> {
         let born_s = window.snapshots.first().map_or(window.time_s, |s| s.time_s);
         let beyond = |share: f64| self.chances.beyond_noise(born_s, left.frames, window.energies, share);
-        let positions = window.positions(&window.state, window.time_s);
+        let positions = window.positions(self.engine.bases);
         let is_near = |at: [f64; 2]| {
             let mut others = positions.as_slice().chunks_exact(2);
             others.any(|u| (u[0] - at[0]).hypot(u[1] - at[1]) < OVERLAPPING)
         };
-        peaks(self.matched_filter, &left.sum, beyond(TRIED))
-            .into_iter()
-            .filter(|(value, at)| is_near(*at) || *value > beyond(TRIED_ALONE))
-            .map(|(_, at)| at)
-            .take(PEAKS)
-            .collect()
+        let mut peaks = peaks(self.matched_filter, &left.sum, beyond(TRIED));
+        peaks.retain(|(value, at)| is_near(*at) || *value > beyond(TRIED_ALONE));
+        on_ground(window, peaks).map(|(_, at)| at).take(PEAKS).collect()
     }
 
     /// Adds targets at residual peaks while the score improves. Returns whether any was added.
@@ -240,6 +238,9 @@ impl WindowSearch<'_, '_, '_> {
     /// The window with emitters from the subspace of its frames alone, not fitted; `None` where they have too many coefficients for that.
     pub fn restarted(&mut self, window: &Window) -> Option<Window> {
         let frames: Vec<_> = window.snapshots.iter().map(|s| &*s.compressed).collect();
+        if window.snapshots.iter().any(|s| s.outlook.is_some()) {
+            return None;
+        }
         let subspace = Subspace::new(&frames)?;
         let first = window.snapshots.first().map_or(0.0, |s| s.time_s);
         let middle = 0.5 * (first + window.time_s);
@@ -248,22 +249,18 @@ impl WindowSearch<'_, '_, '_> {
             snapshots: subspace
                 .components
                 .iter()
-                .map(|c| Snapshot {
-                    time_s: middle,
-                    compressed: c.clone(),
-                    nuisances: Nuisances::default(),
-                    local: LocalQuadratic::default(),
-                })
+                .map(|c| Snapshot::new(middle, c.clone(), None))
                 .collect(),
             dropped: subspace.dropped as f64,
             unknown: window.unknown,
+            unit_m: window.unit_m,
             energies: Energies::Signed,
             ..Window::default()
         };
         let mut best: Option<Window> = None;
         let peaks = subspace.music(self.engine.bases, subspace.count);
         let current = {
-            let positions = window.positions(&window.state, middle);
+            let positions = window.places(&window.state, middle);
             (0..positions.len() / 2)
                 .map(|i| [positions[2 * i], positions[2 * i + 1]])
                 .collect()
@@ -289,6 +286,15 @@ impl WindowSearch<'_, '_, '_> {
         }
         Some(next)
     }
+}
+
+/// The places of positions on the newest frame's sensor.
+fn on_ground(window: &Window, peaks: Vec<(f64, [f64; 2])>) -> impl Iterator<Item = (f64, [f64; 2])> + use<'_> {
+    let newest = window.snapshots.last();
+    let place = move |at| newest.map_or(Some(at), |newest| newest.place(at));
+    peaks
+        .into_iter()
+        .filter_map(move |(value, at)| Some((value, place(at)?)))
 }
 
 /// What the light of each target weighs against its errors.

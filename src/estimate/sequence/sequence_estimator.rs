@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use jiff::Timestamp;
-use nalgebra::DVector;
+use nalgebra::{DVector, Vector6};
 
 use crate::estimate::emitter::Estimate;
 use crate::estimate::error::Error;
@@ -11,21 +11,23 @@ use crate::estimate::estimator::Estimator;
 use crate::estimate::estimators::analytic::AnalyticEstimator;
 use crate::estimate::estimators::list::EstimatorSpec;
 use crate::estimate::fit::work_budget::WorkBudget;
-use crate::estimate::model::hypothesis::Nuisances;
 use crate::estimate::rules::Rules;
 use crate::estimate::sequence::chances::Chances;
 use crate::estimate::sequence::joint_information::{JointInformation, STATE};
+use crate::estimate::sequence::local_quadratic::Engine;
 use crate::estimate::sequence::motion::{SPEED_STD_M_S, open, surprised};
+use crate::estimate::sequence::outlook::Outlook;
 use crate::estimate::sequence::report::report;
 use crate::estimate::sequence::residual_map::ResidualSum;
 use crate::estimate::sequence::revision_schedule::{RevisionSchedule, YOUNG};
 use crate::estimate::sequence::search::{BESIDE, TURN_PENALTY, WINDOW_STEPS, WindowSearch};
-use crate::estimate::sequence::snapshot::{Engine, LocalQuadratic, Snapshot};
+use crate::estimate::sequence::snapshot::Snapshot;
 use crate::estimate::sequence::straying::SURPRISE;
 use crate::estimate::sequence::target::Target;
 use crate::estimate::sequence::upkeep::{MAX_SNAPSHOTS, bury, most_snapshots, refresh};
 use crate::estimate::sequence::window::Window;
 use crate::frame::Frame;
+use crate::geo::Sight;
 use crate::optics::{Camera, Smear};
 
 /// Steps of a fit to a new frame.
@@ -39,8 +41,17 @@ const SEARCH_WORK: f64 = 0.5;
 pub(crate) struct SequenceEstimator {
     spec: &'static EstimatorSpec,
     single: AnalyticEstimator,
-    camera: Camera,
+    camera: Arc<Camera>,
     rules: Rules,
+    /// Of a moving platform, in the next frame; and what that frame sees where.
+    sight: Option<Sight>,
+    outlook: Option<Arc<Outlook>>,
+    /// Of the pose before: where that of a frame is sought.
+    pose_error: Vector6<f64>,
+    /// Whether spots move so far during its exposure that it is not remembered.
+    is_smeared: bool,
+    /// Metres on the ground that places are counted in: a σ of the sensor.
+    unit_m: f64,
     /// Times are seconds since this.
     epoch: Option<Timestamp>,
     window: Window,
@@ -62,8 +73,13 @@ impl SequenceEstimator {
         Self {
             spec,
             single,
-            camera: camera.clone(),
+            unit_m: camera.ground_scale() * camera.spot_sigma_m,
+            camera: Arc::new(camera.clone()),
             rules,
+            sight: None,
+            outlook: None,
+            pose_error: Vector6::zeros(),
+            is_smeared: false,
             epoch: None,
             window: Window::default(),
             left: ResidualSum::default(),
@@ -72,19 +88,19 @@ impl SequenceEstimator {
         }
     }
 
-    /// Metres on the ground of one σ on the sensor.
-    fn ground_m(&self) -> f64 {
-        self.camera.ground_scale() * self.camera.spot_sigma_m
-    }
-
     fn forget(&mut self) {
+        if let Some(sight) = &self.sight {
+            self.unit_m = sight.ground_scale(&self.camera) * self.camera.spot_sigma_m;
+        }
         let extent = self.camera.x.half_width().max(self.camera.y.half_width()) * 2.0 / self.camera.spot_sigma_m + 4.0;
         self.window = Window {
-            unknown: [extent * extent / 12.0, (SPEED_STD_M_S / self.ground_m()).powi(2)],
+            unknown: [extent * extent / 12.0, (SPEED_STD_M_S / self.unit_m).powi(2)],
+            unit_m: self.unit_m,
             ..Window::default()
         };
         self.left.clear();
         self.schedule = RevisionSchedule::default();
+        self.pose_error = Vector6::zeros();
     }
 }
 
@@ -93,21 +109,34 @@ impl Estimator for SequenceEstimator {
         self.spec.name
     }
 
-    /// The camera of frames together stands still.
-    fn set_smear(&mut self, _smear: Option<&Smear>) {}
+    fn set_smear(&mut self, smear: Option<&Smear>) {
+        self.is_smeared = smear.is_some();
+        self.single.set_smear(smear);
+    }
+
+    fn set_sight(&mut self, sight: Option<&Sight>) {
+        self.sight = sight.cloned();
+    }
 
     fn estimate_until(&mut self, frame: &Frame, is_over: &dyn Fn() -> bool) -> Result<Estimate, Error> {
         let scale = self.single.load(frame)?;
         let epoch = *self.epoch.get_or_insert(frame.time);
         let time_s = frame.time.duration_since(epoch).as_secs_f64();
         let elapsed = time_s - self.window.time_s;
-        if self.window.snapshots.is_empty() || !(elapsed > 0.0 && elapsed <= self.memory_s) {
+        let goes_on = elapsed > 0.0 && elapsed <= self.memory_s && self.outlook.is_some() == self.sight.is_some();
+        if self.window.age == 0 || !goes_on {
             self.forget();
             self.window.time_s = time_s;
         }
+        let (camera, unit_m) = (&self.camera, self.unit_m);
+        self.outlook = (self.sight.as_ref()).map(|sight| Arc::new(Outlook::new(sight, camera, unit_m)));
         self.window.advance(time_s, self.memory_s);
+        self.window.keep_straight(time_s);
         if let Some(alone) = self.take(time_s, elapsed, scale, is_over) {
             return Ok(alone);
+        }
+        if let Some(newest) = self.window.snapshots.last() {
+            self.pose_error = newest.local.pose_error;
         }
         self.tend(elapsed, is_over);
         self.revise(is_over);
@@ -116,6 +145,7 @@ impl Estimator for SequenceEstimator {
             &mut self.single,
             &self.window,
             &self.camera,
+            self.unit_m,
             self.rules,
             name,
             scale,
@@ -129,12 +159,12 @@ impl SequenceEstimator {
     /// remembered stays as it is.
     fn take(&mut self, time_s: f64, elapsed: f64, scale: f64, is_over: &dyn Fn() -> bool) -> Option<Estimate> {
         let mut budget = WorkBudget::new(is_over);
-        let is_even = self.single.loaded().1.variance.is_constant();
+        let is_even = self.single.loaded().1.variance.is_constant() && !self.is_smeared;
         if is_even && self.window.len() > 0 {
             let known = self.window.total.clone();
             let fresh = self.fresh(known.clone(), time_s);
             let mut fresh = self.fit(fresh, &mut budget);
-            let turned = surprised(&known, &mut fresh, elapsed, 1.0 / self.ground_m());
+            let turned = surprised(&known, &mut fresh, elapsed, 1.0 / self.unit_m);
             if turned.is_empty()
                 && let Some(grown) = self.explain(fresh.clone(), scale, &mut budget)
             {
@@ -143,7 +173,7 @@ impl SequenceEstimator {
             }
             // The first frames may have been misread; later it is likelier that somebody has turned or stopped: the same with a manoeuvre since
             // the frame before.
-            let is_young = self.window.snapshots.len() <= YOUNG;
+            let is_young = self.window.age <= YOUNG;
             if turned.is_empty() && is_young && self.search_again(time_s, is_over) {
                 return None;
             }
@@ -156,7 +186,7 @@ impl SequenceEstimator {
                 }
             }
         }
-        if is_even && self.window.snapshots.len() > YOUNG && self.search_again(time_s, is_over) {
+        if is_even && self.window.age > YOUNG && self.search_again(time_s, is_over) {
             return None;
         }
         // What is remembered is wrong where this frame alone is explained and its prediction is not.
@@ -167,8 +197,10 @@ impl SequenceEstimator {
             ..self.fresh(JointInformation::default(), time_s)
         };
         for emitter in &found.emitters {
-            let at = emitter.sensor_m.map(|v| v / self.camera.spot_sigma_m);
-            alone.insert(Target::born(time_s), at, [0.0; 2]);
+            let position = emitter.sensor_m.map(|v| v / self.camera.spot_sigma_m);
+            if let Some(place) = alone.snapshots[0].place(position) {
+                alone.insert(Target::born(time_s), place, [0.0; 2]);
+            }
         }
         let fitted = if is_even {
             let alone = self.fit(alone, &mut budget);
@@ -203,7 +235,7 @@ impl SequenceEstimator {
     /// The newest frame fitted to what is remembered, where these targets may have changed their velocity `since_s` seconds ago.
     fn turned(&mut self, who: &[usize], since_s: f64, budget: &mut WorkBudget) -> Window {
         let mut opened = self.window.total.clone();
-        open(&mut opened, who, since_s, 1.0 / self.ground_m());
+        open(&mut opened, who, since_s, 1.0 / self.unit_m);
         let mut fresh = self.fresh(opened, self.window.time_s);
         who.iter().for_each(|&e| fresh.targets[e].straying.turn());
         self.fit(fresh, budget)
@@ -239,7 +271,7 @@ impl SequenceEstimator {
             }
         }
         if !who.is_empty() {
-            let (all, unit) = (self.window.snapshots.len(), 1.0 / self.ground_m());
+            let (all, unit) = (self.window.snapshots.len(), 1.0 / self.unit_m);
             self.window.fold(all);
             open(&mut self.window.prior, &who, since_s, unit);
             self.left.clear();
@@ -271,20 +303,18 @@ impl SequenceEstimator {
     /// A window of the loaded frame alone, on top of `prior`.
     fn fresh(&mut self, prior: JointInformation, time_s: f64) -> Window {
         let (targets, state) = (self.window.targets.clone(), self.window.state.clone());
-        let unknown = self.window.unknown;
-        let (_, compressed, _) = self.single.loaded();
+        let (unknown, unit_m) = (self.window.unknown, self.window.unit_m);
+        let outlook = self.outlook.clone();
+        let mut snapshot = Snapshot::new(time_s, Arc::new(self.single.loaded().1.clone()), outlook);
+        snapshot.local.pose_error = self.pose_error;
         Window {
             targets,
             time_s,
             state,
             prior,
             unknown,
-            snapshots: vec![Snapshot {
-                time_s,
-                compressed: Arc::new(compressed.clone()),
-                nuisances: Nuisances::default(),
-                local: LocalQuadratic::default(),
-            }],
+            unit_m,
+            snapshots: vec![snapshot],
             ..Window::default()
         }
     }
@@ -302,6 +332,7 @@ impl SequenceEstimator {
         window.state = fresh.state;
         window.total = fresh.total;
         window.snapshots.append(&mut fresh.snapshots);
+        window.age += 1;
     }
 
     /// Fits the newest frame to what is remembered.
@@ -321,19 +352,19 @@ impl SequenceEstimator {
         if has_grown {
             self.left.clear();
         } else if is_explained {
-            self.left.add(&left, MAX_SNAPSHOTS as f64);
+            let filter = &self.single.loaded().0.matched_filter;
+            self.left.add(filter, &left, self.outlook.clone(), MAX_SNAPSHOTS as f64);
         }
         is_explained.then_some(fresh)
     }
 
     /// Ends targets that are gone, forgets newcomers that were noise, and keeps the window within its bounds and linearised.
     fn tend(&mut self, elapsed: f64, is_over: &dyn Fn() -> bool) {
-        let (space, compressed, _) = self.single.loaded();
-        let view = space.bases.axes().map(|b| b.min_position()..b.max_position());
+        let (_, compressed, _) = self.single.loaded();
         let most = most_snapshots(compressed.mx * compressed.my);
         let mut budget = WorkBudget::new(is_over);
         self.with_search(&mut budget, |window, search| {
-            bury(window, search.engine, &view, elapsed);
+            bury(window, search.engine, elapsed);
             let noise = search.unconfirmed(window);
             window.discard(search.engine, &noise);
         });
@@ -360,7 +391,7 @@ impl SequenceEstimator {
 
     /// Runs `run` on the window, with what a search of the loaded frame's space needs.
     fn with_search<R>(&mut self, budget: &mut WorkBudget, run: impl FnOnce(&mut Window, &mut WindowSearch) -> R) -> R {
-        let speed_unit = 1.0 / self.ground_m();
+        let speed_unit = 1.0 / self.unit_m;
         let (space, _, _) = self.single.loaded();
         let mut engine = Engine {
             bases: &space.bases,

@@ -1,50 +1,17 @@
-//! One frame of the window: its coefficients, and its log likelihood as a quadratic in the emitters' positions, energies projected out.
+//! A frame that the window holds, and how it sees the places that the window follows.
 
 use std::sync::Arc;
 
-use nalgebra::{Cholesky, DMatrix, DVector};
+use nalgebra::{DMatrix, DVector};
 
-use crate::estimate::fit::context::FitContext;
-use crate::estimate::fit::levenberg_marquardt::{evaluate, linearise};
-use crate::estimate::fit::problem::Problem;
-use crate::estimate::fit::work_budget::WorkBudget;
-use crate::estimate::fit::workspace::Workspace;
 use crate::estimate::model::bases::Bases;
 use crate::estimate::model::compressed_frame::CompressedFrame;
-use crate::estimate::model::hypothesis::{Hypothesis, Nuisances, PointSource};
-use crate::estimate::rules::Rules;
-use crate::estimate::sequence::target::Light;
+use crate::estimate::model::hypothesis::Nuisances;
+use crate::estimate::sequence::local_quadratic::{Energies, Engine, LocalQuadratic};
+use crate::estimate::sequence::outlook::{FrameFit, Outlook};
 
-/// Relative increase of the energies' information before it is factorised: sources at one place leave it singular.
-const RIDGE: f64 = 1e-13;
-
-/// What fits of one snapshot after another share.
-pub(crate) struct Engine<'a, 'b> {
-    pub bases: &'a Bases,
-    pub rules: Rules,
-    pub budget: &'a mut WorkBudget<'b>,
-    pub workspace: &'a mut Workspace,
-}
-
-/// What the energies of emitters may be in the snapshots of a window.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub(crate) enum Energies {
-    /// Light: frames.
-    #[default]
-    NonNegative,
-    /// Sums of light with signs: the principal components of frames.
-    Signed,
-}
-
-impl Energies {
-    /// Share of the snapshots in which noise lights an emitter that is none.
-    pub fn lit_by_noise(self) -> f64 {
-        match self {
-            Self::NonNegative => 0.5,
-            Self::Signed => 1.0,
-        }
-    }
-}
+/// Work of finding where a place lies on the sensor of a moving platform, for one of its coordinates, in operations.
+const OUTLOOK_WORK: f64 = 500.0;
 
 /// A frame that the window holds.
 #[derive(Clone)]
@@ -53,202 +20,76 @@ pub(crate) struct Snapshot {
     pub time_s: f64,
     pub compressed: Arc<CompressedFrame>,
     pub nuisances: Nuisances,
+    /// How it sees places on the ground; `None`: places are positions on the sensor.
+    pub outlook: Option<Arc<Outlook>>,
+    /// About places.
     pub local: LocalQuadratic,
 }
 
-/// −2 ln L of one frame about `positions`, with its energies and background at their best for every position (variable projection: Golub
-/// and Pereyra, 1973; the information is Kaufman's, 1975): deviance − 2 gᵀδ + δᵀIδ.
-#[derive(Clone, Debug, Default)]
-pub(crate) struct LocalQuadratic {
-    pub deviance: f64,
-    /// (x, y) of each emitter, σ.
-    pub positions: DVector<f64>,
-    pub gradient: DVector<f64>,
-    pub information: DMatrix<f64>,
-    pub energies: Vec<f64>,
-    /// Variances of the energies where the positions are known, were all of them free.
-    pub energy_variances: Vec<f64>,
-    /// Which energies are not at zero, where they may not be below it.
-    pub is_lit: Vec<bool>,
-}
-
-/// Sources at `positions`.
-pub(crate) fn hypothesis(positions: &DVector<f64>, energies: Energies, nuisances: Nuisances) -> Hypothesis {
-    let mut hypothesis = Hypothesis::empty(nuisances);
-    hypothesis.has_signed_energies = energies == Energies::Signed;
-    let sources = positions.as_slice().chunks_exact(2);
-    hypothesis
-        .sources
-        .extend(sources.map(|u| PointSource::new([u[0], u[1]], 0.0)));
-    hypothesis
-}
-
-impl LocalQuadratic {
-    /// Of a compressed frame with sources at `positions`.
-    pub fn new(
-        engine: &mut Engine,
-        compressed: &CompressedFrame,
-        energies: Energies,
-        nuisances: Nuisances,
-        positions: DVector<f64>,
-    ) -> Self {
-        let mut hypothesis = hypothesis(&positions, energies, nuisances);
-        let problem = Problem {
-            bases: engine.bases,
-            compressed,
-            constraint: None,
-        };
-        let at = linearise(problem, &mut hypothesis, engine.budget, engine.workspace);
-        let n = hypothesis.sources.len();
-        let (p, linear) = (at.equations.parameters, n + nuisances.background_terms());
-        let h = &at.equations.information;
-        let position = |k: usize| 3 * (k / 2) + k % 2;
-        let energy = |k: usize| if k < n { 3 * k + 2 } else { 2 * n + k };
-        let entry = |a: usize, b: usize| h[a.min(b) * p + a.max(b)];
-        let factor = |of: &[usize]| {
-            let mut inner = DMatrix::from_fn(of.len(), of.len(), |r, c| entry(energy(of[r]), energy(of[c])));
-            for k in 0..of.len() {
-                inner[(k, k)] *= 1.0 + RIDGE;
-                inner[(k, k)] += 1e-300;
-            }
-            Cholesky::new(inner)
-        };
-        let all: Vec<usize> = (0..linear).collect();
-        let is_free = at.scratch.amplitudes.is_free();
-        let free: Vec<usize> = all.iter().copied().filter(|&k| is_free[k]).collect();
-        let mut information = DMatrix::from_fn(2 * n, 2 * n, |r, c| entry(position(r), position(c)));
-        let mut energy_variances = vec![f64::INFINITY; n];
-        if let Some(factor) = factor(&free) {
-            let cross = DMatrix::from_fn(free.len(), 2 * n, |r, c| entry(energy(free[r]), position(c)));
-            information -= cross.transpose() * factor.solve(&cross);
-        }
-        if let Some(factor) = factor(&all) {
-            let inverse = factor.inverse();
-            energy_variances = (0..n).map(|k| inverse[(k, k)]).collect();
-        }
-        let is_lit = is_free[..n].to_vec();
+impl Snapshot {
+    pub fn new(time_s: f64, compressed: Arc<CompressedFrame>, outlook: Option<Arc<Outlook>>) -> Self {
         Self {
-            deviance: hypothesis.deviance,
-            gradient: DVector::from_fn(2 * n, |k, _| at.equations.gradient[position(k)]),
-            information,
-            energies: hypothesis
-                .sources
-                .iter()
-                .zip(&is_lit)
-                .map(|(s, lit)| if *lit { s.a } else { 0.0 })
-                .collect(),
-            energy_variances,
-            is_lit,
-            positions,
+            time_s,
+            compressed,
+            nuisances: Nuisances::default(),
+            outlook,
+            local: LocalQuadratic::default(),
         }
     }
 
-    /// −2 ln L of the frame with its emitters at `positions`, as far as the quadratic holds.
-    pub fn cost(&self, positions: &DVector<f64>) -> f64 {
-        let step = positions - &self.positions;
-        self.deviance - 2.0 * self.gradient.dot(&step) + (&self.information * &step).dot(&step)
+    /// The frame about `places`.
+    pub fn about(&self, engine: &mut Engine, energies: Energies, places: DVector<f64>) -> LocalQuadratic {
+        match &self.outlook {
+            None => LocalQuadratic::new(engine, &self.compressed, energies, self.nuisances, places),
+            Some(outlook) => self.fit(engine, energies, &places, outlook).about(places),
+        }
     }
 
-    /// What the light of each emitter weighs; none, where the frame was not linearised yet.
-    pub fn lights(&self) -> impl Iterator<Item = Light> {
-        let energies = self.energies.iter().zip(&self.energy_variances);
-        energies.zip(&self.is_lit).map(|((energy, variance), is_lit)| Light {
-            evidence: energy * energy / variance,
-            lit: f64::from(*is_lit),
+    fn fit(&self, engine: &mut Engine, energies: Energies, places: &DVector<f64>, outlook: &Outlook) -> FrameFit {
+        let view = view(engine.bases);
+        outlook.fit(places, self.local.pose_error, view, |positions| {
+            engine.budget.charge(OUTLOOK_WORK * positions.len() as f64);
+            LocalQuadratic::new(engine, &self.compressed, energies, self.nuisances, positions)
         })
     }
-}
 
-/// The residual of `compressed` with sources at `positions`, (my, mx), and its square.
-pub(crate) fn residual<'w>(
-    engine: &'w mut Engine,
-    compressed: &CompressedFrame,
-    energies: Energies,
-    nuisances: Nuisances,
-    positions: &DVector<f64>,
-) -> (&'w [f64], f64) {
-    let mut hypothesis = hypothesis(positions, energies, nuisances);
-    let mut context = FitContext {
-        bases: engine.bases,
-        compressed,
-        rules: engine.rules,
-        budget: engine.budget,
-        workspace: engine.workspace,
-    };
-    evaluate(&mut context, &mut hypothesis);
-    (&engine.workspace.current.residual, hypothesis.deviance)
-}
-
-#[cfg(test)]
-mod tests {
-    use nalgebra::DVector;
-
-    use super::{Energies, Engine, LocalQuadratic};
-    use crate::estimate::fit::work_budget::WorkBudget;
-    use crate::estimate::model::hypothesis::Nuisances;
-    use crate::estimate::test_frame::{Shown, TestFrame};
-
-    fn local(test: &mut TestFrame, energies: Energies, positions: &[f64]) -> LocalQuadratic {
-        let mut engine = Engine {
-            bases: &test.space.bases,
-            rules: Default::default(),
-            budget: &mut WorkBudget::new(&|| false),
-            workspace: &mut test.space.workspace,
-        };
-        let positions = DVector::from_column_slice(positions);
-        LocalQuadratic::new(&mut engine, &test.compressed, energies, Nuisances::default(), positions)
-    }
-
-    fn one_spot() -> TestFrame {
-        Shown {
-            pixels_per_sigma: 2.0,
-            sources: &[([0.3, -0.4], 200.0)],
-            noise: Some(5),
-            ..Shown::default()
-        }
-        .frame()
-    }
-
-    #[test]
-    fn light_below_zero_explains_nothing() {
-        let mut test = one_spot();
-        // Beside the spot, and 0.2 σ from each other: opposite lights would shift it.
-        let pair = [0.45, -0.4, 0.65, -0.4];
-        let signed = local(&mut test, Energies::Signed, &pair);
-        let light = local(&mut test, Energies::NonNegative, &pair);
-        assert!(
-            signed.energies[0] > 200.0 && signed.energies[1] < 0.0,
-            "{:?}",
-            signed.energies
-        );
-        assert_eq!((&light.is_lit[..], light.energies[1]), (&[true, false][..], 0.0));
-        let alone = local(&mut test, Energies::NonNegative, &pair[..2]);
-        let std = alone.energy_variances[0].sqrt();
-        assert!((light.energies[0] - alone.energies[0]).abs() < 0.1 * std);
-        assert!(light.deviance > signed.deviance + 10.0);
-        // But for the little light that gives a dark emitter's position a gradient.
-        assert!((light.deviance - alone.deviance).abs() < 1.0);
-    }
-
-    #[test]
-    fn the_gradient_is_that_of_the_deviance_with_dark_emitters_at_zero() {
-        let mut test = one_spot();
-        let at = [0.35, -0.42, 0.65, -0.3];
-        let quadratic = local(&mut test, Energies::NonNegative, &at);
-        assert_eq!(quadratic.is_lit, [true, false]);
-        for k in 0..4 {
-            let h = 1e-5;
-            let mut deviance = |sign: f64| {
-                let mut moved = at;
-                moved[k] += sign * h;
-                local(&mut test, Energies::NonNegative, &moved).deviance
-            };
-            let slope = (deviance(1.0) - deviance(-1.0)) / (2.0 * h);
-            let expected = -2.0 * quadratic.gradient[k];
-            assert!(
-                (slope - expected).abs() < 1e-3 * (1.0 + expected.abs()),
-                "{k}: {slope} against {expected}"
-            );
+    /// Positions on the sensor, σ, of `places`, the pose error at its best for these, and their covariance where that of the places is `cov`,
+    /// which holds what this frame says.
+    pub fn on_sensor(
+        &self,
+        engine: &mut Engine,
+        energies: Energies,
+        places: DVector<f64>,
+        cov: DMatrix<f64>,
+    ) -> (DVector<f64>, DMatrix<f64>) {
+        match &self.outlook {
+            None => (places, cov),
+            Some(outlook) => {
+                let fit = self.fit(engine, energies, &places, outlook);
+                let cov = fit.cov_on_sensor(&cov);
+                (fit.local.positions, cov)
+            }
         }
     }
+
+    /// Positions on the sensor, σ, of `places`, with the pose error that the frame was found to have.
+    pub fn positions(&self, bases: &Bases, places: DVector<f64>) -> DVector<f64> {
+        match &self.outlook {
+            None => places,
+            Some(outlook) => outlook.show(&places, &self.local.pose_error, view(bases)).positions,
+        }
+    }
+
+    /// The place that a position on the sensor, σ, shows; `None` where that is no ground.
+    pub fn place(&self, position: [f64; 2]) -> Option<[f64; 2]> {
+        match &self.outlook {
+            None => Some(position),
+            Some(outlook) => outlook.place(position, &self.local.pose_error),
+        }
+    }
+}
+
+/// Where emitters may be on the sensor, σ.
+pub(crate) fn view(bases: &Bases) -> [[f64; 2]; 2] {
+    bases.axes().map(|b| [b.min_position(), b.max_position()])
 }

@@ -15,6 +15,20 @@ const FRAMES: f64 = 1600.0;
 /// The variance of a sum's mean where an emitter has turned, in units of the sum's own.
 const SPREAD: f64 = 10.0;
 
+/// ln of the least spectral density of an acceleration, m²/s³, and from which on it counts: somebody who goes straight on is hardly ever above it.
+const LEAST: f64 = -11.5;
+const COUNTS: f64 = -8.1;
+const MOST: f64 = 0.4;
+/// How fast it follows what a frame has shown, and the mean square over its expectation at which it stays. Faster takes chance for restlessness,
+/// slower leaves who begins to roam to the turns.
+const RATE: f64 = 0.02;
+const STAYS: f64 = 1.3;
+const MOST_OF_A_FRAME: f64 = 5.0;
+
+/// A course counts as straight for t where t³ is this times the variance of the position over the acceleration's density: the line that fits
+/// it best then ends half a standard deviation from it.
+const STRAIGHT: f64 = 5.0;
+
 /// Changes added up over a memory: the older, the less they count.
 #[derive(Clone, Copy, Debug, Default)]
 struct Sum {
@@ -49,17 +63,23 @@ pub(crate) struct Straying {
     left: Matrix2<f64>,
     /// How far a turn leads astray in a frame, σ.
     reach: f64,
+    /// Variance of the position along an axis, σ².
+    variance: f64,
+    /// ln of the acceleration's spectral density, m²/s³, above [`LEAST`].
+    restlessness: f64,
 }
 
 impl Straying {
     /// Takes a new frame's change, in its standard deviations, what error it leaves for each of these, and how far a turn leads astray in a
     /// frame, σ. Whether chance does not explain the changes of some memory.
-    pub fn add(&mut self, change: Vector2<f64>, left: Matrix2<f64>, reach: f64) -> bool {
-        (self.left, self.reach) = (left, reach);
+    pub fn add(&mut self, change: Vector2<f64>, left: Matrix2<f64>, variance: f64, reach: f64) -> bool {
+        (self.left, self.variance, self.reach) = (left, variance, reach);
         self.frames += 1.0;
         for (sum, frames) in self.sums.iter_mut().zip(MEMORIES) {
             sum.add(change, 1.0 - 1.0 / frames);
         }
+        let shown = (0.5 * self.sums[1].z2()).min(MOST_OF_A_FRAME);
+        self.restlessness = (self.restlessness + RATE * (shown - STAYS)).clamp(0.0, MOST - LEAST);
         self.sums.iter().any(|sum| sum.z2() > SURPRISE)
     }
 
@@ -67,6 +87,19 @@ impl Straying {
     pub fn turn(&mut self) {
         self.sums = Default::default();
         self.shown += 1.0;
+    }
+
+    /// Spectral density of the acceleration, m²/s³; 0 for somebody who goes straight on.
+    pub fn acceleration(&self) -> f64 {
+        match LEAST + self.restlessness {
+            density if density > COUNTS => density.exp(),
+            _ => 0.0,
+        }
+    }
+
+    /// How long the course counts as straight, s, where the acceleration has this density, σ²/s³.
+    pub fn straight_s(&self, density: f64) -> f64 {
+        (STRAIGHT * self.variance / density).cbrt()
     }
 
     /// The second moment of how far the fitted position is behind, σ², over whether the emitter has left its course, by the memory that tells
@@ -103,12 +136,12 @@ mod tests {
         let mut noise = || Vector2::from_fn(|_, _| StandardNormal.sample(&mut rng));
         let mut straying = Straying::default();
         let by_chance = (0..20_000)
-            .filter(|_| straying.add(noise(), Matrix2::identity(), 1.0))
+            .filter(|_| straying.add(noise(), Matrix2::identity(), 1.0, 1.0))
             .count();
         assert!(by_chance <= 2, "{by_chance} times by chance");
         let frames_until = |bias: f64, noise: &mut dyn FnMut() -> Vector2<f64>| {
             let mut straying = Straying::default();
-            (1..100).find(|_| straying.add(noise() + Vector2::new(bias, 0.0), Matrix2::identity(), 1.0))
+            (1..100).find(|_| straying.add(noise() + Vector2::new(bias, 0.0), Matrix2::identity(), 1.0, 1.0))
         };
         assert_eq!(frames_until(9.0, &mut noise), Some(1));
         // Two standard deviations a frame are 5.3 of eight frames.
@@ -127,6 +160,7 @@ mod tests {
                 straying.add(
                     Vector2::new(gain * error / std, 0.0),
                     Matrix2::identity() * std * (1.0 - gain) / gain,
+                    1.0,
                     reach,
                 );
             }
@@ -146,10 +180,10 @@ mod tests {
         let lag_after = |turns: usize, frames: usize| {
             let mut straying = Straying::default();
             for _ in 0..frames {
-                straying.add(Vector2::zeros(), Matrix2::identity(), 1.0);
+                straying.add(Vector2::zeros(), Matrix2::identity(), 1.0, 1.0);
             }
             (0..turns).for_each(|_| straying.turn());
-            straying.add(Vector2::new(3.0, 0.0), Matrix2::identity(), 1.0);
+            straying.add(Vector2::new(3.0, 0.0), Matrix2::identity(), 1.0, 1.0);
             straying.lag()[(0, 0)]
         };
         let (unknown, stands, roams) = (lag_after(0, 0), lag_after(0, 100_000), lag_after(200, 2000));
@@ -157,5 +191,22 @@ mod tests {
             stands < 0.05 * unknown && roams > 5.0 * unknown,
             "{stands} {unknown} {roams}"
         );
+    }
+
+    #[test]
+    fn who_roams_is_restless_and_who_goes_straight_on_is_not() {
+        let mut rng = ChaCha8Rng::seed_from_u64(3);
+        let mut after = |bias: f64, frames: usize| {
+            let mut straying = Straying::default();
+            let mut most = 0.0f64;
+            for _ in 0..frames {
+                let noise = Vector2::from_fn(|_, _| StandardNormal.sample(&mut rng));
+                straying.add(noise + Vector2::new(bias, 0.0), Matrix2::identity(), 1.0, 1.0);
+                most = most.max(straying.acceleration());
+            }
+            most
+        };
+        assert_eq!(after(0.0, 20_000), 0.0);
+        assert!(after(1.5, 200) > 0.01);
     }
 }

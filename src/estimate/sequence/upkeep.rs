@@ -1,9 +1,8 @@
 //! The window between frames: who is gone, and what it may hold.
 
-use std::ops::Range;
-
+use crate::estimate::sequence::local_quadratic::Engine;
 use crate::estimate::sequence::search::WINDOW_STEPS;
-use crate::estimate::sequence::snapshot::Engine;
+use crate::estimate::sequence::snapshot::view;
 use crate::estimate::sequence::window::Window;
 
 /// Frames nearer in time than this count as one draw of the fading, s: the coherence time of a turbulent atmosphere.
@@ -20,15 +19,15 @@ pub(crate) fn most_snapshots(coefficients: usize) -> usize {
 }
 
 /// Ends targets that have gone dark or left the view: frames before hold them still.
-pub(crate) fn bury(window: &mut Window, engine: &mut Engine, view: &[Range<f64>; 2], elapsed: f64) {
+pub(crate) fn bury(window: &mut Window, engine: &mut Engine, elapsed: f64) {
     let Some(last) = window.snapshots.last() else { return };
     let (time_s, weight) = (last.time_s, (elapsed / COHERENCE_S).clamp(0.0, 1.0));
+    let (positions, view) = (window.positions(engine.bases), view(engine.bases));
     let mut has_died = false;
     for (i, e) in window.present(time_s).into_iter().enumerate() {
-        let at = window.place(e);
         let target = &mut window.targets[e];
         target.weigh(time_s, last.local.energies[i], last.local.energy_variances[i], weight);
-        let has_left = (0..2).any(|k| !view[k].contains(&at[k]));
+        let has_left = (0..2).any(|k| !(view[k][0]..view[k][1]).contains(&positions[2 * i + k]));
         if target.is_dark() || has_left {
             target.died_s = time_s;
             has_died = true;

@@ -2,9 +2,12 @@
 
 use nalgebra::DVector;
 
+use crate::estimate::model::bases::Bases;
 use crate::estimate::model::hypothesis::OVERLAPPING;
 use crate::estimate::sequence::joint_information::{JointInformation, STATE};
-use crate::estimate::sequence::snapshot::{Energies, Engine, LocalQuadratic, Snapshot};
+use crate::estimate::sequence::local_quadratic::{Energies, Engine, LocalQuadratic};
+use crate::estimate::sequence::motion::accelerated;
+use crate::estimate::sequence::snapshot::Snapshot;
 use crate::estimate::sequence::target::{Light, Target};
 
 /// Damping λ: first value and range, as in the fit of one frame.
@@ -59,6 +62,10 @@ pub(crate) struct Window {
     pub energies: Energies,
     /// Variances of position, σ², and velocity, σ²/s², of an emitter of which nothing is known.
     pub unknown: [f64; 2],
+    /// Metres on the ground of a σ.
+    pub unit_m: f64,
+    /// Frames that it has seen.
+    pub age: usize,
 }
 
 impl Window {
@@ -71,7 +78,7 @@ impl Window {
         (0..self.len()).filter(|&e| self.targets[e].is_in(time_s)).collect()
     }
 
-    /// The target's position, σ.
+    /// The target's place, σ.
     pub fn place(&self, e: usize) -> [f64; 2] {
         [self.state[STATE * e], self.state[STATE * e + 1]]
     }
@@ -84,14 +91,23 @@ impl Window {
         beside
     }
 
-    /// Positions of the targets that a frame at `time_s` may hold.
-    pub fn positions(&self, state: &DVector<f64>, time_s: f64) -> DVector<f64> {
+    /// Places of the targets that a frame at `time_s` may hold.
+    pub fn places(&self, state: &DVector<f64>, time_s: f64) -> DVector<f64> {
         let dt = time_s - self.time_s;
         let at = self.present(time_s).into_iter();
         let at: Vec<f64> = at
             .flat_map(|e| [0, 1].map(|k| state[STATE * e + k] + dt * state[STATE * e + 2 + k]))
             .collect();
         DVector::from_vec(at)
+    }
+
+    /// Positions on the sensor, σ, of the targets that the newest frame may hold.
+    pub fn positions(&self, bases: &Bases) -> DVector<f64> {
+        let places = self.places(&self.state, self.time_s);
+        match self.snapshots.last() {
+            Some(newest) => newest.positions(bases, places),
+            None => places,
+        }
     }
 
     /// Moves state and knowledge to `time_s`; what has left the window fades with the time constant `memory_s`.
@@ -133,16 +149,35 @@ impl Window {
         self.total.marginalise(e);
     }
 
-    /// Moves the `count` oldest snapshots into the prior. Returns what this takes off the cost of the state.
+    /// Moves the `count` oldest snapshots into the prior, from each to the next of which the emitters may have accelerated. Returns what this takes off the cost of the state.
     pub fn fold(&mut self, count: usize) -> f64 {
         let mut prior = std::mem::take(&mut self.prior);
         let mut cost = prior.cost(&self.state);
         prior.recentre(&self.state);
-        for snapshot in self.snapshots.drain(..count).collect::<Vec<_>>() {
-            cost += snapshot.local.cost(&self.positions(&self.state, snapshot.time_s));
+        let next_s: Vec<f64> = self
+            .snapshots
+            .iter()
+            .skip(1)
+            .map(|s| s.time_s)
+            .chain([self.time_s])
+            .collect();
+        for (snapshot, next_s) in self
+            .snapshots
+            .drain(..count)
+            .collect::<Vec<_>>()
+            .into_iter()
+            .zip(next_s)
+        {
+            cost += snapshot.local.cost(&self.places(&self.state, snapshot.time_s));
             self.absorb(&mut prior, &snapshot.local, snapshot.time_s);
             for (e, light) in self.present(snapshot.time_s).into_iter().zip(snapshot.local.lights()) {
                 self.targets[e].folded.add(light);
+                let density = self.targets[e].straying.acceleration() / (self.unit_m * self.unit_m);
+                let dt = next_s - snapshot.time_s;
+                if density > 0.0 && dt > 0.0 {
+                    let at: Vec<usize> = (STATE * e..STATE * (e + 1)).collect();
+                    prior.add_noise(&at, &accelerated(density, dt, self.time_s - next_s));
+                }
             }
         }
         self.prior = prior;
@@ -163,7 +198,7 @@ impl Window {
 
     /// Adds a snapshot's likelihood to `knowledge`.
     pub fn absorb(&self, knowledge: &mut JointInformation, local: &LocalQuadratic, time_s: f64) {
-        let shift = self.positions(&knowledge.at, time_s) - &local.positions;
+        let shift = self.places(&knowledge.at, time_s) - &local.positions;
         let gradient = &local.gradient - &local.information * shift;
         knowledge.absorb(
             &self.present(time_s),
@@ -178,8 +213,7 @@ impl Window {
         locals.clear();
         let mut cost = self.prior.cost(state);
         for s in &self.snapshots {
-            let positions = self.positions(state, s.time_s);
-            let local = LocalQuadratic::new(engine, &s.compressed, self.energies, s.nuisances, positions);
+            let local = s.about(engine, self.energies, self.places(state, s.time_s));
             cost += local.deviance;
             locals.push(local);
         }
@@ -208,7 +242,7 @@ impl Window {
         let mut trial = Vec::new();
         let is_linear = self.damping > 0.0;
         let mut cost = if is_linear {
-            locals.extend(self.snapshots.iter_mut().map(|s| std::mem::take(&mut s.local)));
+            locals.extend(self.snapshots.iter_mut().map(|s| s.local.take()));
             self.cost
         } else {
             self.linearise(engine, &self.state.clone(), &mut locals)
@@ -304,7 +338,7 @@ impl Window {
             })
             .collect();
         let of = |s: &Snapshot| {
-            let moved = self.positions(&self.state, s.time_s) - &s.local.positions;
+            let moved = self.places(&self.state, s.time_s) - &s.local.positions;
             let shares = self.present(s.time_s).into_iter().zip(moved.as_slice().chunks_exact(2));
             shares.map(|(e, d)| d[0].hypot(d[1]) / reach[e]).fold(0.0, f64::max)
         };
@@ -333,9 +367,8 @@ impl Window {
 
     /// Linearises one snapshot at the state. The caller adds up anew.
     fn relinearise(&mut self, engine: &mut Engine, k: usize) {
-        let positions = self.positions(&self.state, self.snapshots[k].time_s);
-        let s = &mut self.snapshots[k];
-        s.local = LocalQuadratic::new(engine, &s.compressed, self.energies, s.nuisances, positions);
+        let places = self.places(&self.state, self.snapshots[k].time_s);
+        self.snapshots[k].local = self.snapshots[k].about(engine, self.energies, places);
     }
 
     /// Linearises the newest snapshot anew, as when one of its targets has turned out to be dark.
@@ -355,6 +388,24 @@ impl Window {
             total.recentre(&self.state);
         }
         self.total = total;
+    }
+
+    /// Keeps of the snapshots those since which everybody has gone straight on, at `now_s`.
+    pub fn keep_straight(&mut self, now_s: f64) {
+        let spans = self.targets.iter().map(|t| {
+            let density = t.straying.acceleration() / (self.unit_m * self.unit_m);
+            if density > 0.0 {
+                t.straying.straight_s(density)
+            } else {
+                f64::INFINITY
+            }
+        });
+        let span_s = spans.fold(f64::INFINITY, f64::min);
+        let bent = self.snapshots.iter().take_while(|s| now_s - s.time_s > span_s).count();
+        if bent > 0 {
+            self.fold(bent);
+            self.total = self.sum(&self.state, self.snapshots.iter().map(|s| &s.local));
+        }
     }
 
     /// Goes on with frames that came while this window was searched.

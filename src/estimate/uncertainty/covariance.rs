@@ -1,6 +1,6 @@
 //! The covariance, condition number and determinant of normal equations.
 
-use nalgebra::DMatrix;
+use nalgebra::{Cholesky, DMatrix};
 
 use crate::estimate::dense_linalg::{cholesky, dispatch, invert};
 use crate::estimate::fit::normal_equations::NormalEquations;
@@ -18,24 +18,26 @@ pub(crate) struct Covariance {
 impl Covariance {
     /// `None` where the information is singular. `prior` is a precision added to the sources' positions.
     pub fn new(equations: &NormalEquations, prior: f64) -> Option<Self> {
-        Self::with_known(equations, prior, None)
+        Self::inverse_of(equations.information.clone(), equations, prior)
     }
 
     /// The same with further information on the positions, over x and y of each source.
-    pub fn with_known(equations: &NormalEquations, prior: f64, known: Option<&DMatrix<f64>>) -> Option<Self> {
+    pub fn with_known(equations: &NormalEquations, prior: f64, known: &DMatrix<f64>) -> Option<Self> {
+        let (n, mut information) = (equations.parameters, equations.information.clone());
+        let at = |k: usize| 3 * (k / 2) + k % 2;
+        for r in 0..known.nrows() {
+            for c in r..known.ncols() {
+                information[at(r) * n + at(c)] += known[(r, c)];
+            }
+        }
+        Self::inverse_of(information, equations, prior)
+    }
+
+    fn inverse_of(mut factor: Vec<f64>, equations: &NormalEquations, prior: f64) -> Option<Self> {
         let n = equations.parameters;
-        let mut factor = equations.information.clone();
         for i in 0..equations.sources {
             factor[3 * i * n + 3 * i] += prior;
             factor[(3 * i + 1) * n + 3 * i + 1] += prior;
-        }
-        if let Some(known) = known {
-            let at = |k: usize| 3 * (k / 2) + k % 2;
-            for r in 0..known.nrows() {
-                for c in r..known.ncols() {
-                    factor[at(r) * n + at(c)] += known[(r, c)];
-                }
-            }
         }
         for i in 0..n {
             factor[i * n + i] *= 1.0 + RIDGE;
@@ -83,6 +85,25 @@ impl Covariance {
     pub fn block(&self, i: usize, j: usize) -> [[f64; 2]; 2] {
         [0, 1].map(|r| [0, 1].map(|c| self.at(i, r, j, c)))
     }
+}
+
+/// Information on the positions, (x, y) of each source, with energies and nuisances projected out: the Schur complement. `None` where these
+/// are singular.
+pub(crate) fn position_information(equations: &NormalEquations) -> Option<DMatrix<f64>> {
+    let (p, n) = (equations.parameters, equations.sources);
+    let entry = |a: usize, b: usize| equations.information[a.min(b) * p + a.max(b)];
+    let positions: Vec<usize> = (0..2 * n).map(|k| 3 * (k / 2) + k % 2).collect();
+    let others: Vec<usize> = (0..p).filter(|k| *k >= 3 * n || k % 3 == 2).collect();
+    let of = |rows: &[usize], columns: &[usize]| {
+        DMatrix::from_fn(rows.len(), columns.len(), |r, c| entry(rows[r], columns[c]))
+    };
+    let mut inner = of(&others, &others);
+    for k in 0..others.len() {
+        inner[(k, k)] *= 1.0 + RIDGE;
+    }
+    let cross = of(&others, &positions);
+    let factor = Cholesky::new(inner)?;
+    Some(of(&positions, &positions) - cross.tr_mul(&factor.solve(&cross)))
 }
 
 /// Condition number (1-norm) of the information matrix, scaled to a unit diagonal (van der Sluis, 1969: no other scaling does much

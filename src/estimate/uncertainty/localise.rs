@@ -8,7 +8,7 @@ use crate::estimate::fit::levenberg_marquardt::linearise;
 use crate::estimate::fit::normal_equations::NormalEquations;
 use crate::estimate::model::hypothesis::{Hypothesis, OVERLAPPING};
 use crate::estimate::preprocess::screening::PreprocessedFrame;
-use crate::estimate::uncertainty::covariance::{Covariance, RIDGE, condition_number};
+use crate::estimate::uncertainty::covariance::{Covariance, RIDGE, condition_number, position_information};
 use crate::estimate::uncertainty::pixel_posterior;
 use crate::estimate::uncertainty::posterior_mean::PosteriorMoments;
 use crate::estimate::uncertainty::profile_nonlinearity::is_likelihood_quadratic;
@@ -36,8 +36,8 @@ pub(crate) struct Localised {
     pub condition: f64,
 }
 
-/// Turns `hypothesis` into emitters with covariance and flags. `known` is the information on the positions (x, y of each source, 1/σ²)
-/// that does not come from this frame.
+/// Turns `hypothesis` into emitters with covariance and flags. `posterior` is the covariance of the positions (x, y of each source, σ²) where
+/// more is known of them than what this frame says.
 pub(crate) fn localise(
     context: &mut FitContext,
     hypothesis: &mut Hypothesis,
@@ -45,7 +45,7 @@ pub(crate) fn localise(
     camera: &Camera,
     noise_j: f64,
     posterior_moments: Option<&[PosteriorMoments]>,
-    known: Option<&DMatrix<f64>>,
+    posterior: Option<&DMatrix<f64>>,
 ) -> Localised {
     let n = hypothesis.sources.len();
     let p = hypothesis.parameters();
@@ -59,7 +59,17 @@ pub(crate) fn localise(
     let prior = 12.0 / (extent * extent);
     let problem = context.problem();
     let mut at = linearise(problem, hypothesis, context.budget, context.workspace);
-    let covariance = Covariance::with_known(at.equations, prior, known);
+    let of_frame = Covariance::new(at.equations, prior);
+    let known = posterior.map(|cov| {
+        cov.clone()
+            .cholesky()
+            .map(|c| c.inverse())
+            .zip(position_information(at.equations))
+    });
+    let covariance = match known.flatten() {
+        Some((all, of_frame)) => Covariance::with_known(at.equations, prior, &(all - of_frame)),
+        None => of_frame.clone(),
+    };
     let condition = (covariance.as_ref()).map_or(f64::INFINITY, |c| condition_number(at.equations, c));
     // Where the weights allow for an inexact PSF, what pixels add to positions is not the inverse of their weights.
     let (p_weights, evaluation) = (&compressed.position_weights, at.evaluation);
@@ -71,7 +81,8 @@ pub(crate) fn localise(
     // An ill-conditioned fit leaves a sandwich that is no covariance; the inverse of the weights then stands.
     let is_covariance = |[[a, b], [_, c]]: [[f64; 2]; 2]| a > 0.0 && a * c > b * b;
     let sandwiched = sandwiched.filter(|s| (0..n).all(|i| is_covariance(s.block(i, i))));
-    let scores = match &covariance {
+    // Positions that others have led astray would look like spots that are wider.
+    let scores = match &of_frame {
         Some(c) => second_moment_scores(problem, &mut at, c, context.budget),
         None => vec![SecondMomentScore::default(); n],
     };
@@ -145,7 +156,7 @@ pub(crate) fn localise(
             flags.set(Flags::UNRESOLVED, (0..n).any(|j| is_doubtful[j] && is_near(i, j)));
             flags.set(Flags::NON_GAUSSIAN, !is_quadratic[i]);
             let (mut u, mut own) = (source.u, own);
-            for k in 0..if is_regular && known.is_none() { 2 } else { 0 } {
+            for k in 0..if is_regular && posterior.is_none() { 2 } else { 0 } {
                 if let Some(s) = pixel_posterior::pixel_posterior([bx, by], k, &source) {
                     u[k] += s.shift;
                     // Neighbours and nuisances widen this variance as they widen the information matrix's.

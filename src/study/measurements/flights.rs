@@ -106,9 +106,10 @@ fn scene(kind: &Kind, seed: u64) -> String {
     text
 }
 
-fn flown(kind: &Kind, seed: u64, seconds: f64, more: &str) -> Reviewed {
+fn flown(kind: &Kind, estimator: Option<&str>, seed: u64, seconds: f64, more: &str) -> Reviewed {
     let mut story = PixelStory::only(seed, &format!("{}{more}", scene(kind, seed)));
     story.seconds = seconds;
+    story.config.estimator.name = estimator.map(str::to_owned);
     review(&story)
 }
 
@@ -166,7 +167,7 @@ fn delay_s(raised: &Raised, wanted: crate::monitor::AlertKind, from_s: f64) -> f
 }
 
 /// `stories` flights of each kind, honest, with a stranger, and dragged away at 1 m/s.
-pub fn flights(stories: u64, seed: u64) -> Measured {
+pub fn flights(stories: u64, seed: u64, estimator: Option<&str>) -> Measured {
     let mut text = format!(
         "{stories} flights of each kind; honest ones of {HONEST_S} s. Errors are of users' positions after {SETTLED_S} s.\n\n\
          | platform | flights with false alerts | median error m | mean squared error over the stated | stranger alerted within \
@@ -178,18 +179,23 @@ pub fn flights(stories: u64, seed: u64) -> Measured {
         let seeds = || (seed..seed + stories).into_par_iter();
         let honest: Vec<_> = seeds()
             .map(|k| {
-                let told = flown(kind, k, HONEST_S, "");
+                let told = flown(kind, estimator, k, HONEST_S, "");
                 let (metres, normalised) = errors(&told);
                 ((k, told.raised()), median(metres), mean(&normalised))
             })
             .collect();
         let strangers: Vec<_> = seeds()
-            .map(|k| (k, flown(kind, k, COMES_S + STRANGER_S, &stranger(kind, k)).raised()))
+            .map(|k| {
+                (
+                    k,
+                    flown(kind, estimator, k, COMES_S + STRANGER_S, &stranger(kind, k)).raised(),
+                )
+            })
             .collect();
         let dragged: Vec<_> = seeds()
             .map(|k| {
                 let drag = format!("[platform.telemetry.dragged]\nfrom_s = {DRAGGED_S:?}\nvelocity_m_s = [1, 0]\n");
-                (k, flown(kind, k, DRAGGED_S + 15.0, &drag).raised())
+                (k, flown(kind, estimator, k, DRAGGED_S + 15.0, &drag).raised())
             })
             .collect();
         let within = |stories: &[(u64, Raised)], wanted, from_s, limit_s| {

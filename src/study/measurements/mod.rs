@@ -66,7 +66,7 @@ pub const ALL: &[Measurement] = &[
     with("stranger-near", 300, pixels::strangers_near),
     with("stranger-in-crowd", 200, pixels::strangers_in_crowd),
     with("shadow", 10, pixels::shadows),
-    measurement("flights", 10, flights::flights),
+    with("flights", 10, flights::flights),
     measurement("calibration", 5, calibration::error_left),
     rows("lens", 40, lens::uncalibrated),
     rows("lens-calibrated", 40, lens::calibrated),
