@@ -7,7 +7,7 @@ use crate::geo::Sight;
 use crate::optics::Smear;
 
 /// Turns a frame into emitters. Holds its scratch memory, so that a frame allocates nothing on the hot path. Deterministic: the
-/// same frame gives the same bits.
+/// same frames in the same order give the same bits.
 pub trait Estimator: Send {
     /// The name that `[estimator] name` selects it by.
     fn name(&self) -> &'static str;

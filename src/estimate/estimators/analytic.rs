@@ -49,6 +49,8 @@ impl AnalyticEstimator {
     pub fn of_window(spec: &'static EstimatorSpec, camera: &Camera, rules: Rules, source_penalty: f64) -> Self {
         let pixels = [&camera.x, &camera.y].map(|axis| Basis::pixels(axis, camera.spot_sigma_m));
         let mut search = FrameSearch::new(spec, camera, rules, (pixels, None));
+        // Windows show a few spots each: the whole frame's search remembers.
+        search.history = None;
         search.space.source_penalty = source_penalty;
         search.reweighting.space.source_penalty = source_penalty;
         Self {
@@ -114,6 +116,12 @@ impl AnalyticEstimator {
             sums.square += p * p;
         }
         Ok(sums)
+    }
+
+    /// Whether recent frames showed that spots differ from the PSF.
+    pub fn remembers_spot_error(&self) -> bool {
+        let history = self.search.history.as_ref();
+        history.is_some_and(|history| history.spot_error().is_some())
     }
 
     /// Whether the loaded window shows anything that may be an emitter.

@@ -16,9 +16,8 @@ use crate::estimate::model_order::pruning::without_insignificant;
 use crate::estimate::model_order::refine::shrink;
 use crate::estimate::model_order::reweighting::Reweighting;
 use crate::estimate::model_order::search::{Search, SearchSpace};
-use crate::estimate::model_order::spot_error::{
-    Shape, drop_halo, explained_by_width, inspect_shape, search_with_spot_error,
-};
+use crate::estimate::model_order::spot_error::{Shape, explained_by_width, inspect_shape};
+use crate::estimate::model_order::spot_error_history::SpotErrorHistory;
 use crate::estimate::preprocess::noise_variance::VarianceFunction;
 use crate::estimate::preprocess::outliers::NoiseInspection;
 use crate::estimate::preprocess::screening::PreprocessedFrame;
@@ -66,9 +65,11 @@ impl Found {
 
 /// A frame, and the spaces that it is searched in.
 pub(crate) struct FrameSearch {
-    spec: &'static EstimatorSpec,
-    /// As configured; `None` where it is found from the frames.
-    spot_error: Option<f64>,
+    pub spec: &'static EstimatorSpec,
+    /// As configured, or as recent frames showed; `None` where it is found from the frame alone.
+    pub spot_error: Option<f64>,
+    /// What recent frames showed, where none is configured and the sensor is wide enough to show it.
+    pub history: Option<SpotErrorHistory>,
     pub frame: PreprocessedFrame,
     inspection: NoiseInspection,
     /// The frame in bases that leave a part to measure the noise, where the search's own do not.
@@ -96,16 +97,19 @@ impl FrameSearch {
         } else {
             None
         };
+        let reweighting = Reweighting::new(camera, rules);
+        let is_sought = camera.spot_error.is_none() && spec.chooses_order() && spec.method != Method::Sequence;
         Self {
             spec,
             spot_error: camera.spot_error,
+            history: (is_sought && !is_narrow(&reweighting.space.bases)).then(SpotErrorHistory::default),
             frame: PreprocessedFrame::default(),
             inspection: NoiseInspection::default(),
             noise_bases: noise_bases.map(|bases| (bases, CompressedFrame::default())),
             pencil,
             space: SearchSpace::new(bases, rules).with_shape(camera),
             compressed: CompressedFrame::of_camera(camera),
-            reweighting: Reweighting::new(camera, rules),
+            reweighting,
             network_start: NetworkStart::new(camera, rules.network_start && spec.chooses_order()),
             rules,
         }
@@ -138,11 +142,19 @@ impl FrameSearch {
 
     /// The emitters of the frame.
     pub fn run(&mut self, budgets: &mut Budgets) -> Found {
+        let remembered = self.history.as_ref().and_then(SpotErrorHistory::spot_error);
+        let remembered = match remembered.map(|error| self.find_as_remembered(error, budgets)) {
+            Some((found, true)) => return found,
+            other => other.map(|(found, _)| found),
+        };
         let mut found = self.find(budgets);
         let suspected = found.suspected_variance;
         let is_simpler = self.allow_for_shape(&mut found, budgets);
         if !self.spec.chooses_order() {
             return found;
+        }
+        if !is_simpler {
+            self.remember_shape(&mut found, budgets);
         }
         let compressed = self.compressed_of(found.kind);
         let variance = suspected.or((!compressed.variance.is_constant()).then_some(compressed.variance));
@@ -155,54 +167,13 @@ impl FrameSearch {
         if is_weighted {
             found.kind = SearchKind::Reweighted;
         }
+        if let Some(remembered) = remembered {
+            self.keep_fewer(&mut found, remembered);
+        }
         found
     }
 
-    /// Where the spots differ from the PSF, searches again with that allowed for. Returns whether fewer sources explain the frame under equal
-    /// weights.
-    fn allow_for_shape(&mut self, found: &mut Found, budgets: &mut Budgets) -> bool {
-        if !self.spec.chooses_order() {
-            if let Some(error) = self.spot_error.filter(|e| *e > 0.0) {
-                drop_halo(
-                    &self.space.bases,
-                    error,
-                    self.space.source_penalty,
-                    &mut found.hypothesis.sources,
-                );
-                found.spot_error = error;
-            }
-            return false;
-        }
-        let compressed = self.compressed_of(found.kind);
-        let is_explained = compressed.is_explained_by(&found.hypothesis);
-        let excess = compressed.excess(&found.hypothesis);
-        let Reweighting { space, compressed } = &mut self.reweighting;
-        let (frame, budget) = (&self.frame, &mut budgets.reweighting);
-        let shape = match self.spot_error {
-            Some(0.0) => Shape::AsModelled,
-            Some(error) => Shape::of_spot_error(error, &found.hypothesis, &self.frame.beyond),
-            None => inspect_shape(space, compressed, frame, &found.hypothesis, excess, budget),
-        };
-        match shape {
-            Shape::AsModelled => {}
-            Shape::Simpler(simpler) => {
-                found.hypothesis = simpler;
-                return true;
-            }
-            Shape::Different(error, bright) => {
-                let next = search_with_spot_error(space, compressed, frame, error, bright, budget);
-                let is_simpler =
-                    next.sources.len() < found.hypothesis.sources.len() && compressed.is_explained_by(&next);
-                if !is_explained || is_simpler || self.spot_error.is_some() {
-                    found.hypothesis = next;
-                    found.spot_error = error;
-                }
-            }
-        }
-        false
-    }
-
-    fn compressed_of(&self, kind: SearchKind) -> &CompressedFrame {
+    pub fn compressed_of(&self, kind: SearchKind) -> &CompressedFrame {
         match (kind, &self.noise_bases) {
             (SearchKind::Pencil, Some((_, compressed))) => compressed,
             (SearchKind::Reweighted, _) => &self.reweighting.compressed,
@@ -231,7 +202,7 @@ impl FrameSearch {
     }
 
     /// The frame by the estimator's method.
-    fn find(&mut self, budgets: &mut Budgets) -> Found {
+    pub fn find(&mut self, budgets: &mut Budgets) -> Found {
         let mut search = self.space.search(&self.compressed, &self.frame, &mut budgets.search);
         let hypothesis = match self.spec.method {
             Method::Peak { steps } => {
@@ -247,11 +218,15 @@ impl FrameSearch {
             }
             Method::Pencil { steps } => initialise(&mut search, Nuisances::default(), steps).into_hypothesis(),
             Method::MaximumLikelihood | Method::MaximumPosterior | Method::Sequence => {
-                let mut initial = initial_hypothesis(&mut search);
-                if self.spot_error.is_some_and(|e| e > 0.0) && search.context.bases.are_pixels() {
-                    // The search with the spot error is the only one.
+                if self.spot_error.is_some_and(|e| e > 0.0) {
+                    // The search with the spot error is the only one. It starts from peaks: the pencil takes rings for sources.
+                    let Reweighting { space, compressed } = &mut self.reweighting;
+                    compressed.load(&self.frame, &space.bases.x, &space.bases.y);
+                    let mut search = space.search(compressed, &self.frame, &mut budgets.reweighting);
+                    let initial = initial_hypothesis(&mut search);
                     return Found::of(without_insignificant(&mut search, initial), SearchKind::Main);
                 }
+                let mut initial = initial_hypothesis(&mut search);
                 let is_explained = self.compressed.is_explained_by(&initial);
                 if !is_explained {
                     self.network_start.improve(&mut search, &mut initial);

@@ -30,7 +30,7 @@ impl EstimatorSpec {
         )
     }
 
-    /// Whether an answer depends on the frames before.
+    /// Whether emitters are followed over frames. The others remember at most how far the lens's spots differ from the PSF.
     pub fn remembers(&self) -> bool {
         self.method == Method::Sequence
     }

@@ -4,6 +4,7 @@ pub mod analytic;
 pub mod budgets;
 pub mod build;
 pub mod frame_search;
+pub mod lens_shape;
 pub mod list;
 pub mod network;
 pub mod network_start;

@@ -357,7 +357,8 @@ impl Estimator for WindowedEstimator {
             }
         }
         let may_be_whole = self.may_share_misfit() && total.windows <= MOST_FOR_WHOLE && !total.estimate.is_cut_short;
-        if may_be_whole && !total.is_explained(&self.camera) {
+        let is_lens_known = self.whole.as_ref().is_some_and(AnalyticEstimator::remembers_spot_error);
+        if may_be_whole && (is_lens_known || !total.is_explained(&self.camera)) {
             return self.search_whole(frame, is_over);
         }
         Ok(total.finish(sums))

@@ -31,8 +31,29 @@ const COMMON: f64 = 0.75;
 /// Other bright spots within [`NEAR`] σ of half of the spots, up to which these are no crowd.
 const MAX_NEAR: usize = 1;
 const NEAR: f64 = 5.0;
-/// Largest ratio of a spot's misfit to the common one with which it follows that.
-const MAX_GROWTH: f64 = 2.5;
+/// How far spots must agree for a misfit to be the lens's.
+#[derive(Clone, Copy)]
+pub(crate) struct Agreement {
+    /// More than this share of the spots that show a misfit must follow the common one.
+    share: f64,
+    /// Largest ratio of a spot's misfit to the common one with which it follows that.
+    most_growth: f64,
+}
+
+impl Agreement {
+    /// Where a frame decides alone: it takes a misfit that one spot shows much more strongly for a stranger.
+    pub const ALONE: Self = Self {
+        share: COMMON,
+        most_growth: 2.5,
+    };
+    /// Where many frames decide together: three of four spots are enough, as the fourth's ghost may fall beside the sensor; and coma that
+    /// grows from the sensor's middle is several times as strong at its corners as in most spots.
+    pub const OF_FRAMES: Self = Self {
+        share: 0.7,
+        most_growth: 10.0,
+    };
+}
+
 /// Significance that the common misfit keeps under the weights: well below a source's threshold (5.5), so that spots that differ from
 /// the common one are covered too.
 const LEFT: f64 = 2.0;
@@ -109,7 +130,13 @@ pub(crate) fn is_narrow(bases: &Bases) -> bool {
 
 /// The spot error that a fitted hypothesis shows: by rings around its bright spots, or offset by offset where these are `least` or more. 0
 /// where their residuals have nothing in common. `is_explained`: whether more sources explain the frame.
-pub(crate) fn common_misfit(search: &mut Search, candidate: &mut Candidate, least: usize, is_explained: bool) -> f64 {
+pub(crate) fn common_misfit(
+    search: &mut Search,
+    candidate: &mut Candidate,
+    least: usize,
+    is_explained: bool,
+    agreement: Agreement,
+) -> f64 {
     let (mx, my) = (search.compressed().mx, search.compressed().my);
     let bases = search.context.bases;
     let norm = halo::spot_norm(bases);
@@ -161,7 +188,7 @@ pub(crate) fn common_misfit(search: &mut Search, candidate: &mut Candidate, leas
     let mirrored = [along_axes.clone(), views(&|_| [-1.0, 0.0])].concat();
     [along_axes, views(&radial), mirrored]
         .iter()
-        .map(|views| compare(views, sources, norm, ends, |u| filter.response_at(u)))
+        .map(|views| compare(views, sources, norm, ends, agreement, |u| filter.response_at(u)))
         .fold(ring, f64::max)
 }
 
@@ -173,6 +200,7 @@ fn compare(
     sources: &[PointSource],
     norm: f64,
     ends: [[f64; 2]; 2],
+    Agreement { share, most_growth }: Agreement,
     response: impl Fn([f64; 2]) -> Option<f64>,
 ) -> f64 {
     let (mut largest, mut core) = (0.0f64, 0.0f64);
@@ -241,11 +269,11 @@ fn compare(
         visible += f64::from(rr > SIGNIFICANT);
         // Aberrations grow towards the edge: a spot may show the common misfit more strongly than most.
         if rr - follows < MAX_LEFT_OF_ONE * rr {
-            following += f64::from(rr > SIGNIFICANT && rt < MAX_GROWTH * tt);
-            strongest = strongest.max((rt / tt).min(MAX_GROWTH));
+            following += f64::from(rr > SIGNIFICANT && rt < most_growth * tt);
+            strongest = strongest.max((rt / tt).min(most_growth));
         }
     }
-    let is_common = left < MAX_LEFT * whole && following > COMMON * visible;
+    let is_common = left < MAX_LEFT * whole && following > share * visible;
     if is_common && core < MAX_CORE {
         (strongest * largest / LEFT).min(MAX_SPOT_ERROR)
     } else {

@@ -19,3 +19,4 @@ pub mod reweighting;
 pub mod ring_misfit;
 pub mod search;
 pub mod spot_error;
+pub mod spot_error_history;
