@@ -23,5 +23,6 @@ mod subspace;
 mod target;
 mod upkeep;
 mod window;
+mod window_fit;
 
 pub(crate) use sequence_estimator::SequenceEstimator;

@@ -21,7 +21,6 @@ pub(crate) fn report(
     single: &mut AnalyticEstimator,
     window: &Window,
     camera: &Camera,
-    unit_m: f64,
     rules: Rules,
     name: &'static str,
     scale: f64,
@@ -31,7 +30,7 @@ pub(crate) fn report(
     let present = window.present(window.time_s);
     let n = present.len();
     let is_still = window.snapshots.last().is_none_or(|s| s.outlook.is_none());
-    let posterior = posterior(&window.total, 1.0 / unit_m);
+    let posterior = posterior(&window.total, 1.0 / window.unit_m);
     let mut cov = None;
     let mut budget = WorkBudget::new(is_over);
     let (space, compressed, frame) = single.loaded();

@@ -8,7 +8,8 @@ use crate::estimate::sequence::search::{
 };
 use crate::estimate::sequence::straying::SURPRISE;
 use crate::estimate::sequence::target::Target;
-use crate::estimate::sequence::window::{Progress, Window};
+use crate::estimate::sequence::window::Window;
+use crate::estimate::sequence::window_fit::Progress;
 
 /// A proposal counts as better when it lowers the score by this: what unfinished fits differ by.
 const LEAST_GAIN: f64 = 1.0;

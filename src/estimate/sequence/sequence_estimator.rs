@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use jiff::Timestamp;
-use nalgebra::{DVector, Vector6};
+use nalgebra::DVector;
 
 use crate::estimate::emitter::Estimate;
 use crate::estimate::error::Error;
@@ -46,12 +46,8 @@ pub(crate) struct SequenceEstimator {
     /// Of a moving platform, in the next frame; and what that frame sees where.
     sight: Option<Sight>,
     outlook: Option<Arc<Outlook>>,
-    /// Of the pose before: where that of a frame is sought.
-    pose_error: Vector6<f64>,
     /// Whether spots move so far during its exposure that it is not remembered.
     is_smeared: bool,
-    /// Metres on the ground that places are counted in: a σ of the sensor.
-    unit_m: f64,
     /// Times are seconds since this.
     epoch: Option<Timestamp>,
     window: Window,
@@ -73,12 +69,10 @@ impl SequenceEstimator {
         Self {
             spec,
             single,
-            unit_m: camera.ground_scale() * camera.spot_sigma_m,
             camera: Arc::new(camera.clone()),
             rules,
             sight: None,
             outlook: None,
-            pose_error: Vector6::zeros(),
             is_smeared: false,
             epoch: None,
             window: Window::default(),
@@ -89,18 +83,20 @@ impl SequenceEstimator {
     }
 
     fn forget(&mut self) {
-        if let Some(sight) = &self.sight {
-            self.unit_m = sight.ground_scale(&self.camera) * self.camera.spot_sigma_m;
-        }
-        let extent = self.camera.x.half_width().max(self.camera.y.half_width()) * 2.0 / self.camera.spot_sigma_m + 4.0;
+        let (camera, sigma_m) = (&self.camera, self.camera.spot_sigma_m);
+        let scale = self
+            .sight
+            .as_ref()
+            .map_or(camera.ground_scale(), |sight| sight.ground_scale(camera));
+        let unit_m = scale * sigma_m;
+        let extent = camera.x.half_width().max(camera.y.half_width()) * 2.0 / sigma_m + 4.0;
         self.window = Window {
-            unknown: [extent * extent / 12.0, (SPEED_STD_M_S / self.unit_m).powi(2)],
-            unit_m: self.unit_m,
+            unknown: [extent * extent / 12.0, (SPEED_STD_M_S / unit_m).powi(2)],
+            unit_m,
             ..Window::default()
         };
         self.left.clear();
         self.schedule = RevisionSchedule::default();
-        self.pose_error = Vector6::zeros();
     }
 }
 
@@ -128,24 +124,20 @@ impl Estimator for SequenceEstimator {
             self.forget();
             self.window.time_s = time_s;
         }
-        let (camera, unit_m) = (&self.camera, self.unit_m);
+        let (camera, unit_m) = (&self.camera, self.window.unit_m);
         self.outlook = (self.sight.as_ref()).map(|sight| Arc::new(Outlook::new(sight, camera, unit_m)));
         self.window.advance(time_s, self.memory_s);
         self.window.keep_straight(time_s);
         if let Some(alone) = self.take(time_s, elapsed, scale, is_over) {
             return Ok(alone);
         }
-        if let Some(newest) = self.window.snapshots.last() {
-            self.pose_error = newest.local.pose_error;
-        }
         self.tend(elapsed, is_over);
         self.revise(is_over);
-        let name = self.spec.name;
+        let (window, camera, name) = (&self.window, &self.camera, self.spec.name);
         Ok(report(
             &mut self.single,
-            &self.window,
-            &self.camera,
-            self.unit_m,
+            window,
+            camera,
             self.rules,
             name,
             scale,
@@ -164,7 +156,7 @@ impl SequenceEstimator {
             let known = self.window.total.clone();
             let fresh = self.fresh(known.clone(), time_s);
             let mut fresh = self.fit(fresh, &mut budget);
-            let turned = surprised(&known, &mut fresh, elapsed, 1.0 / self.unit_m);
+            let turned = surprised(&known, &mut fresh, elapsed, 1.0 / self.window.unit_m);
             if turned.is_empty()
                 && let Some(grown) = self.explain(fresh.clone(), scale, &mut budget)
             {
@@ -235,7 +227,7 @@ impl SequenceEstimator {
     /// The newest frame fitted to what is remembered, where these targets may have changed their velocity `since_s` seconds ago.
     fn turned(&mut self, who: &[usize], since_s: f64, budget: &mut WorkBudget) -> Window {
         let mut opened = self.window.total.clone();
-        open(&mut opened, who, since_s, 1.0 / self.unit_m);
+        open(&mut opened, who, since_s, 1.0 / self.window.unit_m);
         let mut fresh = self.fresh(opened, self.window.time_s);
         who.iter().for_each(|&e| fresh.targets[e].straying.turn());
         self.fit(fresh, budget)
@@ -271,7 +263,7 @@ impl SequenceEstimator {
             }
         }
         if !who.is_empty() {
-            let (all, unit) = (self.window.snapshots.len(), 1.0 / self.unit_m);
+            let (all, unit) = (self.window.snapshots.len(), 1.0 / self.window.unit_m);
             self.window.fold(all);
             open(&mut self.window.prior, &who, since_s, unit);
             self.left.clear();
@@ -306,7 +298,7 @@ impl SequenceEstimator {
         let (unknown, unit_m) = (self.window.unknown, self.window.unit_m);
         let outlook = self.outlook.clone();
         let mut snapshot = Snapshot::new(time_s, Arc::new(self.single.loaded().1.clone()), outlook);
-        snapshot.local.pose_error = self.pose_error;
+        snapshot.local.pose_error = self.window.pose_error;
         Window {
             targets,
             time_s,
@@ -331,6 +323,7 @@ impl SequenceEstimator {
         }
         window.state = fresh.state;
         window.total = fresh.total;
+        window.pose_error = fresh.snapshots.last().map_or(window.pose_error, |s| s.local.pose_error);
         window.snapshots.append(&mut fresh.snapshots);
         window.age += 1;
     }
@@ -391,7 +384,7 @@ impl SequenceEstimator {
 
     /// Runs `run` on the window, with what a search of the loaded frame's space needs.
     fn with_search<R>(&mut self, budget: &mut WorkBudget, run: impl FnOnce(&mut Window, &mut WindowSearch) -> R) -> R {
-        let speed_unit = 1.0 / self.unit_m;
+        let speed_unit = 1.0 / self.window.unit_m;
         let (space, _, _) = self.single.loaded();
         let mut engine = Engine {
             bases: &space.bases,
