@@ -25,7 +25,7 @@ pub struct Args {
     /// Of lens, lens-calibrated, lens-alerts: only the rows whose name begins so ("airy disc 300"); may be repeated
     #[arg(long, value_name = "ROW")]
     only: Vec<String>,
-    /// Of honest-pixels to shadow: the estimator
+    /// Of honest-pixels to flights: the estimator
     #[arg(long, value_name = "NAME", value_parser = clap::builder::PossibleValuesParser::new(ESTIMATORS.iter().map(|e| e.name)))]
     estimator: Option<String>,
 }

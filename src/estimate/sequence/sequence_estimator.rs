@@ -15,7 +15,7 @@ use crate::estimate::rules::Rules;
 use crate::estimate::sequence::chances::Chances;
 use crate::estimate::sequence::joint_information::{JointInformation, STATE};
 use crate::estimate::sequence::local_quadratic::Engine;
-use crate::estimate::sequence::motion::{SPEED_STD_M_S, open, surprised};
+use crate::estimate::sequence::motion::{open, surprised};
 use crate::estimate::sequence::outlook::Outlook;
 use crate::estimate::sequence::report::report;
 use crate::estimate::sequence::residual_map::ResidualSum;
@@ -83,18 +83,8 @@ impl SequenceEstimator {
     }
 
     fn forget(&mut self) {
-        let (camera, sigma_m) = (&self.camera, self.camera.spot_sigma_m);
-        let scale = self
-            .sight
-            .as_ref()
-            .map_or(camera.ground_scale(), |sight| sight.ground_scale(camera));
-        let unit_m = scale * sigma_m;
-        let extent = camera.x.half_width().max(camera.y.half_width()) * 2.0 / sigma_m + 4.0;
-        self.window = Window {
-            unknown: [extent * extent / 12.0, (SPEED_STD_M_S / unit_m).powi(2)],
-            unit_m,
-            ..Window::default()
-        };
+        let scale = self.sight.as_ref().map(|sight| sight.ground_scale(&self.camera));
+        self.window = Window::empty(&self.camera, scale.unwrap_or(self.camera.ground_scale()));
         self.left.clear();
         self.schedule = RevisionSchedule::default();
     }

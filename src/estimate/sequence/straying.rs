@@ -15,11 +15,12 @@ const FRAMES: f64 = 1600.0;
 /// The variance of a sum's mean where an emitter has turned, in units of the sum's own.
 const SPREAD: f64 = 10.0;
 
-/// ln of the least spectral density of an acceleration, m²/s³, and from which on it counts: somebody who goes straight on is hardly ever above it.
+/// ln of the spectral density of an acceleration, m²/s³: the least, from which on it counts (somebody who goes straight on is hardly ever
+/// above), and the most, that of a walker who turns round within a second or two.
 const LEAST: f64 = -11.5;
 const COUNTS: f64 = -8.1;
 const MOST: f64 = 0.4;
-/// How fast it follows what a frame has shown, and the mean square over its expectation at which it stays. Faster takes chance for restlessness,
+/// How fast it follows what a frame has shown, the mean square over its expectation at which it stays, and most that a frame counts. Faster takes chance for restlessness,
 /// slower leaves who begins to roam to the turns.
 const RATE: f64 = 0.02;
 const STAYS: f64 = 1.3;
@@ -70,8 +71,8 @@ pub(crate) struct Straying {
 }
 
 impl Straying {
-    /// Takes a new frame's change, in its standard deviations, what error it leaves for each of these, and how far a turn leads astray in a
-    /// frame, σ. Whether chance does not explain the changes of some memory.
+    /// Takes a new frame's change, in its standard deviations, what error it leaves for each of these, the variance that the position has then
+    /// along an axis, σ², and how far a turn leads astray in a frame, σ. Whether chance does not explain the changes of some memory.
     pub fn add(&mut self, change: Vector2<f64>, left: Matrix2<f64>, variance: f64, reach: f64) -> bool {
         (self.left, self.variance, self.reach) = (left, variance, reach);
         self.frames += 1.0;

@@ -5,9 +5,10 @@ use nalgebra::{DVector, Vector6};
 use crate::estimate::model::bases::Bases;
 use crate::estimate::sequence::joint_information::{JointInformation, STATE};
 use crate::estimate::sequence::local_quadratic::{Energies, Engine, LocalQuadratic};
-use crate::estimate::sequence::motion::accelerated;
+use crate::estimate::sequence::motion::{SPEED_STD_M_S, accelerated};
 use crate::estimate::sequence::snapshot::Snapshot;
 use crate::estimate::sequence::target::{Light, Target};
+use crate::optics::Camera;
 
 /// Standard deviations of χ² from which a frame contradicts what is remembered, as the flag `poor_fit` of one frame: nearer, noise alone would end the
 /// memory within hours.
@@ -43,6 +44,17 @@ pub(crate) struct Window {
 }
 
 impl Window {
+    /// Of a camera that sees `ground_scale` metres of the ground for a metre of its sensor.
+    pub fn empty(camera: &Camera, ground_scale: f64) -> Self {
+        let unit_m = ground_scale * camera.spot_sigma_m;
+        let extent = camera.x.half_width().max(camera.y.half_width()) * 2.0 / camera.spot_sigma_m + 4.0;
+        Self {
+            unknown: [extent * extent / 12.0, (SPEED_STD_M_S / unit_m).powi(2)],
+            unit_m,
+            ..Self::default()
+        }
+    }
+
     pub fn len(&self) -> usize {
         self.targets.len()
     }
