@@ -1,7 +1,7 @@
 //! The chances that noise has to look like an emitter in many frames, and what a source must bring against them.
 
+use crate::estimate::sequence::course::courses;
 use crate::estimate::sequence::local_quadratic::Energies;
-use crate::estimate::sequence::motion::courses;
 use crate::estimate::sequence::window::Window;
 
 /// Least decrease of the deviance that a source must bring when its energy is free in each of `frames` frames: the bound of χ² with that

@@ -6,6 +6,7 @@
 //! all positions and velocities together.
 
 mod chances;
+mod course;
 mod joint_information;
 mod local_quadratic;
 mod motion;

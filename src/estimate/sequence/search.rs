@@ -4,9 +4,9 @@
 use crate::estimate::detect::matched_filter::MatchedFilter;
 use crate::estimate::model::hypothesis::OVERLAPPING;
 use crate::estimate::sequence::chances::Chances;
+use crate::estimate::sequence::course::open;
 use crate::estimate::sequence::joint_information::STATE;
 use crate::estimate::sequence::local_quadratic::{Energies, Engine};
-use crate::estimate::sequence::motion::open;
 use crate::estimate::sequence::residual_map::{ResidualSum, peaks, residual_map};
 use crate::estimate::sequence::snapshot::Snapshot;
 use crate::estimate::sequence::subspace::Subspace;

@@ -15,20 +15,19 @@ const FRAMES: f64 = 1600.0;
 /// The variance of a sum's mean where an emitter has turned, in units of the sum's own.
 const SPREAD: f64 = 10.0;
 
-/// ln of the spectral density of an acceleration, m²/s³: the least, from which on it counts (somebody who goes straight on is hardly ever
-/// above), and the most, that of a walker who turns round within a second or two.
-const LEAST: f64 = -11.5;
-const COUNTS: f64 = -8.1;
-const MOST: f64 = 0.4;
-/// How fast it follows what a frame has shown, the mean square over its expectation at which it stays, and most that a frame counts. Faster takes chance for restlessness,
-/// slower leaves who begins to roam to the turns.
+/// A course counts as straight for t where t³ is this times the variance of the position over the acceleration's spectral density: the line that
+/// fits it best then ends half a standard deviation from it.
+const STRAIGHT: f64 = 5.0;
+/// Who goes straight on does so for this long, s, and who accelerates all the time for this long at least.
+const LONGEST_S: f64 = 20.0;
+const SHORTEST_S: f64 = 0.3;
+/// Density over the least from which on it counts: somebody who goes straight on is hardly ever above.
+const COUNTS: f64 = 30.0;
+/// How fast it follows what a frame has shown, the mean square over its expectation at which it stays, and most that a frame counts. Faster
+/// takes chance for restlessness, slower leaves who begins to roam to the turns.
 const RATE: f64 = 0.02;
 const STAYS: f64 = 1.3;
 const MOST_OF_A_FRAME: f64 = 5.0;
-
-/// A course counts as straight for t where t³ is this times the variance of the position over the acceleration's density: the line that fits
-/// it best then ends half a standard deviation from it.
-const STRAIGHT: f64 = 5.0;
 
 /// Changes added up over a memory: the older, the less they count.
 #[derive(Clone, Copy, Debug, Default)]
@@ -66,8 +65,8 @@ pub(crate) struct Straying {
     reach: f64,
     /// Variance of the position along an axis, σ².
     variance: f64,
-    /// ln of the acceleration's spectral density, m²/s³, above [`LEAST`].
-    restlessness: f64,
+    /// Spectral density of the acceleration, σ²/s³.
+    density: f64,
 }
 
 impl Straying {
@@ -80,7 +79,8 @@ impl Straying {
             sum.add(change, 1.0 - 1.0 / frames);
         }
         let shown = (0.5 * self.sums[1].z2()).min(MOST_OF_A_FRAME);
-        self.restlessness = (self.restlessness + RATE * (shown - STAYS)).clamp(0.0, MOST - LEAST);
+        let (least, most) = (self.density_of(LONGEST_S), self.density_of(SHORTEST_S));
+        self.density = (self.density.max(least) * (RATE * (shown - STAYS)).exp()).clamp(least, most);
         self.sums.iter().any(|sum| sum.z2() > SURPRISE)
     }
 
@@ -90,17 +90,25 @@ impl Straying {
         self.shown += 1.0;
     }
 
-    /// Spectral density of the acceleration, m²/s³; 0 for somebody who goes straight on.
+    /// Spectral density of the acceleration, σ²/s³; 0 for somebody who goes straight on.
     pub fn acceleration(&self) -> f64 {
-        match LEAST + self.restlessness {
-            density if density > COUNTS => density.exp(),
-            _ => 0.0,
+        match self.density > COUNTS * self.density_of(LONGEST_S) {
+            true => self.density,
+            false => 0.0,
         }
     }
 
-    /// How long the course counts as straight, s, where the acceleration has this density, σ²/s³.
-    pub fn straight_s(&self, density: f64) -> f64 {
-        (STRAIGHT * self.variance / density).cbrt()
+    /// How long the course counts as straight, s.
+    pub fn straight_s(&self) -> f64 {
+        match self.acceleration() {
+            density if density > 0.0 => (STRAIGHT * self.variance / density).cbrt(),
+            _ => f64::INFINITY,
+        }
+    }
+
+    /// The density with which a course is straight for so long.
+    fn density_of(&self, straight_s: f64) -> f64 {
+        STRAIGHT * self.variance / straight_s.powi(3)
     }
 
     /// The second moment of how far the fitted position is behind, σ², over whether the emitter has left its course, by the memory that tells
@@ -208,6 +216,6 @@ mod tests {
             most
         };
         assert_eq!(after(0.0, 20_000), 0.0);
-        assert!(after(1.5, 200) > 0.01);
+        assert!(after(1.5, 200) > 0.1);
     }
 }

@@ -3,9 +3,9 @@
 use nalgebra::{DVector, Vector6};
 
 use crate::estimate::model::bases::Bases;
+use crate::estimate::sequence::course::{SPEED_STD_M_S, accelerated};
 use crate::estimate::sequence::joint_information::{JointInformation, STATE};
 use crate::estimate::sequence::local_quadratic::{Energies, Engine, LocalQuadratic};
-use crate::estimate::sequence::motion::{SPEED_STD_M_S, accelerated};
 use crate::estimate::sequence::snapshot::Snapshot;
 use crate::estimate::sequence::target::{Light, Target};
 use crate::optics::Camera;
@@ -158,7 +158,7 @@ impl Window {
             self.absorb(&mut prior, &snapshot.local, snapshot.time_s);
             for (e, light) in self.present(snapshot.time_s).into_iter().zip(snapshot.local.lights()) {
                 self.targets[e].folded.add(light);
-                let density = self.targets[e].straying.acceleration() / (self.unit_m * self.unit_m);
+                let density = self.targets[e].straying.acceleration();
                 let dt = next_s - snapshot.time_s;
                 if density > 0.0 && dt > 0.0 {
                     let at: Vec<usize> = (STATE * e..STATE * (e + 1)).collect();
@@ -234,15 +234,7 @@ impl Window {
 
     /// Keeps of the snapshots those since which everybody has gone straight on, at `now_s`.
     pub fn keep_straight(&mut self, now_s: f64) {
-        let spans = self.targets.iter().map(|t| {
-            let density = t.straying.acceleration() / (self.unit_m * self.unit_m);
-            if density > 0.0 {
-                t.straying.straight_s(density)
-            } else {
-                f64::INFINITY
-            }
-        });
-        let span_s = spans.fold(f64::INFINITY, f64::min);
+        let span_s = (self.targets.iter()).fold(f64::INFINITY, |span_s, t| span_s.min(t.straying.straight_s()));
         let bent = self.snapshots.iter().take_while(|s| now_s - s.time_s > span_s).count();
         if bent > 0 {
             self.fold(bent);
