@@ -123,7 +123,7 @@ impl ResidualSum {
 
     pub fn clear(&mut self) {
         self.sum.clear();
-        self.frames = 0.0;
+        (self.frames, self.outlook) = (0.0, None);
     }
 }
 

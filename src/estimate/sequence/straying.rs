@@ -80,7 +80,8 @@ impl Straying {
         }
         let shown = (0.5 * self.sums[1].z2()).min(MOST_OF_A_FRAME);
         let (least, most) = (self.density_of(LONGEST_S), self.density_of(SHORTEST_S));
-        self.density = (self.density.max(least) * (RATE * (shown - STAYS)).exp()).clamp(least, most);
+        let density = self.density.max(least) * (RATE * (shown - STAYS)).exp();
+        self.density = density.max(least).min(most);
         self.sums.iter().any(|sum| sum.z2() > SURPRISE)
     }
 
