@@ -12,6 +12,9 @@ use crate::optics::Camera;
 const SPEEDS_M_S: [f64; 4] = [0.01, 0.7, 2.5, SPEED_STD_M_S];
 /// Relative rounding of a difference of covariances.
 const ROUNDING: f64 = 1e-6;
+/// Share of a change's variance that must be left beside what all change alike for the change to tell anything: with up to three emitters, six
+/// numbers, the six of a pose explain all of it.
+const LEAST_TOLD: f64 = 1e-3;
 /// A hypothesis of less weight is left out.
 const LEAST_WEIGHT: f64 = 1e-3;
 
@@ -111,6 +114,7 @@ pub(crate) fn surprised(known: &JointInformation, fresh: &mut Window, elapsed: f
     for k in 0..n {
         errors[(k, k)] = errors[(k, k)].max(0.0) + ROUNDING * prior[(place(k), place(k))];
     }
+    let whole = errors.diagonal();
     let newest = fresh.snapshots.last();
     if let Some(outlook) = newest.and_then(|s| s.outlook.as_ref()) {
         let shared = outlook.shared(&fresh.places(&fresh.state, fresh.time_s));
@@ -118,6 +122,10 @@ pub(crate) fn surprised(known: &JointInformation, fresh: &mut Window, elapsed: f
         take_out(&shared, &mut errors, &mut change);
     }
     let mut is_surprised = |i: usize, e: usize| {
+        if (0..2).any(|k| errors[(2 * i + k, 2 * i + k)] < LEAST_TOLD * whole[2 * i + k]) {
+            fresh.targets[e].straying.hide();
+            return false;
+        }
         let block = |m: &DMatrix<f64>| Matrix2::from_fn(|k, l| m[(2 * i + k, 2 * i + l)]);
         let Some(std) = block(&errors).cholesky().map(|c| c.l()) else {
             return false;

@@ -67,13 +67,15 @@ pub(crate) struct Straying {
     variance: f64,
     /// Spectral density of the acceleration, σ²/s³.
     density: f64,
+    /// Whether frames do not tell its course.
+    is_hidden: bool,
 }
 
 impl Straying {
     /// Takes a new frame's change, in its standard deviations, what error it leaves for each of these, the variance that the position has then
     /// along an axis, σ², and how far a turn leads astray in a frame, σ. Whether chance does not explain the changes of some memory.
     pub fn add(&mut self, change: Vector2<f64>, left: Matrix2<f64>, variance: f64, reach: f64) -> bool {
-        (self.left, self.variance, self.reach) = (left, variance, reach);
+        (self.left, self.variance, self.reach, self.is_hidden) = (left, variance, reach, false);
         self.frames += 1.0;
         for (sum, frames) in self.sums.iter_mut().zip(MEMORIES) {
             sum.add(change, 1.0 - 1.0 / frames);
@@ -83,6 +85,11 @@ impl Straying {
         let density = self.density.max(least) * (RATE * (shown - STAYS)).exp();
         self.density = density.max(least).min(most);
         self.sums.iter().any(|sum| sum.z2() > SURPRISE)
+    }
+
+    /// The frame does not tell its course, which then does not count as straight.
+    pub fn hide(&mut self) {
+        self.is_hidden = true;
     }
 
     /// The emitter has turned: what the frames have shown so far is of its course before.
@@ -102,6 +109,7 @@ impl Straying {
     /// How long the course counts as straight, s.
     pub fn straight_s(&self) -> f64 {
         match self.acceleration() {
+            _ if self.is_hidden => 0.0,
             density if density > 0.0 => (STRAIGHT * self.variance / density).cbrt(),
             _ => f64::INFINITY,
         }
@@ -218,5 +226,15 @@ mod tests {
         };
         assert_eq!(after(0.0, 20_000), 0.0);
         assert!(after(1.5, 200) > 0.1);
+    }
+
+    #[test]
+    fn whose_course_no_frame_tells_does_not_go_straight_on_until_one_does() {
+        let mut straying = Straying::default();
+        assert!(straying.straight_s().is_infinite());
+        straying.hide();
+        assert_eq!(straying.straight_s(), 0.0);
+        straying.add(Vector2::zeros(), Matrix2::identity(), 1.0, 1.0);
+        assert!(straying.straight_s().is_infinite());
     }
 }
