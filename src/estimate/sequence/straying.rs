@@ -18,15 +18,13 @@ const SPREAD: f64 = 10.0;
 /// A course counts as straight for t where t³ is this times the variance of the position over the acceleration's spectral density: the line that
 /// fits it best then ends half a standard deviation from it.
 const STRAIGHT: f64 = 5.0;
-/// Who goes straight on does so for this long, s, and who accelerates all the time for this long at least.
-const LONGEST_S: f64 = 20.0;
+/// How long courses count as straight, s: of who goes straight on, and of who accelerates all the time.
+const LONGEST_S: f64 = 40.0;
 const SHORTEST_S: f64 = 0.3;
-/// Density over the least from which on it counts: somebody who goes straight on is hardly ever above.
-const COUNTS: f64 = 30.0;
-/// How fast it follows what a frame has shown, the mean square over its expectation at which it stays, and most that a frame counts. Faster
-/// takes chance for restlessness, slower leaves who begins to roam to the turns.
-const RATE: f64 = 0.02;
-const STAYS: f64 = 1.3;
+/// How fast the ln of that follows what a frame has shown, the mean square over its expectation at which it stays, and most that a frame counts.
+/// Faster takes chance for restlessness, slower leaves who begins to roam to the turns.
+const RATE: f64 = 0.01;
+const STAYS: f64 = 1.12;
 const MOST_OF_A_FRAME: f64 = 5.0;
 
 /// Changes added up over a memory: the older, the less they count.
@@ -65,8 +63,8 @@ pub(crate) struct Straying {
     reach: f64,
     /// Variance of the position along an axis, σ².
     variance: f64,
-    /// Spectral density of the acceleration, σ²/s³.
-    density: f64,
+    /// ln of [`LONGEST_S`] over how long the course is straight.
+    restlessness: f64,
     /// Whether frames do not tell its course.
     is_hidden: bool,
 }
@@ -81,9 +79,8 @@ impl Straying {
             sum.add(change, 1.0 - 1.0 / frames);
         }
         let shown = (0.5 * self.sums[1].z2()).min(MOST_OF_A_FRAME);
-        let (least, most) = (self.density_of(LONGEST_S), self.density_of(SHORTEST_S));
-        let density = self.density.max(least) * (RATE * (shown - STAYS)).exp();
-        self.density = density.max(least).min(most);
+        let most = (LONGEST_S / SHORTEST_S).ln();
+        self.restlessness = (self.restlessness + RATE * (shown - STAYS)).clamp(0.0, most);
         self.sums.iter().any(|sum| sum.z2() > SURPRISE)
     }
 
@@ -98,26 +95,23 @@ impl Straying {
         self.shown += 1.0;
     }
 
-    /// Spectral density of the acceleration, σ²/s³; 0 for somebody who goes straight on.
-    pub fn acceleration(&self) -> f64 {
-        match self.density > COUNTS * self.density_of(LONGEST_S) {
-            true => self.density,
-            false => 0.0,
-        }
+    /// What it has shown of accelerations so far is forgotten.
+    pub fn go_straight(&mut self) {
+        self.restlessness = 0.0;
     }
 
     /// How long the course counts as straight, s.
     pub fn straight_s(&self) -> f64 {
-        match self.acceleration() {
-            _ if self.is_hidden => 0.0,
-            density if density > 0.0 => (STRAIGHT * self.variance / density).cbrt(),
-            _ => f64::INFINITY,
-        }
+        if self.is_hidden { 0.0 } else { self.unbent_s() }
     }
 
-    /// The density with which a course is straight for so long.
-    fn density_of(&self, straight_s: f64) -> f64 {
-        STRAIGHT * self.variance / straight_s.powi(3)
+    /// Spectral density of the acceleration, σ²/s³.
+    pub fn acceleration(&self) -> f64 {
+        STRAIGHT * self.variance / self.unbent_s().powi(3)
+    }
+
+    fn unbent_s(&self) -> f64 {
+        LONGEST_S * (-self.restlessness).exp()
     }
 
     /// The second moment of how far the fitted position is behind, σ², over whether the emitter has left its course, by the memory that tells
@@ -214,27 +208,31 @@ mod tests {
     #[test]
     fn who_roams_is_restless_and_who_goes_straight_on_is_not() {
         let mut rng = ChaCha8Rng::seed_from_u64(3);
-        let mut after = |bias: f64, frames: usize| {
+        let mut straight_s = |bias: f64, variance: fn(u32) -> f64| {
             let mut straying = Straying::default();
-            let mut most = 0.0f64;
-            for _ in 0..frames {
+            let mut sum = 0.0;
+            for k in 0..1000 {
                 let noise = Vector2::from_fn(|_, _| StandardNormal.sample(&mut rng));
-                straying.add(noise + Vector2::new(bias, 0.0), Matrix2::identity(), 1.0, 1.0);
-                most = most.max(straying.acceleration());
+                straying.add(noise + Vector2::new(bias, 0.0), Matrix2::identity(), variance(k), 1.0);
+                sum += straying.straight_s();
             }
-            most
+            sum / 1000.0
         };
-        assert_eq!(after(0.0, 20_000), 0.0);
-        assert!(after(1.5, 200) > 0.1);
+        let (straight, roams) = (straight_s(0.0, |_| 1.0), straight_s(1.5, |_| 1.0));
+        assert!(straight > 10.0 && roams < 2.0, "{straight} {roams}");
+        // Chance while a place is hardly known is no acceleration once it is known well.
+        let becomes_known = straight_s(0.0, |k| f64::from(k + 1).powi(-3));
+        assert!(becomes_known > 10.0, "{becomes_known}");
     }
 
     #[test]
     fn whose_course_no_frame_tells_does_not_go_straight_on_until_one_does() {
         let mut straying = Straying::default();
-        assert!(straying.straight_s().is_infinite());
+        straying.add(Vector2::zeros(), Matrix2::identity(), 1.0, 1.0);
+        assert!(straying.straight_s() > 1.0);
         straying.hide();
         assert_eq!(straying.straight_s(), 0.0);
         straying.add(Vector2::zeros(), Matrix2::identity(), 1.0, 1.0);
-        assert!(straying.straight_s().is_infinite());
+        assert!(straying.straight_s() > 1.0);
     }
 }
