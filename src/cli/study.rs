@@ -4,7 +4,7 @@ use std::io::Write;
 
 use super::progress::Steps;
 use super::{Failure, Outcome};
-use crate::estimate::ESTIMATORS;
+use crate::estimate::{self, ESTIMATORS, Rules};
 use crate::study::measurements::{ALL, Measurement};
 
 #[derive(Debug, clap::Args)]
@@ -28,11 +28,19 @@ pub struct Args {
     /// Of honest-pixels to flights: the estimator
     #[arg(long, value_name = "NAME", value_parser = clap::builder::PossibleValuesParser::new(ESTIMATORS.iter().map(|e| e.name)))]
     estimator: Option<String>,
+    /// Of sequence and honest-pixels to flights: a rule of the estimator to leave out
+    #[arg(long, value_name = "RULE", value_parser = clap::builder::PossibleValuesParser::new(Rules::NAMES.iter().chain(Rules::OF_SEQUENCES)))]
+    without: Option<String>,
 }
 
 pub fn run(args: Args) -> Outcome {
     let is_wanted = |m: &&Measurement| args.what.iter().any(|name| name == m.name);
     let wanted: Vec<&Measurement> = ALL.iter().filter(is_wanted).collect();
+    let estimator = estimate::Config {
+        name: args.estimator,
+        rules: args.without.and_then(|rule| Rules::without(&rule)).unwrap_or_default(),
+        ..Default::default()
+    };
     let mut steps = Steps::new(wanted.len() as u64);
     let mut broken = Vec::new();
     for measurement in wanted {
@@ -40,7 +48,7 @@ pub fn run(args: Args) -> Outcome {
         let mut printed = print(&format!("## {}\n", measurement.name));
         let mut say = |line: &str| printed = std::mem::replace(&mut printed, Ok(())).and_then(|()| print(line));
         let stories = args.stories.unwrap_or(measurement.stories);
-        let measured = measurement.run(stories, args.seed, &args.only, args.estimator.as_deref(), &mut say);
+        let measured = measurement.run(stories, args.seed, &args.only, &estimator, &mut say);
         say(&measured.text);
         printed.map_err(Failure::other)?;
         steps.next(measurement.name);

@@ -1,28 +1,33 @@
 //! The rules that were added to the estimators one by one, each of which can be switched off to measure what it gains and costs.
 
 macro_rules! rules {
-    ($($(#[doc = $doc:expr])* $name:ident,)*) => {
+    (of_frames: { $($(#[doc = $doc:expr])* $name:ident,)* } of_sequences: { $($(#[doc = $of:expr])* $later:ident,)* }) => {
         /// Which rules are in force; all by default. [`Rules::without`] switches one off for `oapwatch tradeoff --without NAME`.
         #[derive(Clone, Copy, Debug, PartialEq, Eq)]
         pub struct Rules {
             $($(#[doc = $doc])* pub $name: bool,)*
+            $($(#[doc = $of])* pub $later: bool,)*
         }
 
         impl Default for Rules {
             fn default() -> Self {
-                Self { $($name: true,)* }
+                Self { $($name: true,)* $($later: true,)* }
             }
         }
 
         impl Rules {
-            /// The names of all rules.
+            /// The names of the rules by which a frame is searched.
             pub const NAMES: &[&str] = &[$(stringify!($name),)*];
+
+            /// The names of those by which `sequence` puts frames together.
+            pub const OF_SEQUENCES: &[&str] = &[$(stringify!($later),)*];
 
             /// All rules but the one of this name; `None` where there is none of it.
             pub fn without(name: &str) -> Option<Self> {
                 let mut rules = Self::default();
                 match name {
                     $(stringify!($name) => rules.$name = false,)*
+                    $(stringify!($later) => rules.$later = false,)*
                     _ => return None,
                 }
                 Some(rules)
@@ -32,6 +37,7 @@ macro_rules! rules {
 }
 
 rules! {
+    of_frames: {
     /// Proposal: a source at a residual peak. For sources too faint for the start, which few cells of the trade-off hold: needed in one of
     /// 240 frames with a background, spikes or dead pixels.
     birth,
@@ -88,6 +94,35 @@ rules! {
     /// On a large sensor spots that stand apart are searched window by window. Saves nine tenths of the time, and finds all of 200 emitters
     /// instead of 80.
     windows,
+    }
+    of_sequences: {
+    /// A newcomer whose light in all frames is less than the penalty of a source over them is forgotten.
+    confirm_newcomers,
+    /// A faint newcomer is forgotten when two or three frames do not show it again.
+    doubt_faint_newcomers,
+    /// Where the newest frame alone shows those who are known but not the newcomer, there is none.
+    ask_frame_alone,
+    /// A newcomer beside others has to explain the frames better than that these have turned.
+    turns_before_newcomers,
+    /// A frame that contradicts what is known opens all velocities.
+    turn_everybody,
+    /// The window is searched together with a frame that contradicts what is known.
+    search_again,
+    /// Where pairs are ambiguous the window is searched from its principal components.
+    principal_components,
+    /// Emitters are born where the residuals of all frames together peak.
+    summed_residuals,
+    /// Weak emitters are tried at other places.
+    move_emitters,
+    /// The covariance holds what may be left of a turn.
+    allow_for_turns,
+    /// The accelerations of who roams are learned, and the window ends where courses are not straight.
+    follow_accelerations,
+    /// Velocities count as those of people who stand, walk, cycle or drive.
+    weigh_speeds,
+    /// Who has gone dark is not reported before it is dropped.
+    hide_dark,
+    }
 }
 
 #[cfg(test)]

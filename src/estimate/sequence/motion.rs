@@ -25,9 +25,9 @@ pub(crate) struct Posterior {
 }
 
 /// The posterior of `total` over hypotheses of how fast the emitters of a scene are, each weighed by its evidence: people who all stand still
-/// cost no information for velocities that are not there, and people who walk are not held back. `unit` is 1 m/s in σ/s. `None` where
-/// the information is singular.
-pub(crate) fn posterior(total: &JointInformation, unit: f64) -> Option<Posterior> {
+/// cost no information for velocities that are not there, and people who walk are not held back. Without `has_speeds` any speed is as likely.
+/// `unit` is 1 m/s in σ/s. `None` where the information is singular.
+pub(crate) fn posterior(total: &JointInformation, unit: f64, has_speeds: bool) -> Option<Posterior> {
     let n = total.len();
     if n == 0 {
         return None;
@@ -37,6 +37,9 @@ pub(crate) fn posterior(total: &JointInformation, unit: f64) -> Option<Posterior
     let velocity = |k: usize| STATE * (k / 2) + 2 + k % 2;
     let speeds = DVector::from_fn(2 * n, |k, _| state[velocity(k)]);
     let errors = DMatrix::from_fn(2 * n, 2 * n, |r, c| covariance[(velocity(r), velocity(c))]);
+    if !has_speeds {
+        return Some(Posterior { state, covariance });
+    }
     // −2 ln of the velocities' probability where they are N(0, variance) and measured with these errors.
     let cost = |speed: f64| -> Option<f64> {
         let mut sum = errors.clone();

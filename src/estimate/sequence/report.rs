@@ -30,7 +30,7 @@ pub(crate) fn report(
     let present = window.present(window.time_s);
     let n = present.len();
     let is_still = window.snapshots.last().is_none_or(|s| s.outlook.is_none());
-    let posterior = posterior(&window.total, 1.0 / window.unit_m);
+    let posterior = posterior(&window.total, 1.0 / window.unit_m, rules.weigh_speeds);
     let mut cov = None;
     let mut budget = WorkBudget::new(is_over);
     let (space, compressed, frame) = single.loaded();
@@ -38,7 +38,7 @@ pub(crate) fn report(
     if let (Some(Posterior { state, covariance }), Some(newest)) = (&posterior, window.snapshots.last()) {
         let place = |k: usize| STATE * present[k / 2] + k % 2;
         let mut own = DMatrix::from_fn(2 * n, 2 * n, |r, c| covariance[(place(r), place(c))]);
-        for (i, &e) in present.iter().enumerate() {
+        for (i, &e) in present.iter().enumerate().filter(|_| rules.allow_for_turns) {
             let lag = window.targets[e].straying.lag();
             for k in 0..2 {
                 for l in 0..2 {
@@ -87,7 +87,9 @@ pub(crate) fn report(
         }
     }
     let mut seen = present.iter().map(|e| window.targets[*e].is_seen());
-    found.emitters.retain(|_| seen.next().unwrap_or(true));
+    found
+        .emitters
+        .retain(|_| seen.next().unwrap_or(true) || !rules.hide_dark);
     Estimate {
         emitters: found.emitters,
         estimator: name,

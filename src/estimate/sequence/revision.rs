@@ -71,12 +71,13 @@ impl Revision {
     /// with one elsewhere, or all anew; `None` where there is nothing to try.
     pub fn begin(window: &Window, search: &WindowSearch, births: Vec<[f64; 2]>) -> Option<Self> {
         let mut proposals = VecDeque::from([Proposal::Same]);
-        if !births.is_empty() {
+        let rules = search.engine.rules;
+        if !births.is_empty() && rules.turns_before_newcomers {
             proposals.push_back(Proposal::Turn(window.beside(&births, BESIDE)));
         }
         proposals.extend(births.into_iter().map(Proposal::Birth));
         let is_ambiguous = is_ambiguous(window);
-        if is_ambiguous {
+        if is_ambiguous && rules.principal_components {
             proposals.push_back(Proposal::Restart);
         }
         let without = if is_ambiguous {
@@ -193,7 +194,7 @@ impl Revision {
             .iter()
             .filter(|p| matches!(p, Proposal::Move(..)))
             .count();
-        if let Some(target) = without.filter(|_| moves < RELOCATED * MOVES) {
+        if let Some(target) = without.filter(|_| moves < RELOCATED * MOVES && search.engine.rules.move_emitters) {
             let peaks = search.residual_peaks(&window, 0.0);
             for (_, at) in peaks.into_iter().take(MOVES) {
                 self.proposals

@@ -70,6 +70,9 @@ impl WindowSearch<'_, '_, '_> {
     /// Places where the frames together show light that none shows alone.
     pub fn births(&self, window: &Window, left: &ResidualSum) -> Vec<[f64; 2]> {
         let born_s = window.snapshots.first().map_or(window.time_s, |s| s.time_s);
+        if !self.engine.rules.summed_residuals {
+            return Vec::new();
+        }
         let beyond = |share: f64| self.chances.beyond_noise(born_s, left.frames, window.energies, share);
         let positions = window.positions(self.engine.bases);
         let is_near = |at: [f64; 2]| {
@@ -143,6 +146,9 @@ impl WindowSearch<'_, '_, '_> {
 
     /// Targets, the last first, whose light over all frames that held them is less than their penalty: noise that was born as an emitter.
     pub fn unconfirmed(&self, window: &Window) -> Vec<usize> {
+        if !self.engine.rules.confirm_newcomers {
+            return Vec::new();
+        }
         let lights = window.lights();
         let is_noise = |e: &usize| {
             let target = &window.targets[*e];
@@ -187,6 +193,9 @@ impl WindowSearch<'_, '_, '_> {
     /// Moves weak targets to where the residual peaks without them.
     fn relocate(&mut self, window: &mut Window) -> bool {
         let before = self.score(window);
+        if !self.engine.rules.move_emitters {
+            return false;
+        }
         for e in by_light(window).into_iter().take(RELOCATED) {
             if self.engine.budget.is_exhausted() {
                 break;

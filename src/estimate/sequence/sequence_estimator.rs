@@ -118,6 +118,9 @@ impl Estimator for SequenceEstimator {
         let (camera, unit_m) = (&self.camera, self.window.unit_m);
         self.outlook = (self.sight.as_ref()).map(|sight| Arc::new(Outlook::new(sight, camera, unit_m)));
         self.window.advance(time_s, self.memory_s);
+        if !self.rules.follow_accelerations {
+            self.window.targets.iter_mut().for_each(|t| t.straying.go_straight());
+        }
         self.window.keep_straight(time_s);
         if let Some(alone) = self.take(time_s, elapsed, scale, is_over) {
             return Ok(alone);
@@ -160,7 +163,7 @@ impl SequenceEstimator {
             if turned.is_empty() && is_young && self.search_again(time_s, is_over) {
                 return None;
             }
-            let everybody: Vec<usize> = (0..self.window.len()).collect();
+            let everybody = (0..self.window.len()).filter(|_| self.rules.turn_everybody).collect();
             for who in [turned, everybody].into_iter().filter(|who| !who.is_empty()) {
                 let fresh = self.turned(&who, 0.5 * elapsed, &mut budget);
                 if let Some(grown) = self.explain(fresh.clone(), scale, &mut budget) {
@@ -206,7 +209,7 @@ impl SequenceEstimator {
         let before = fresh.present(fresh.time_s).len();
         let grown = self.with_newcomers(fresh.clone(), budget)?;
         let after = grown.present(grown.time_s).len();
-        if after == before {
+        if after == before || !self.rules.ask_frame_alone {
             return Some(grown);
         }
         let found = self.single.estimate_loaded(scale, &|| budget.is_exhausted());
@@ -238,7 +241,7 @@ impl SequenceEstimator {
         let newcomers: Vec<[f64; 2]> = (self.window.len()..grown.len()).map(|e| grown.place(e)).collect();
         let mut doubted = fresh.beside(&newcomers, BESIDE);
         doubted.retain(|e| !who.contains(e));
-        if !doubted.is_empty() {
+        if !doubted.is_empty() && self.rules.turns_before_newcomers {
             doubted.extend(&who);
             let lately = 0.5 * LATELY * elapsed;
             let turned = self.turned(&doubted, lately, budget);
@@ -264,7 +267,7 @@ impl SequenceEstimator {
 
     /// Searches the frames of the window together with the loaded one, as what is remembered may be wrong. Whether that explains it.
     fn search_again(&mut self, time_s: f64, is_over: &dyn Fn() -> bool) -> bool {
-        let Some(first) = self.window.snapshots.first() else {
+        let Some(first) = self.window.snapshots.first().filter(|_| self.rules.search_again) else {
             return false;
         };
         let born_s = first.time_s;

@@ -1,5 +1,6 @@
 //! An emitter that the window follows, and whether it has gone dark.
 
+use crate::estimate::rules::Rules;
 use crate::estimate::sequence::straying::Straying;
 
 /// Frames over which a target's mean energy is averaged.
@@ -69,8 +70,9 @@ impl Target {
     }
 
     /// Whether it has gone dark, or was noise.
-    pub fn is_dark(&self) -> bool {
-        self.darkness > if self.is_doubtful { DARK_NEWCOMER } else { DARK }
+    pub fn is_dark(&self, rules: Rules) -> bool {
+        let is_doubtful = self.is_doubtful && rules.doubt_faint_newcomers;
+        self.darkness > if is_doubtful { DARK_NEWCOMER } else { DARK }
     }
 
     /// Whether it is still seen: what is gone would be followed as a beam until it is dropped.
@@ -104,7 +106,7 @@ impl Target {
 
 #[cfg(test)]
 mod tests {
-    use super::Target;
+    use super::{Rules, Target};
 
     /// One born at 0 whose energy is measured as `energies`, with a standard deviation of 1.
     fn target(energies: &[f64]) -> Target {
@@ -117,10 +119,16 @@ mod tests {
 
     #[test]
     fn a_faint_newcomer_who_does_not_come_again_was_noise() {
-        assert!(!target(&[7.0, 0.0]).is_dark());
-        assert!(target(&[7.0, 0.0, 0.0]).is_dark());
-        assert!(!target(&[7.0, 5.0, 0.0, 0.0]).is_dark(), "it came again");
-        assert!(!target(&[70.0, 0.0, 0.0]).is_dark(), "noise is not that bright");
+        assert!(!target(&[7.0, 0.0]).is_dark(Rules::default()));
+        assert!(target(&[7.0, 0.0, 0.0]).is_dark(Rules::default()));
+        assert!(
+            !target(&[7.0, 5.0, 0.0, 0.0]).is_dark(Rules::default()),
+            "it came again"
+        );
+        assert!(
+            !target(&[70.0, 0.0, 0.0]).is_dark(Rules::default()),
+            "noise is not that bright"
+        );
     }
 
     #[test]
@@ -129,7 +137,7 @@ mod tests {
         let after = |dark: usize, seen: &mut Vec<f64>| {
             seen.resize(50 + dark, 0.0);
             let target = target(seen);
-            (target.is_seen(), target.is_dark())
+            (target.is_seen(), target.is_dark(Rules::default()))
         };
         assert_eq!(after(2, &mut seen), (true, false));
         assert_eq!(after(3, &mut seen), (false, false));

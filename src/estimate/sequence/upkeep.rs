@@ -28,7 +28,7 @@ pub(crate) fn bury(window: &mut Window, engine: &mut Engine, elapsed: f64) {
         let target = &mut window.targets[e];
         target.weigh(time_s, last.local.energies[i], last.local.energy_variances[i], weight);
         let has_left = (0..2).any(|k| !(view[k][0]..view[k][1]).contains(&positions[2 * i + k]));
-        if target.is_dark() || has_left {
+        if target.is_dark(engine.rules) || has_left {
             target.died_s = time_s;
             has_died = true;
         }

@@ -8,6 +8,7 @@ use rand_distr::{Distribution, StandardNormal};
 use rayon::prelude::*;
 
 use super::measured::{Measured, Raised, exceptions};
+use crate::estimate;
 use crate::monitor::AlertKind::{PoseInconsistent, UnclaimedEmitter};
 use crate::study::stories::pixels::{PixelStory, RATE_HZ, Reviewed, review};
 
@@ -106,10 +107,10 @@ fn scene(kind: &Kind, seed: u64) -> String {
     text
 }
 
-fn flown(kind: &Kind, estimator: Option<&str>, seed: u64, seconds: f64, more: &str) -> Reviewed {
+fn flown(kind: &Kind, estimator: &estimate::Config, seed: u64, seconds: f64, more: &str) -> Reviewed {
     let mut story = PixelStory::only(seed, &format!("{}{more}", scene(kind, seed)));
     story.seconds = seconds;
-    story.config.estimator.name = estimator.map(str::to_owned);
+    story.config.estimator = estimator.clone();
     review(&story)
 }
 
@@ -167,7 +168,7 @@ fn delay_s(raised: &Raised, wanted: crate::monitor::AlertKind, from_s: f64) -> f
 }
 
 /// `stories` flights of each kind, honest, with a stranger, and dragged away at 1 m/s.
-pub fn flights(stories: u64, seed: u64, estimator: Option<&str>) -> Measured {
+pub fn flights(stories: u64, seed: u64, estimator: &estimate::Config) -> Measured {
     let mut text = format!(
         "{stories} flights of each kind; honest ones of {HONEST_S} s. Errors are of users' positions after {SETTLED_S} s.\n\n\
          | platform | flights with false alerts | median error m | mean squared error over the stated | stranger alerted within \

@@ -19,6 +19,7 @@ mod smear;
 mod zone_cost;
 mod zones;
 
+use crate::estimate;
 pub use measured::{Measured, Say};
 
 /// Something to measure.
@@ -31,16 +32,16 @@ pub struct Measurement {
 
 enum Run {
     Whole(fn(stories: u64, seed: u64) -> Measured),
-    /// Of the program with an estimator, the default one where none is named.
-    With(fn(stories: u64, seed: u64, estimator: Option<&str>) -> Measured),
+    /// Of the program with an estimator and its rules.
+    With(fn(stories: u64, seed: u64, estimator: &estimate::Config) -> Measured),
     /// Of the rows that are named; each is said as soon as it is measured.
     Rows(fn(stories: u64, seed: u64, only: &[String], say: Say) -> Measured),
 }
 
 impl Measurement {
     /// Measures `stories` stories, whose seeds begin with `seed`; where a measurement has rows, those that `only` names, and says each; where
-    /// frames are of pixels, with the named estimator.
-    pub fn run(&self, stories: u64, seed: u64, only: &[String], estimator: Option<&str>, say: Say) -> Measured {
+    /// frames are of pixels, with this estimator.
+    pub fn run(&self, stories: u64, seed: u64, only: &[String], estimator: &estimate::Config, say: Say) -> Measured {
         match self.run {
             Run::Whole(run) => run(stories, seed),
             Run::With(run) => run(stories, seed, estimator),
@@ -71,7 +72,7 @@ pub const ALL: &[Measurement] = &[
     rows("lens", 40, lens::uncalibrated),
     rows("lens-calibrated", 40, lens::calibrated),
     rows("lens-alerts", 30, lens::honest),
-    measurement("sequence", 8, sequence::frames_together),
+    with("sequence", 8, sequence::frames_together),
     measurement("smear", 100, smear::smears),
     measurement("formats", 200, formats::cost),
     measurement("crowds", 40, crowds::crowds),
@@ -85,7 +86,7 @@ const fn measurement(name: &'static str, stories: u64, run: fn(u64, u64) -> Meas
     }
 }
 
-const fn with(name: &'static str, stories: u64, run: fn(u64, u64, Option<&str>) -> Measured) -> Measurement {
+const fn with(name: &'static str, stories: u64, run: fn(u64, u64, &estimate::Config) -> Measured) -> Measurement {
     Measurement {
         name,
         stories,

@@ -7,6 +7,7 @@ use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 
 use super::measured::{Measured, Raised, exceptions};
+use crate::estimate;
 use crate::monitor::AlertKind::UnclaimedEmitter;
 use crate::study::stories::pixels::{CROWD, PixelStory, RATE_HZ, review};
 
@@ -37,7 +38,7 @@ const GOAL: f64 = 0.998;
 fn told(
     stories: u64,
     seed: u64,
-    estimator: Option<&str>,
+    estimator: &estimate::Config,
     seconds: f64,
     toml: impl Fn(u64) -> String + Sync,
 ) -> Vec<(u64, Raised)> {
@@ -45,23 +46,23 @@ fn told(
     let tell = |k| {
         let mut story = PixelStory::with(k, &toml(k));
         story.seconds = seconds;
-        story.config.estimator.name = estimator.map(str::to_owned);
+        story.config.estimator = estimator.clone();
         (k, review(&story).raised())
     };
     seeds.map(tell).collect()
 }
 
 /// Users of whom two roam near each other and one drives raise nothing.
-pub fn honest_users(stories: u64, seed: u64, estimator: Option<&str>) -> Measured {
+pub fn honest_users(stories: u64, seed: u64, estimator: &estimate::Config) -> Measured {
     peace(stories, seed, estimator, BUSY)
 }
 
 /// Users who stand so near each other that a frame hardly ever tells them all apart raise nothing.
-pub fn honest_crowd(stories: u64, seed: u64, estimator: Option<&str>) -> Measured {
+pub fn honest_crowd(stories: u64, seed: u64, estimator: &estimate::Config) -> Measured {
     peace(stories, seed, estimator, CROWD)
 }
 
-fn peace(stories: u64, seed: u64, estimator: Option<&str>, toml: &str) -> Measured {
+fn peace(stories: u64, seed: u64, estimator: &estimate::Config, toml: &str) -> Measured {
     let mut raised = told(stories, seed, estimator, HONEST_S, |_| toml.to_owned());
     raised.retain(|(_, raised)| !raised.is_empty());
     let frames = stories as f64 * HONEST_S * RATE_HZ;
@@ -96,7 +97,7 @@ fn within(delays: &[f64], s: f64) -> usize {
 }
 
 /// A stranger anywhere in view, as strong as the users.
-pub fn strangers(stories: u64, seed: u64, estimator: Option<&str>) -> Measured {
+pub fn strangers(stories: u64, seed: u64, estimator: &estimate::Config) -> Measured {
     let mut raised = told(stories, seed, estimator, STRANGER_S, |k| {
         let mut rng = ChaCha8Rng::seed_from_u64(k);
         let [x, y] = [0; 2].map(|_| rng.random_range(-120.0..120.0f64));
@@ -118,7 +119,7 @@ pub fn strangers(stories: u64, seed: u64, estimator: Option<&str>) -> Measured {
 }
 
 /// The same within 5 m of one of the users, uniformly over that ground.
-pub fn strangers_near(stories: u64, seed: u64, estimator: Option<&str>) -> Measured {
+pub fn strangers_near(stories: u64, seed: u64, estimator: &estimate::Config) -> Measured {
     let place = |k: u64| {
         let mut rng = ChaCha8Rng::seed_from_u64(k);
         let (r, angle) = (
@@ -149,7 +150,7 @@ pub fn strangers_near(stories: u64, seed: u64, estimator: Option<&str>) -> Measu
 }
 
 /// A stranger within 20 m of the middle of a crowd.
-pub fn strangers_in_crowd(stories: u64, seed: u64, estimator: Option<&str>) -> Measured {
+pub fn strangers_in_crowd(stories: u64, seed: u64, estimator: &estimate::Config) -> Measured {
     let raised = told(stories, seed, estimator, COMES_IN_CROWD_S + 20.0, |k| {
         let mut rng = ChaCha8Rng::seed_from_u64(k);
         let (r, angle) = (
@@ -183,7 +184,7 @@ pub fn strangers_in_crowd(stories: u64, seed: u64, estimator: Option<&str>) -> M
 
 /// A stranger who comes on beside a user and stays, by distance and by power as a share of the user's: how many are alerted within
 /// 20 s, and the median and longest delay. From how far all are found is a requirement; so is that nothing else is raised.
-pub fn shadows(stories: u64, seed: u64, estimator: Option<&str>) -> Measured {
+pub fn shadows(stories: u64, seed: u64, estimator: &estimate::Config) -> Measured {
     let mut text = "| power | m from the user | found | median s | longest s | something else first |\n".to_owned();
     text += "|---|---|---|---|---|---|\n";
     let mut holds = true;

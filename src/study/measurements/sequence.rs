@@ -8,7 +8,7 @@ use rand_chacha::ChaCha8Rng;
 
 use super::measured::Measured;
 use crate::assign::ospa;
-use crate::estimate::{self, Estimate, Estimator};
+use crate::estimate::{self, Estimate, Estimator, Rules};
 use crate::optics::Camera;
 use crate::study::tradeoff::{CUTOFF_M, Cell, Noise, Snapshots, Walk, is_apart};
 
@@ -82,7 +82,7 @@ struct Row {
 }
 
 /// So many walks of each cell, frame rate and strength of the fading.
-pub fn frames_together(walks: u64, seed: u64) -> Measured {
+pub fn frames_together(walks: u64, seed: u64, estimator: &estimate::Config) -> Measured {
     let mut text = "Squared error over the bound of all frames so far (1 is at the bound), median over resolvable emitters, a missed one \
                     counting as ∞; number right: of the walks where all emitters are resolvable.\n\n\
                     | cell | rate, Hz | std of energy | frames | bound (median), m² | `sequence` over bound | `ml` over bound | number right: \
@@ -99,7 +99,7 @@ pub fn frames_together(walks: u64, seed: u64) -> Measured {
                     speed_m_s: 1.0,
                     relative_std,
                 };
-                let rows = measure(&cell, &walk, &AFTER, walks, seed);
+                let rows = measure(&cell, &walk, &AFTER, walks, seed, estimator.rules);
                 for (frames, row) in AFTER.into_iter().zip(&rows) {
                     let setting = format!("{} | {rate_hz} | {relative_std} | {frames}", cell.name());
                     writeln!(text, "| {setting} | {} |", row.cells()).expect("text takes all");
@@ -113,7 +113,7 @@ pub fn frames_together(walks: u64, seed: u64) -> Measured {
             }
         }
     }
-    let (paper, paper_holds) = paper(OF_PAPER * walks, seed);
+    let (paper, paper_holds) = paper(OF_PAPER * walks, seed, estimator.rules);
     let share = right as f64 / clear.max(1) as f64;
     write!(
         text,
@@ -128,14 +128,14 @@ pub fn frames_together(walks: u64, seed: u64) -> Measured {
 }
 
 /// The paper's scene to the letter: σ_eff 8 mm, N₀ 10⁻¹², users who stand still, strong fading.
-fn paper(walks: u64, seed: u64) -> (String, bool) {
+fn paper(walks: u64, seed: u64, rules: Rules) -> (String, bool) {
     let walk = Walk {
         frames: 100,
         rate_hz: 10.0,
         speed_m_s: 0.0,
         relative_std: 0.9,
     };
-    let rows = measure(&Cell::new(Noise::Energy, 8.0, 64), &walk, &[1, 100], walks, seed);
+    let rows = measure(&Cell::new(Noise::Energy, 8.0, 64), &walk, &[1, 100], walks, seed, rules);
     let mut text = "The paper's scene, users still, std .9:\n\n| frames | bound (median), m² | median error, m² | number right | `ml`: median \
                     error, m² | number right |\n|---|---|---|---|---|---|\n"
         .to_owned();
@@ -158,14 +158,14 @@ fn paper(walks: u64, seed: u64) -> (String, bool) {
     (text, is_near && last.right as f64 >= PAPER_RIGHT * last.walks as f64)
 }
 
-fn measure(cell: &Cell, walk: &Walk, after: &[usize], walks: u64, seed: u64) -> Vec<Row> {
+fn measure(cell: &Cell, walk: &Walk, after: &[usize], walks: u64, seed: u64, rules: Rules) -> Vec<Row> {
     let camera = cell.camera().expect("a camera");
     let mut rows: Vec<Row> = after.iter().map(|_| Row::default()).collect();
     for k in seed..seed + walks {
         let mut rng = ChaCha8Rng::seed_from_u64(k);
         let snapshots = Snapshots::draw(&camera, walk, &mut rng);
         let bounds = snapshots.bounds_m2(&camera, after, walk.speed_m_s > 0.0);
-        let mut together = named("sequence", &camera);
+        let mut together = named("sequence", rules, &camera);
         for frame in 0..walk.frames {
             let shown = snapshots.frame(&camera, frame, &mut rng);
             let at = after
@@ -178,7 +178,7 @@ fn measure(cell: &Cell, walk: &Walk, after: &[usize], walks: u64, seed: u64) -> 
             if frame + 1 == after[at] {
                 let truth = snapshots.positions(frame);
                 rows[at].together.add(&truth, &bounds[at], answer.as_ref());
-                let alone = named("ml", &camera).estimate(&shown).ok();
+                let alone = named("ml", rules, &camera).estimate(&shown).ok();
                 rows[at].alone.add(&truth, &bounds[at], alone.as_ref());
                 rows[at].bounds.extend_from_slice(&bounds[at]);
             }
@@ -187,9 +187,10 @@ fn measure(cell: &Cell, walk: &Walk, after: &[usize], walks: u64, seed: u64) -> 
     rows
 }
 
-fn named(name: &str, camera: &Camera) -> Box<dyn Estimator> {
+fn named(name: &str, rules: Rules, camera: &Camera) -> Box<dyn Estimator> {
     let config = estimate::Config {
         name: Some(name.to_owned()),
+        rules,
         ..Default::default()
     };
     estimate::build(&config, camera).expect("an estimator")
@@ -246,7 +247,7 @@ mod tests {
             speed_m_s: 1.0,
             relative_std: 0.29,
         };
-        let rows = measure(&Cell::new(Noise::Energy, 2.0, 64), &walk, &[10], 4, 1);
+        let rows = measure(&Cell::new(Noise::Energy, 2.0, 64), &walk, &[10], 4, 1, Rules::default());
         let [together, alone] = [&rows[0].together, &rows[0].alone].map(|t| t.over_bound().unwrap());
         assert!(together < 1.6 && alone > 1.5 * together, "{together} {alone}");
     }
