@@ -2,7 +2,8 @@
 
 macro_rules! rules {
     (of_frames: { $($(#[doc = $doc:expr])* $name:ident,)* } of_sequences: { $($(#[doc = $of:expr])* $later:ident,)* }) => {
-        /// Which rules are in force; all by default. [`Rules::without`] switches one off for `oapwatch tradeoff --without NAME`.
+        /// Which rules are in force; all by default. [`Rules::without`] switches one off for `oapwatch tradeoff --without NAME`
+        /// and `oapwatch study --without NAME`.
         #[derive(Clone, Copy, Debug, PartialEq, Eq)]
         pub struct Rules {
             $($(#[doc = $doc])* pub $name: bool,)*
@@ -104,16 +105,12 @@ rules! {
     ask_frame_alone,
     /// A newcomer beside others has to explain the frames better than that these have turned.
     turns_before_newcomers,
-    /// A frame that contradicts what is known opens all velocities.
-    turn_everybody,
     /// The window is searched together with a frame that contradicts what is known.
     search_again,
     /// Where pairs are ambiguous the window is searched from its principal components.
     principal_components,
     /// Emitters are born where the residuals of all frames together peak.
     summed_residuals,
-    /// Weak emitters are tried at other places.
-    move_emitters,
     /// The covariance holds what may be left of a turn.
     allow_for_turns,
     /// The accelerations of who roams are learned, and the window ends where courses are not straight.
@@ -141,9 +138,10 @@ mod tests {
             Rules::default()
         );
         assert_eq!(Rules::without("relocate_outside"), None);
-        for (i, name) in Rules::NAMES.iter().enumerate() {
+        let names = [Rules::NAMES, Rules::OF_SEQUENCES].concat();
+        for (i, name) in names.iter().enumerate() {
             assert_ne!(Rules::without(name), Some(Rules::default()), "{name}");
-            assert!(!Rules::NAMES[..i].contains(name), "{name} is there once");
+            assert!(!names[..i].contains(name), "{name} is there once");
         }
     }
 }

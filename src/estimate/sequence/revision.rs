@@ -4,7 +4,7 @@
 use std::collections::VecDeque;
 
 use crate::estimate::sequence::search::{
-    BESIDE, CONVERGE_STEPS, RELOCATED, TRIAL_STEPS, TURN_PENALTY, WindowSearch, is_ambiguous,
+    BESIDE, CONVERGE_STEPS, TRIAL_STEPS, TURN_PENALTY, WindowSearch, is_ambiguous,
 };
 use crate::estimate::sequence::straying::SURPRISE;
 use crate::estimate::sequence::target::Target;
@@ -13,8 +13,6 @@ use crate::estimate::sequence::window_fit::Progress;
 
 /// A proposal counts as better when it lowers the score by this: what unfinished fits differ by.
 const LEAST_GAIN: f64 = 1.0;
-/// Residual peaks at which an emitter is tried that was removed elsewhere.
-const MOVES: usize = 2;
 
 /// Another explanation of the window.
 enum Proposal {
@@ -24,8 +22,6 @@ enum Proposal {
     Turn(Vec<usize>),
     Birth([f64; 2]),
     Death(usize),
-    /// An emitter that has been removed from the window, at another place.
-    Move(Box<(Window, Target)>, [f64; 2]),
     /// What the principal components of all frames show.
     Restart,
 }
@@ -34,8 +30,6 @@ enum Proposal {
 struct Trial {
     window: Window,
     steps: usize,
-    /// The emitter without which it is, to be tried elsewhere.
-    without: Option<Target>,
     /// What frames have cost that were folded for a turn.
     folded: Option<f64>,
 }
@@ -67,8 +61,8 @@ pub(crate) struct Revision {
 }
 
 impl Revision {
-    /// Of a window, with an emitter more at one of `births`, without one that may be noise, and, where emitters are not told apart for certain,
-    /// with one elsewhere, or all anew; `None` where there is nothing to try.
+    /// Of a window, with an emitter more at one of `births`, without one that may be noise or, where emitters are not told apart for certain, one
+    /// of others, or all anew; `None` where there is nothing to try.
     pub fn begin(window: &Window, search: &WindowSearch, births: Vec<[f64; 2]>) -> Option<Self> {
         let mut proposals = VecDeque::from([Proposal::Same]);
         let rules = search.engine.rules;
@@ -137,7 +131,6 @@ impl Revision {
         let born_s = self.base.snapshots.first().map_or(self.base.time_s, |s| s.time_s);
         let mut window = self.base.clone();
         let mut steps = TRIAL_STEPS;
-        let mut without = None;
         let mut folded = None;
         match proposal {
             Proposal::Same => {}
@@ -145,38 +138,20 @@ impl Revision {
                 folded = Some(search.turn(&mut window, &who)?);
             }
             Proposal::Birth(at) => window.insert(Target::born(born_s), at, [0.0; 2]),
-            Proposal::Death(e) => {
-                without = Some(window.targets[e]);
-                window.remove(e);
-            }
-            Proposal::Move(rest, at) => {
-                let (rest, target) = *rest;
-                window = rest;
-                window.insert(target, at, [0.0; 2]);
-            }
+            Proposal::Death(e) => window.remove(e),
             Proposal::Restart => {
                 window = search.restarted(&window)?;
                 steps = CONVERGE_STEPS;
             }
         }
         window.damping = 0.0;
-        Some(Trial {
-            window,
-            steps,
-            without,
-            folded,
-        })
+        Some(Trial { window, steps, folded })
     }
 
     /// Compares a fitted trial. Returns it where it is better.
     fn conclude(&mut self, search: &mut WindowSearch, trial: Trial) -> Option<Window> {
         let score = trial.score(search);
-        let Trial {
-            window,
-            without,
-            folded,
-            ..
-        } = trial;
+        let Trial { window, folded, .. } = trial;
         if !self.is_fitted {
             (self.is_fitted, self.score, self.base) = (true, score, window);
             return None;
@@ -186,21 +161,6 @@ impl Revision {
             self.score = self.score.min(score + TURN_PENALTY);
             return None;
         }
-        if score < self.score - LEAST_GAIN {
-            return Some(window);
-        }
-        let moves = self
-            .proposals
-            .iter()
-            .filter(|p| matches!(p, Proposal::Move(..)))
-            .count();
-        if let Some(target) = without.filter(|_| moves < RELOCATED * MOVES && search.engine.rules.move_emitters) {
-            let peaks = search.residual_peaks(&window, 0.0);
-            for (_, at) in peaks.into_iter().take(MOVES) {
-                self.proposals
-                    .push_back(Proposal::Move(Box::new((window.clone(), target)), at));
-            }
-        }
-        None
+        (score < self.score - LEAST_GAIN).then_some(window)
     }
 }

@@ -33,8 +33,8 @@ pub(crate) const BESIDE: f64 = 1.5;
 pub(crate) const TURN_PENALTY: f64 = 6.0;
 /// Rounds of births and deaths.
 const ROUNDS: usize = 12;
-/// Targets that are moved to the residual's peaks, the weakest first.
-pub(crate) const RELOCATED: usize = 3;
+/// Targets whose removal is tried although nothing speaks against them, those of least light.
+const LEAST_LIT: usize = 3;
 
 /// A search of one window.
 pub(crate) struct WindowSearch<'s, 'a, 'b> {
@@ -182,39 +182,12 @@ impl WindowSearch<'_, '_, '_> {
     /// Targets whose removal is tried: doubtful ones, and those of least light.
     pub fn weakest(&self, window: &Window) -> Vec<usize> {
         let mut weakest = self.doubtful(window);
-        for e in by_light(window).into_iter().take(RELOCATED) {
+        for e in by_light(window).into_iter().take(LEAST_LIT) {
             if !weakest.contains(&e) {
                 weakest.push(e);
             }
         }
         weakest
-    }
-
-    /// Moves weak targets to where the residual peaks without them.
-    fn relocate(&mut self, window: &mut Window) -> bool {
-        let before = self.score(window);
-        if !self.engine.rules.move_emitters {
-            return false;
-        }
-        for e in by_light(window).into_iter().take(RELOCATED) {
-            if self.engine.budget.is_exhausted() {
-                break;
-            }
-            let target = window.targets[e];
-            let mut without = window.clone();
-            without.remove(e);
-            without.fit(self.engine, TRIAL_STEPS);
-            for (_, at) in self.residual_peaks(&without, 0.0).into_iter().take(2) {
-                let mut next = without.clone();
-                next.insert(target, at, [0.0; 2]);
-                next.fit(self.engine, TRIAL_STEPS);
-                if self.score(&next) < before - 1.0 {
-                    *window = next;
-                    return true;
-                }
-            }
-        }
-        false
     }
 
     /// Lets these targets change their velocity in the middle of the window. Returns what this takes off the score with the frames before;
@@ -233,12 +206,12 @@ impl WindowSearch<'_, '_, '_> {
         Some(folded)
     }
 
-    /// Grows, shrinks and relocates until nothing improves.
+    /// Grows and shrinks until nothing improves.
     pub fn refine(&mut self, window: &mut Window, born_s: f64) {
         for _ in 0..4 {
             let has_grown = self.grow(window, born_s);
             let has_shrunk = self.shrink(window);
-            if !has_grown && !has_shrunk && !self.relocate(window) {
+            if !has_grown && !has_shrunk {
                 break;
             }
         }

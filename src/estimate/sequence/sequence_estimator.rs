@@ -163,11 +163,10 @@ impl SequenceEstimator {
             if turned.is_empty() && is_young && self.search_again(time_s, is_over) {
                 return None;
             }
-            let everybody = (0..self.window.len()).filter(|_| self.rules.turn_everybody).collect();
-            for who in [turned, everybody].into_iter().filter(|who| !who.is_empty()) {
-                let fresh = self.turned(&who, 0.5 * elapsed, &mut budget);
+            if !turned.is_empty() {
+                let fresh = self.turned(&turned, 0.5 * elapsed, &mut budget);
                 if let Some(grown) = self.explain(fresh.clone(), scale, &mut budget) {
-                    self.accept_turned(fresh, grown, &who, elapsed, &mut budget);
+                    self.accept_turned(fresh, grown, &turned, elapsed, &mut budget);
                     return None;
                 }
             }
