@@ -105,6 +105,53 @@ fn an_airy_disc_is_learned_from_frames_of_unknown_positions() {
     assert!(text.contains("[spot.shape]") && text.contains("error ="), "{text}");
 }
 
+/// Strong coma on a small sensor: no shape is the same everywhere, and the config's width is that of the core without it.
+#[test]
+fn a_comatic_lens_is_learned_from_its_wavefront() {
+    let dir = tempfile::tempdir().unwrap();
+    let effects = "[effects.spot]\nkind = \"zernike\"\nfirst_zero_m = 2.2e-3\n\
+        [[effects.spot.term]]\nnoll = 8\nwaves = [0.0, 0.2]\n\
+        [[effects.spot.term]]\nnoll = 7\nwaves = [0.0, 0.0, 0.2]";
+    scene_frames(dir.path(), "spot_sigma_m = 7.5e-4", SIX, effects, 100);
+    let out = learned(dir.path());
+    assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
+    let report: serde_json::Value = serde_json::from_slice(&out.stdout).unwrap();
+    let after = &report["after"];
+    let reduced = after["chi2"].as_f64().unwrap() / after["degrees_of_freedom"].as_f64().unwrap();
+    assert!(reduced < 1.15, "{report}");
+    let wavefront = &report["spot"]["wavefront"];
+    assert!(
+        (wavefront["first_zero_m"].as_f64().unwrap() / 2.2e-3 - 1.0).abs() < 0.03,
+        "{report}"
+    );
+    // 0.2 waves at the edge along both axes; the simulator mixes images between seven places of the field.
+    let coma = 0.2 * (2.0f64 / 3.0).sqrt();
+    assert!(
+        (wavefront["coma"].as_f64().unwrap() / coma - 1.0).abs() < 0.1,
+        "{report}"
+    );
+    assert!(report["gain_scatter"].is_null(), "{report}");
+
+    let device = std::fs::read_to_string(dir.path().join("device.toml")).unwrap();
+    let calibrated = dir.path().join("calibrated.toml");
+    std::fs::write(&calibrated, format!("{device}calibration = \"calibration.toml\"\n")).unwrap();
+    let count = |config: &Path| {
+        let out = oapwatch(&[&"locate", &"--config", &config, &dir.path().join("frames.npy")]);
+        assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
+        let answers: Vec<serde_json::Value> = serde_json::Deserializer::from_slice(&out.stdout)
+            .into_iter()
+            .map(Result::unwrap)
+            .collect();
+        answers
+            .iter()
+            .map(|a| a["emitters"].as_array().unwrap().len())
+            .sum::<usize>()
+    };
+    // Of six hundred some are too near to each other to be told apart.
+    let (before, found) = (count(&dir.path().join("device.toml")), count(&calibrated));
+    assert!((560..=602).contains(&found), "{found}, not calibrated {before}");
+}
+
 #[test]
 fn a_gaussian_that_is_known_is_not_calibrated_again() {
     let dir = tempfile::tempdir().unwrap();

@@ -15,6 +15,12 @@ pub fn norm(camera: &Camera, model: &TemplateModel) -> f64 {
     (model.coefficients[..n * n].iter().map(|c| c * c).sum::<f64>() / area).sqrt()
 }
 
+/// Width of the Gaussian with this norm: what the estimator's halo is as wide as.
+pub fn sigma_equivalent_m(camera: &Camera, model: &TemplateModel) -> f64 {
+    let pixel = (camera.x.pitch_m * camera.y.pitch_m).sqrt();
+    pixel / (2.0 * std::f64::consts::PI.sqrt() * norm(camera, model))
+}
+
 /// Inverse prior variances of the coefficients: three times what the template has at that distance, fading at the edge.
 pub fn prior(model: &TemplateModel, is_first: bool) -> Vec<f64> {
     let n = model.n;
@@ -56,7 +62,7 @@ const EDGE: [f64; 2] = [0.6, 0.8];
 /// The share of a spot's light by which it differs from a template that ends at the edge of its support: the light near the edge, as even
 /// over a spot's width as a spot's own, over the halo's height there. Real tails fall no slower than the halo does beyond.
 pub fn light_left_out(camera: &Camera, model: &TemplateModel) -> f64 {
-    let distance = 0.5 * (EDGE[0] + EDGE[1]) * model.radius_m() / camera.spot_sigma_m;
+    let distance = 0.5 * (EDGE[0] + EDGE[1]) * model.radius_m() / sigma_equivalent_m(camera, model);
     let height = 1.0 / (1.0 + (distance / HALO).powi(2));
     light_at_edge(camera, model) / (norm(camera, model).powi(2) * height)
 }

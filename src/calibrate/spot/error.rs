@@ -28,6 +28,10 @@ pub enum Error {
          them beams, below saturation, and none always beside another?"
     )]
     NotAlike { share: f64 },
+    #[error(
+        "the learned spot has only {share:.0} % of its light within two of its widths: it is no spot; give more frames, or brighter beams"
+    )]
+    Scattered { share: f64 },
     #[error("no pixel of the {frames} frames has a finite value")]
     NotFinite { frames: usize },
     #[error("the pixels of the {frames} frames hardly differ, not even by noise: is there a picture in them?")]

@@ -4,6 +4,7 @@ use std::ops::Range;
 
 use super::band::pixels_within;
 use super::patch::{Patch, Source};
+use super::template_model::TemplateModel;
 use crate::optics::Camera;
 
 /// One frame prepared for learning, J, row by row.
@@ -56,6 +57,22 @@ pub fn patches(camera: &Camera, index: usize, image: &Image, sources: Vec<Source
             chi2: 0.0,
         })
         .collect()
+}
+
+/// What the patches of an image leave of it, J; between them its level is taken off.
+pub fn residual(camera: &Camera, model: &TemplateModel, image: &Image, patches: &[&Patch]) -> Vec<f64> {
+    let nx = camera.x.n;
+    let mut residual: Vec<f64> = image.pixels.iter().map(|v| v - image.level).collect();
+    for patch in patches {
+        let expected = patch.expected(camera, model);
+        for (row, line) in patch.y.clone().zip(expected.chunks_exact(patch.x.len())) {
+            let start = row * nx + patch.x.start;
+            for (o, e) in residual[start..].iter_mut().zip(line) {
+                *o += image.level - e;
+            }
+        }
+    }
+    residual
 }
 
 fn overlap(a: &[Range<usize>; 2], b: &[Range<usize>; 2]) -> bool {

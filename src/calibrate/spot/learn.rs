@@ -6,9 +6,11 @@ use super::constraints::{self, norm};
 use super::detection::{self, MatchedFilter, Peak};
 use super::flashes;
 use super::grouping::{self, Image};
-use super::patch::{Linearised, Patch, Source};
+use super::patch::{Patch, Source};
+use super::pupil::Pupil;
 use super::solve;
 use super::template_model::TemplateModel;
+use super::wavefront;
 use crate::optics::Camera;
 use crate::stats::median;
 
@@ -20,6 +22,8 @@ const FINEST: f64 = 0.25;
 /// Half the support at the start, σ, and the factor by which it grows while there is light at its edge.
 pub const FIRST_RADIUS: f64 = 6.0;
 const GROWTH: f64 = 1.5;
+/// Half the support of a pupil's spot at the start, σ: an aberrated one is wide.
+const FIRST_PUPIL_RADIUS: f64 = 9.0;
 /// Most splines a side: what a matrix of them costs in each round.
 const MOST_SPLINES: usize = 97;
 /// Largest half of the support, half sensors: spots near an edge show their tails as far as the other edge.
@@ -29,8 +33,7 @@ const WIDEST: f64 = 1.8;
 const EDGE_LIGHT: f64 = 0.1;
 /// Support of what changes over the field, σ: aberrations that change widely are near the core.
 const FIELD_RADIUS: f64 = 7.0;
-/// Default number of rounds, and the relative fall of χ² per degree of freedom below which there are no more.
-pub const MOST_ROUNDS: usize = 12;
+/// Relative fall of χ² per degree of freedom below which there are no more rounds.
 const SETTLED: f64 = 1e-3;
 /// Least matched signal-to-noise ratio of a source that a patch is used for.
 const LEAST_SNR: f64 = 12.0;
@@ -180,6 +183,27 @@ impl<'a> Learner<'a> {
         sums.0 / f64::max(sums.1, 1.0)
     }
 
+    /// χ² of all pixels of the images, those of patches and those between them.
+    pub fn chi2_of_images(&self) -> f64 {
+        let chi2 = self.by_image().into_par_iter().map(|(image, patches)| {
+            let residual = grouping::residual(self.camera, &self.model, image, &patches);
+            residual
+                .iter()
+                .zip(&image.weight)
+                .map(|(r, w)| (r * w).powi(2))
+                .sum::<f64>()
+        });
+        chi2.sum()
+    }
+
+    fn by_image(&self) -> Vec<(&'a Image, Vec<&Patch>)> {
+        let mut by_image: Vec<_> = self.images.iter().map(|image| (*image, Vec::new())).collect();
+        self.patches
+            .iter()
+            .for_each(|patch| by_image[patch.frame].1.push(patch));
+        by_image
+    }
+
     pub fn sources(&self) -> usize {
         self.patches.iter().map(|p| p.sources.len()).sum()
     }
@@ -197,34 +221,19 @@ impl<'a> Learner<'a> {
 
     /// Adds spots that the residual shows; what a brighter spot's own misfit may look like is left alone.
     pub fn find_missing(&mut self) -> usize {
-        let (camera, model, noise) = (self.camera, &self.model, self.noise_j);
+        let (camera, noise) = (self.camera, self.noise_j);
         let share = (4.0 * self.misfit).clamp(0.01, 0.25);
         let near = 3.0 * camera.spot_sigma_m;
-        let mut by_frame: Vec<Vec<&Patch>> = vec![Vec::new(); self.images.len()];
-        for patch in &self.patches {
-            by_frame[patch.frame].push(patch);
-        }
-        let found: Vec<(Vec<Source>, usize)> = by_frame
-            .par_iter()
-            .zip(self.images)
-            .map(|(patches, image)| {
-                let nx = camera.x.n;
-                let mut residual: Vec<f64> = image.pixels.iter().map(|v| v - image.level).collect();
-                for patch in patches {
-                    let expected = patch.expected(camera, model);
-                    for (row, line) in patch.y.clone().zip(expected.chunks_exact(patch.x.len())) {
-                        let start = row * nx + patch.x.start;
-                        for (o, e) in residual[start..].iter_mut().zip(line) {
-                            *o = *o + image.level - e;
-                        }
+        let found: Vec<(Vec<Source>, usize)> = self
+            .by_image()
+            .into_par_iter()
+            .map(|(image, patches)| {
+                let mut residual = grouping::residual(self.camera, &self.model, image, &patches);
+                for (r, weight) in residual.iter_mut().zip(&image.weight) {
+                    if *weight == 0.0 {
+                        *r = 0.0;
                     }
                 }
-                let used = image.weight.iter().map(|w| *w > 0.0);
-                residual.iter_mut().zip(used).for_each(|(r, used)| {
-                    if !used {
-                        *r = 0.0
-                    }
-                });
                 let known: Vec<Source> = patches.iter().flat_map(|p| p.sources.iter().cloned()).collect();
                 let brighter: Vec<Peak> = known.iter().map(Peak::from).collect();
                 let peaks = self.filter.peaks(camera, &residual, noise);
@@ -296,30 +305,26 @@ impl<'a> Learner<'a> {
         found
     }
 
+    /// Goes on with the spot of a lens's pupil, whose wavefront is then what is learned.
+    pub fn begin_wavefront(&mut self) {
+        let radius = FIRST_PUPIL_RADIUS * self.camera.spot_sigma_m;
+        let knots = (2.0 * radius / self.model.knot_m) as usize;
+        let like = self
+            .model
+            .widened((knots | 1).clamp(self.model.n, MOST_SPLINES.max(self.model.n)));
+        self.adopt(Pupil::of_camera(self.camera).template(&like));
+    }
+
     /// One step of the template and of everything else at once.
-    pub fn step(&mut self, is_first: bool) {
-        let (camera, model) = (self.camera, &self.model);
-        let prior = constraints::prior(model, is_first);
-        let linear: Vec<(&Patch, Linearised)> = self
-            .patches
-            .par_iter()
-            .filter_map(|patch| patch.linearise(camera, model).map(|l| (patch, l)))
-            .collect();
-        let step = solve::template_step(model, &linear, &prior);
-        drop(linear);
-        let mut model = self.model.clone();
-        model.coefficients.iter_mut().zip(&step).for_each(|(c, s)| *c += s);
-        let shift = constraints::centre(&mut model, camera.spot_sigma_m);
-        let light = model.normalise();
-        for patch in &mut self.patches {
-            for source in &mut patch.sources {
-                let values = model.field_values(source.at);
-                source.energy_j *= light(&values);
-                let moved = shift(&values);
-                (0..2).for_each(|k| source.at[k] += moved[k]);
+    fn step(&mut self, is_first: bool) {
+        match self.model.pupil {
+            Some(pupil) => {
+                if let Some(model) = wavefront::step(self, pupil) {
+                    self.model = model;
+                }
             }
+            None => solve::step(self, is_first),
         }
-        self.model = model;
     }
 
     /// Whether light at the edge of the support matters, and there is room for more.
@@ -357,7 +362,8 @@ impl<'a> Learner<'a> {
             }
             before = chi2;
             self.step(round == 0 && self.model.degree == 0);
-            if (1..=3).contains(&round) && self.model.degree == 0 && self.is_cut_short() {
+            let may_grow = self.model.degree == 0 || self.model.pupil.is_some();
+            if (1..=3).contains(&round) && may_grow && self.is_cut_short() {
                 let wanted = (GROWTH * self.radius_m()).min(widest);
                 let n = (2.0 * wanted / self.model.knot_m) as usize;
                 let n = (n | 1).min(MOST_SPLINES);

@@ -1,6 +1,7 @@
 //! Learns the spot's shape over the field, the noise and the pixel maps from frames whose positions nobody knows.
 
 mod band;
+mod candidates;
 mod constraints;
 mod coverage;
 mod detection;
@@ -11,10 +12,12 @@ mod learn;
 mod patch;
 mod pixel_maps;
 mod prepare;
+mod pupil;
 mod solve;
 mod statistics;
 mod template_model;
 mod terms;
+mod wavefront;
 
 use std::sync::Arc;
 
@@ -25,8 +28,10 @@ pub use coverage::{CELLS, Coverage};
 pub use error::Error;
 use error::{MIN_FRAMES, MIN_SPOTS};
 use grouping::Image;
-use learn::{Learner, MOST_ROUNDS};
+use learn::Learner;
+pub use pupil::Wavefront;
 use template_model::TemplateModel;
+use terms::Separable;
 
 /// χ² of the held-out frames' pixels around spots with one model.
 #[derive(Clone, Copy, Debug, serde::Serialize)]
@@ -59,6 +64,8 @@ pub struct Learned {
     pub coverage: Coverage,
     /// Degree of the polynomials by which the shape changes over the field; 0: it does not, as far as these frames show.
     pub field_degree: usize,
+    /// That of the lens, where the shape is learned from it.
+    pub wavefront: Option<Wavefront>,
     /// Noise of a pixel, J, and its growth with the light where it shows, J.
     pub noise_std_j: f64,
     pub gain_j: Option<f64>,
@@ -97,6 +104,8 @@ const HELD_OUT: usize = 5;
 /// Misfit of most spots in training, and of all that are not odd on the held-out frames, beyond which spots have no common shape.
 const UNLIKE: f64 = 0.25;
 const UNEXPLAINED: f64 = 0.05;
+/// Least share of a spot's light within two of its widths.
+const COMPACT: f64 = 0.4;
 
 /// Progress of the learning.
 #[derive(Clone, Copy, Debug)]
@@ -131,10 +140,6 @@ pub fn learn(
         }
         prepared.mask_flashes(&flashes);
     }
-    let (train, _) = split(&prepared.images);
-    let mut learner = Learner::new(camera, &train, prepared.noise_j);
-    let detected = Coverage::of(&learner);
-    check_spots(&learner, &prepared, chosen.len())?;
     let mut run = |learner: &mut Learner, rounds: usize, stage: &'static str| {
         learner.run(rounds, &mut |r| {
             progress(Progress {
@@ -145,24 +150,15 @@ pub fn learn(
             });
         });
     };
-    run(&mut learner, MOST_ROUNDS, "the spot's shape");
+    let (train, _) = split(&prepared.images);
+    let detected = Learner::new(camera, &train, prepared.noise_j);
+    check_spots(&detected, &prepared, chosen.len())?;
+    let detected_at = Coverage::of(&detected);
+    let learner = candidates::first(detected, &mut run, &|learner| {
+        check_spots(learner, &prepared, chosen.len())?;
+        check_shape(learner, &detected_at)
+    })?;
     let coverage = Coverage::of(&learner);
-    check_spots(&learner, &prepared, chosen.len())?;
-    let needed = Coverage::needed(camera);
-    // Places that were spread over the pixel and are not any more follow a template that is none.
-    let unexplained = statistics::unexplained(&learner);
-    let is_locked = coverage.phases < needed && detected.phases >= needed && unexplained > UNEXPLAINED;
-    if learner.misfit > UNLIKE || is_locked {
-        return Err(Error::NotAlike {
-            share: 100.0 * learner.misfit.max(unexplained),
-        });
-    }
-    if coverage.phases < needed {
-        return Err(Error::Phases {
-            covered: coverage.phases,
-            needed,
-        });
-    }
 
     // The first estimate of the noise counts some of the spots' light; what the shape leaves does not.
     let (model, misfit, factor) = (
@@ -176,28 +172,8 @@ pub fn learn(
     let flashes = Learner::with_model(camera, &every(&prepared.images), noise_j, &model, misfit).mask_flashes();
     prepared.mask_flashes(&flashes);
     let (train, held) = split(&prepared.images);
-    let mut learner = Learner::with_model(camera, &train, noise_j, &model, misfit);
-
-    // Over the field, as far as the held-out frames say that it helps.
-    let held_fit = |model: &TemplateModel, misfit: f64, images: &[&Image]| -> f64 {
-        let held = Learner::with_model(camera, images, noise_j, model, misfit);
-        held.patches.iter().map(|p| p.chi2).sum()
-    };
-    if coverage.is_field_covered() {
-        let mut best = held_fit(&learner.model, learner.misfit, &held);
-        for degree in FIELD_DEGREES {
-            let mut model = learner.model.clone();
-            model.vary(degree, learner.field_radius_m());
-            let mut varied = Learner::with_model(camera, &train, noise_j, &model, learner.misfit);
-            run(&mut varied, FIELD_ROUNDS, "its change over the field");
-            let chi2 = held_fit(&varied.model, varied.misfit, &held);
-            if best - chi2 < BETTER {
-                break;
-            }
-            best = chi2;
-            learner = varied;
-        }
-    }
+    let learner = Learner::with_model(camera, &train, noise_j, &model, misfit);
+    let learner = candidates::best(learner, &held, coverage.is_field_covered(), &mut run);
 
     // Of a shape that changes over the field, the same one everywhere left some light in the noise.
     let factor = statistics::residual_scale(&learner);
@@ -228,8 +204,10 @@ pub fn learn(
     let mut after = Learner::with_model(camera, &held, noise_j, &model, misfit);
     let odd_held = after.mask_odd().len();
     after.fit(6);
-    let count = terms::needed(&after);
-    let after = after.refitted(terms::truncated(camera, &model, count));
+    let count = Separable::needed(&after).unwrap_or(1);
+    let dark = || Error::NotAlike { share: 100.0 };
+    let separable = Separable::of(camera, &model, count).ok_or_else(dark)?;
+    let after = after.refitted(separable.template(&model));
     let before = after.refitted(TemplateModel::of_camera(camera, &model));
     let fit = |learner: &Learner| Fit {
         chi2: learner.patches.iter().map(|p| p.chi2).sum(),
@@ -253,8 +231,11 @@ pub fn learn(
     let mut last = Learner::with_model(camera, &images, noise_j, &model, misfit);
     run(&mut last, LAST_ROUNDS, "all frames");
     let information = statistics::information(&last);
-    let template = terms::truncated(camera, &last.model, count).template();
-    let shape = SpotShape::from_template(&template, ROUNDING).expect("a normalised template has light");
+    let separable = Separable::of(camera, &last.model, count).ok_or_else(dark)?;
+    let shape = separable.shape(&last.model).ok_or_else(dark)?;
+    if is_shape_better {
+        check_compact(&shape)?;
+    }
     let peak_snr = statistics::peak_snr(&last);
     let spots = last.sources();
     let spot_error = variance
@@ -288,6 +269,7 @@ pub fn learn(
         peak_snr,
         coverage,
         field_degree: last.model.degree,
+        wavefront: last.model.pupil.map(|pupil| pupil.wavefront()),
         noise_std_j: variance.read_noise_j,
         gain_j: variance.gain_j,
         bad_pixels: maps
@@ -326,13 +308,34 @@ const FLASH_PASSES: usize = 3;
 /// Significance that light beyond the learned support keeps under the weights of a spot error, as in the estimator: well below an
 /// emitter's threshold.
 const LEFT: f64 = 2.0;
-/// Degrees that are tried in turn while the held-out frames gain by them.
-const FIELD_DEGREES: [usize; 3] = [2, 3, 4];
-const FIELD_ROUNDS: usize = 4;
 const AGAIN_ROUNDS: usize = 4;
 const LAST_ROUNDS: usize = 3;
-/// Tolerance of the separable terms of a template that has few already.
-const ROUNDING: f64 = 1e-6;
+
+fn check_shape(learner: &Learner, detected: &Coverage) -> Result<(), Error> {
+    let (covered, needed) = (Coverage::of(learner).phases, Coverage::needed(learner.camera));
+    // Places that were spread over the pixel and are not any more follow a template that is none.
+    let unexplained = statistics::unexplained(learner);
+    let is_locked = covered < needed && detected.phases >= needed && unexplained > UNEXPLAINED;
+    if learner.misfit > UNLIKE || is_locked {
+        return Err(Error::NotAlike {
+            share: 100.0 * learner.misfit.max(unexplained),
+        });
+    }
+    if covered < needed {
+        return Err(Error::Phases { covered, needed });
+    }
+    Ok(())
+}
+
+/// Gains and shape are free together, so that a needle amid ripples may explain the held-out frames too. Spots of lenses have more than 70 %
+/// of their light within two widths.
+fn check_compact(shape: &SpotShape) -> Result<(), Error> {
+    let within = shape.encircled_energy([0.0; 2], 2.0 * shape.sigma_equivalent_m());
+    match within < COMPACT {
+        true => Err(Error::Scattered { share: 100.0 * within }),
+        false => Ok(()),
+    }
+}
 
 fn check_pixels(prepared: &prepare::Prepared, frames: &[(usize, &Array2<f64>)]) -> Result<(), Error> {
     let is_finite = frames.iter().any(|(_, pixels)| pixels.iter().any(|v| v.is_finite()));
@@ -363,4 +366,24 @@ fn check_spots(learner: &Learner, prepared: &prepare::Prepared, frames: usize) -
         },
         _ => Error::TooFewSpots { frames, spots },
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::optics::spot::{Field, FieldPolynomial};
+
+    #[test]
+    fn a_needle_amid_ripples_is_no_spot() {
+        let field = Field {
+            half_sensor_m: [0.01; 2],
+        };
+        let profile = |core: f64, rest: f64| (0..41).map(|k| if k == 20 { core } else { rest }).collect::<Vec<f64>>();
+        let shape = |core: f64, rest: f64| {
+            let term = (FieldPolynomial::constant(1.0), profile(core, rest), profile(core, rest));
+            SpotShape::from_terms(field, 1e-4, [term]).expect("light")
+        };
+        assert!(check_compact(&shape(1.0, 0.0)).is_ok());
+        assert!(matches!(check_compact(&shape(1.0, 0.04)), Err(Error::Scattered { share }) if share < 40.0));
+    }
 }

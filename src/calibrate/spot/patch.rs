@@ -311,21 +311,34 @@ impl Linearised {
         buffers: &mut Buffers,
     ) -> Vec<f64> {
         let mut out = vec![0.0; patch.pixels()];
-        for ((source, bands), values) in patch.sources.iter().zip(&self.bands).zip(&self.field_values) {
-            model.local(change, values, &mut buffers.splines);
-            let pair = [&bands[0], &bands[1]];
-            forward(
-                &buffers.splines,
-                model.n,
-                pair,
-                [false; 2],
-                &mut buffers.scratch,
-                &mut buffers.image,
-            );
-            patch.place(bands, &buffers.image, source.energy_j, &mut out);
+        for i in 0..patch.sources.len() {
+            self.source_change(patch, model, i, change, buffers, &mut out);
         }
         out.iter_mut().zip(&patch.weight).for_each(|(o, w)| *o *= w);
         out
+    }
+
+    /// The change of the pixels, J, that one source's own makes, added to `out`.
+    pub fn source_change(
+        &self,
+        patch: &Patch,
+        model: &TemplateModel,
+        i: usize,
+        change: &[f64],
+        buffers: &mut Buffers,
+        out: &mut [f64],
+    ) {
+        let bands = &self.bands[i];
+        model.local(change, &self.field_values[i], &mut buffers.splines);
+        forward(
+            &buffers.splines,
+            model.n,
+            [&bands[0], &bands[1]],
+            [false; 2],
+            &mut buffers.scratch,
+            &mut buffers.image,
+        );
+        patch.place(bands, &buffers.image, patch.sources[i].energy_j, out);
     }
 
     /// The adjoint of [`Self::template_change`], added to `gradient`; `weighted` is used up.

@@ -2,6 +2,8 @@
 
 use rayon::prelude::*;
 
+use super::constraints;
+use super::learn::Learner;
 use super::patch::{Buffers, Linearised, Patch};
 use super::template_model::TemplateModel;
 
@@ -11,12 +13,36 @@ const STEPS: usize = 30;
 const ACCURACY: f64 = 3e-4;
 
 /// A patch with its Jacobian at the present state; none where its own parameters are not determined.
-pub type Linear<'a> = Vec<(&'a Patch, Linearised)>;
+type Linear<'a> = Vec<(&'a Patch, Linearised)>;
+
+/// One step of the template and of everything else at once.
+pub fn step(learner: &mut Learner, is_first: bool) {
+    let (camera, model) = (learner.camera, &learner.model);
+    let prior = constraints::prior(model, is_first);
+    let linear: Linear = learner
+        .patches
+        .par_iter()
+        .filter_map(|patch| patch.linearise(camera, model).map(|l| (patch, l)))
+        .collect();
+    let step = template_step(model, &linear, &prior);
+    drop(linear);
+    let mut model = model.clone();
+    model.coefficients.iter_mut().zip(&step).for_each(|(c, s)| *c += s);
+    let shift = constraints::centre(&mut model, camera.spot_sigma_m);
+    let light = model.normalise();
+    for source in learner.patches.iter_mut().flat_map(|patch| &mut patch.sources) {
+        let values = model.field_values(source.at);
+        source.energy_j *= light(&values);
+        let moved = shift(&values);
+        (0..2).for_each(|k| source.at[k] += moved[k]);
+    }
+    learner.model = model;
+}
 
 /// Change δ of the coefficients that minimises Σ_patches ‖P(r − D δ)‖² + ‖(c + δ)/τ‖², where P removes what places, energies and
 /// backgrounds explain (variable projection: Kaufman, 1975), so that the alternation of places and template takes a few rounds
 /// instead of dozens. `prior` holds 1/τ².
-pub fn template_step(model: &TemplateModel, patches: &Linear, prior: &[f64]) -> Vec<f64> {
+fn template_step(model: &TemplateModel, patches: &Linear, prior: &[f64]) -> Vec<f64> {
     let n = model.coefficients.len();
     let over_patches = |image: &(dyn Fn(&Patch, &Linearised, &mut Buffers) -> Vec<f64> + Sync)| -> Vec<f64> {
         patches

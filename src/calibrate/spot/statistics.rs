@@ -3,7 +3,7 @@
 use faer::Mat;
 use ndarray::Array2;
 
-use super::constraints::{HALO, norm};
+use super::constraints::{HALO, norm, sigma_equivalent_m};
 use super::learn::Learner;
 use crate::calibrate::exposure::ScaledCholesky;
 use crate::stats::median;
@@ -109,7 +109,7 @@ fn spot_error(pixels: &[Pixel], read2: f64, gain: f64) -> f64 {
 
 fn pixels(learner: &Learner) -> Vec<Pixel> {
     let camera = learner.camera;
-    let sigma = camera.spot_sigma_m;
+    let sigma = sigma_equivalent_m(camera, &learner.model);
     let norm = norm(camera, &learner.model);
     let mut out = Vec::new();
     for patch in &learner.patches {

@@ -1,9 +1,11 @@
 //! The template as it is learned: bicubic splines for each component of the field.
 
-use ndarray::Array2;
+use faer::Mat;
+use rayon::prelude::*;
 
+use super::pupil::Pupil;
 use crate::optics::Camera;
-use crate::optics::spot::{Component, Field, FieldPolynomial, LEGENDRE, Template};
+use crate::optics::spot::{Field, FieldPolynomial, Template};
 
 /// Unit-energy template Σ_c p_c(u, v)·T_c(x, y), p_0 = 1, the others products of Legendre polynomials.
 #[derive(Clone, Debug)]
@@ -17,6 +19,8 @@ pub struct TemplateModel {
     pub degree: usize,
     /// First n², then inner² for each other component; rows in y.
     pub coefficients: Vec<f64>,
+    /// The pupil that the coefficients are of, where that is learned instead of them.
+    pub pupil: Option<Pupil>,
 }
 
 impl TemplateModel {
@@ -37,12 +41,12 @@ impl TemplateModel {
             inner: 0,
             degree: 0,
             coefficients: coefficients.iter().map(|c| c / total).collect(),
+            pupil: None,
         }
     }
 
     /// The spot that a camera assumes, its own shape or a Gaussian, on the knots of another model.
     pub fn of_camera(camera: &Camera, like: &Self) -> Self {
-        let n = like.n;
         let at = |sensor_m: [f64; 2]| {
             let density = |x: f64, y: f64| match &camera.spot_shape {
                 Some(shape) => shape.density(sensor_m, [x, y]),
@@ -68,32 +72,40 @@ impl TemplateModel {
                 inner: 0,
                 degree: 0,
                 coefficients: at([0.0; 2]),
+                pupil: None,
                 ..*like
             };
         }
-        // Projected on the Legendre polynomials by Gauss's quadrature, exact to the degree that a calibration may have.
-        let mut model = Self {
+        let half = like.field.half_sensor_m;
+        like.projected(|[u, v]| vec![at([u * half[0], v * half[1]])]).remove(0)
+    }
+
+    /// The templates on the same knots whose first components would be `at` at each place of the field, projected on the Legendre
+    /// polynomials by Gauss's quadrature, exact to the degree that a calibration may have.
+    pub fn projected(&self, at: impl Fn([f64; 2]) -> Vec<Vec<f64>> + Sync) -> Vec<Self> {
+        let n = self.n;
+        let nodes: Vec<_> = NODES.iter().flat_map(|u| NODES.map(|v| (*u, v))).collect();
+        let values: Vec<Vec<Vec<f64>>> = nodes.par_iter().map(|(u, v)| at([u.0, v.0])).collect();
+        let count = values.first().map_or(0, Vec::len);
+        let empty = Self {
             inner: n,
             degree: MOST_DEGREE,
             coefficients: vec![0.0; FieldPolynomial::length(MOST_DEGREE) * n * n],
-            ..*like
+            pupil: None,
+            ..*self
         };
-        let half = model.field.half_sensor_m;
-        for (u, wu) in LEGENDRE {
-            for (v, wv) in LEGENDRE {
-                let values = at([u * half[0], v * half[1]]);
-                let blocks = model
-                    .coefficients
-                    .chunks_exact_mut(n * n)
-                    .zip(FieldPolynomial::powers());
-                for (block, (i, j)) in blocks {
+        let mut models = vec![empty; count];
+        for (((u, wu), (v, wv)), values) in nodes.into_iter().zip(values) {
+            for (model, values) in models.iter_mut().zip(values) {
+                let blocks = model.coefficients.chunks_exact_mut(n * n);
+                for (block, (i, j)) in blocks.zip(FieldPolynomial::powers()) {
                     let norm = 0.25 * f64::from((2 * i + 1) * (2 * j + 1));
                     let share = norm * wu * wv * legendre(i, u) * legendre(j, v);
                     block.iter_mut().zip(&values).for_each(|(b, value)| *b += share * value);
                 }
             }
         }
-        model
+        models
     }
 
     pub fn radius_m(&self) -> f64 {
@@ -133,8 +145,15 @@ impl TemplateModel {
         self.coefficients.resize(length, 0.0);
     }
 
-    /// The same first component on `n` splines a side.
+    /// The same spot on `n` splines a side: the first component, or the pupil's.
     pub fn widened(&self, n: usize) -> Self {
+        if let Some(pupil) = self.pupil {
+            return pupil.template(&Self {
+                n,
+                coefficients: Vec::new(),
+                ..*self
+            });
+        }
         let margin = (n - self.n) / 2;
         let mut coefficients = vec![0.0; n * n];
         for j in 0..self.n {
@@ -146,6 +165,7 @@ impl TemplateModel {
             inner: 0,
             degree: 0,
             coefficients,
+            pupil: None,
             ..*self
         }
     }
@@ -214,42 +234,65 @@ impl TemplateModel {
         move |p: &[f64]| light.iter().zip(p).map(|(l, p)| l * p).sum::<f64>().max(0.1 * light[0])
     }
 
-    /// As the optics takes it, with monomials for Legendre polynomials.
-    pub fn template(&self) -> Template {
-        let powers: Vec<(i32, i32)> = FieldPolynomial::powers().take(self.components()).collect();
-        let components = powers.iter().enumerate().map(|(c, (i, j))| {
-            let (start, m) = self.block(c);
-            let margin = (self.n - m) / 2;
-            let mut coefficients = Array2::zeros((self.n, self.n));
-            for (k, value) in self.coefficients[start..start + m * m].iter().enumerate() {
-                coefficients[(k / m + margin, k % m + margin)] = *value;
-            }
-            let (a, b) = (legendre_monomials(*i), legendre_monomials(*j));
-            let field = powers.iter().map(|(k, l)| a[*k as usize] * b[*l as usize]).collect();
-            Component {
-                field: FieldPolynomial(field),
-                coefficients,
-            }
-        });
-        Template {
-            field: self.field,
-            knot_m: self.knot_m,
-            components: components.collect(),
+    /// Coefficients of component `c` on all knots.
+    pub fn component(&self, c: usize) -> Mat<f64> {
+        let (start, m) = self.block(c);
+        let margin = (self.n - m) / 2;
+        let mut out = Mat::zeros(self.n, self.n);
+        for (k, value) in self.coefficients[start..start + m * m].iter().enumerate() {
+            out[(k / m + margin, k % m + margin)] = *value;
         }
+        out
+    }
+
+    /// The same with all components on all knots.
+    pub fn filled(&self) -> Self {
+        let n = self.n;
+        let mut coefficients = Vec::with_capacity(self.components() * n * n);
+        for c in 0..self.components() {
+            let component = self.component(c);
+            (0..n).for_each(|j| coefficients.extend((0..n).map(|i| component[(j, i)])));
+        }
+        Self {
+            inner: n,
+            coefficients,
+            ..*self
+        }
+    }
+
+    /// Monomials of p_c.
+    pub fn field_polynomial(&self, c: usize) -> Vec<f64> {
+        let powers = || FieldPolynomial::powers().take(self.components());
+        let (i, j) = powers().nth(c).unwrap_or_default();
+        let (a, b) = (legendre_monomials(i), legendre_monomials(j));
+        powers().map(|(k, l)| a[k as usize] * b[l as usize]).collect()
     }
 }
 
 /// Highest degree of the field's polynomials.
-pub const MOST_DEGREE: usize = 4;
+pub const MOST_DEGREE: usize = 6;
+
+/// Gauss–Legendre nodes and weights of order 7 on [−1, 1] (Abramowitz and Stegun, 1964, table 25.4).
+const NODES: [(f64, f64); 7] = [
+    (0.0, 0.417_959_183_673_469),
+    (0.405_845_151_377_397, 0.381_830_050_505_119),
+    (-0.405_845_151_377_397, 0.381_830_050_505_119),
+    (0.741_531_185_599_394, 0.279_705_391_489_277),
+    (-0.741_531_185_599_394, 0.279_705_391_489_277),
+    (0.949_107_912_342_759, 0.129_484_966_168_870),
+    (-0.949_107_912_342_759, 0.129_484_966_168_870),
+];
 
 /// Coefficients of the Legendre polynomial of degree `n` (Abramowitz and Stegun, 1964, table 22.9).
 fn legendre_monomials(n: i32) -> [f64; MOST_DEGREE + 1] {
     match n {
-        0 => [1.0, 0.0, 0.0, 0.0, 0.0],
-        1 => [0.0, 1.0, 0.0, 0.0, 0.0],
-        2 => [-0.5, 0.0, 1.5, 0.0, 0.0],
-        3 => [0.0, -1.5, 0.0, 2.5, 0.0],
-        _ => [0.375, 0.0, -3.75, 0.0, 4.375],
+        0 => [1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+        1 => [0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+        2 => [-0.5, 0.0, 1.5, 0.0, 0.0, 0.0, 0.0],
+        3 => [0.0, -1.5, 0.0, 2.5, 0.0, 0.0, 0.0],
+        4 => [0.375, 0.0, -3.75, 0.0, 4.375, 0.0, 0.0],
+        5 => [0.0, 1.875, 0.0, -8.75, 0.0, 7.875, 0.0],
+        _ => [-0.3125, 0.0, 6.5625, 0.0, -19.6875, 0.0, 14.4375],
     }
 }
 

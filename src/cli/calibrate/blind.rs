@@ -154,6 +154,18 @@ fn report(camera: &Camera, l: &Learned) -> Vec<String> {
         shape.terms(),
         1e3 * shape.radius_m()
     ));
+    if let Some(w) = &l.wavefront {
+        lines.push(format!(
+            "wavefront: a round aperture whose first dark ring is at {:.4} mm; over the sensor {:.3} waves rms of defocus, {:.3} of \
+             astigmatism, {:.3} of coma, {:.3} of trefoil, {:.3} of spherical aberration",
+            1e3 * w.first_zero_m,
+            w.defocus,
+            w.astigmatism,
+            w.coma,
+            w.trefoil,
+            w.spherical
+        ));
+    }
     lines.push(format!(
         "held-out frames: reduced χ² {:.4} with the config's spot, {:.4} with the learned one{}",
         l.before.reduced(),
@@ -209,6 +221,7 @@ fn object(args: &Args, camera: &Camera, l: &Learned) -> serde_json::Value {
             "is_better": l.is_shape_better,
             "terms": l.shape.terms(),
             "field_degree": l.field_degree,
+            "wavefront": l.wavefront,
             "sigma_equivalent_m": l.shape.sigma_equivalent_m(),
             "reach_m": l.shape.radius_m(),
             "encircled_energy": radii.iter().map(|r| [*r, l.shape.encircled_energy([0.0; 2], *r)]).collect::<Vec<_>>(),

@@ -21,7 +21,7 @@ pub struct SpotShape {
 }
 
 /// Gauss–Legendre nodes and weights of order 5 on [−1, 1] (Abramowitz and Stegun, 1964, table 25.4).
-pub const LEGENDRE: [(f64, f64); 5] = [
+const LEGENDRE: [(f64, f64); 5] = [
     (0.0, 0.568_888_888_888_888_9),
     (0.538_469_310_105_683_1, 0.478_628_670_499_366_5),
     (-0.538_469_310_105_683_1, 0.478_628_670_499_366_5),

@@ -32,21 +32,25 @@ impl Template {
     pub fn of_density(field: Field, knot_m: f64, radius_m: f64, density: impl Fn(f64, f64) -> f64) -> Self {
         let n = (2 * (radius_m / knot_m).ceil() as usize + 1).saturating_sub(4).max(5);
         let at = |k: usize| (k as f64 - 0.5 * (n - 1) as f64) * knot_m;
-        let mut coefficients = Array2::from_shape_fn((n, n), |(j, i)| density(at(i), at(j)));
-        for mut line in coefficients.rows_mut() {
-            interpolate(&mut line);
-        }
-        for mut line in coefficients.columns_mut() {
-            interpolate(&mut line);
-        }
         Self {
             field,
             knot_m,
             components: vec![Component {
                 field: FieldPolynomial::constant(1.0),
-                coefficients,
+                coefficients: Self::interpolated(Array2::from_shape_fn((n, n), |(j, i)| density(at(i), at(j)))),
             }],
         }
+    }
+
+    /// Coefficients of the splines that have these values at the knots.
+    pub fn interpolated(mut values: Array2<f64>) -> Array2<f64> {
+        for mut line in values.rows_mut() {
+            interpolate(&mut line);
+        }
+        for mut line in values.columns_mut() {
+            interpolate(&mut line);
+        }
+        values
     }
 }
 
@@ -84,39 +88,56 @@ impl SpotShape {
         if !(light.is_finite() && light > 0.0) {
             return None;
         }
-        let mut found: Vec<(f64, usize, Term)> = Vec::new();
-        for (c, component) in template.components.iter().enumerate() {
+        let mut found: Vec<(f64, _)> = Vec::new();
+        for component in &template.components {
             let share = component.field.rms();
             let (ny, nx) = component.coefficients.dim();
             let matrix = Mat::from_fn(ny, nx, |j, i| component.coefficients[(j, i)] / light);
             let svd = matrix.thin_svd().ok()?;
-            let (u, s, v) = (svd.U(), svd.S().column_vector(), svd.V());
-            for k in 0..s.nrows() {
-                let factor = |m: faer::MatRef<'_, f64>| {
-                    let largest = (0..m.nrows()).map(|i| m[(i, k)].abs()).fold(0.0, f64::max);
-                    let rounded = (0..m.nrows()).map(|i| (m[(i, k)] / largest / GRAIN).round() * GRAIN);
-                    (largest, Profile::new(template.knot_m, rounded.collect()))
-                };
-                if !(s[k] > 0.0) {
-                    continue;
-                }
-                let ((by, y), (bx, x)) = (factor(u), factor(v));
-                let weight = FieldPolynomial(component.field.0.iter().map(|p| p * s[k] * bx * by).collect());
-                found.push((s[k] * share, c, Term { weight, x, y }));
+            let s = svd.S().column_vector();
+            for k in (0..s.nrows()).filter(|k| s[*k] > 0.0) {
+                let column = |m: faer::MatRef<'_, f64>| (0..m.nrows()).map(|i| m[(i, k)]).collect::<Vec<f64>>();
+                let weight = FieldPolynomial(component.field.0.iter().map(|p| p * s[k]).collect());
+                found.push((s[k] * share, (weight, column(svd.U()), column(svd.V()))));
             }
         }
         found.sort_by(|a, b| b.0.total_cmp(&a.0));
-        let square = |terms: &[(f64, usize, Term)]| terms.iter().map(|t| t.0 * t.0).sum::<f64>();
+        let square = |terms: &[(f64, _)]| terms.iter().map(|t| t.0 * t.0).sum::<f64>();
         let all = square(&found);
         let enough = |k: &usize| square(&found[*k..]) <= (tolerance * tolerance) * all;
         let count = (1..=found.len()).find(enough)?.min(Self::MOST_TERMS);
-        found.truncate(count);
-        let mut terms: Vec<Term> = found.into_iter().map(|(_, _, term)| term).collect();
+        let strongest = found.into_iter().take(count).map(|(_, term)| term);
+        Self::from_terms(template.field, template.knot_m, strongest)
+    }
+
+    /// From terms' weights and coefficients along y and x, all of the same length on knots `knot_m` apart. The light is normalised to 1 at
+    /// every place. None where they have no light.
+    pub fn from_terms(
+        field: Field,
+        knot_m: f64,
+        terms: impl IntoIterator<Item = (FieldPolynomial, Vec<f64>, Vec<f64>)>,
+    ) -> Option<Self> {
+        let rounded = |values: Vec<f64>| {
+            let largest = values.iter().fold(0.0, |a: f64, v| a.max(v.abs()));
+            let values = values.iter().map(|v| (v / largest / GRAIN).round() * GRAIN).collect();
+            (largest, Profile::new(knot_m, values))
+        };
+        let mut terms: Vec<Term> = terms
+            .into_iter()
+            .map(|(weight, y, x)| {
+                let ((by, y), (bx, x)) = (rounded(y), rounded(x));
+                let weight = FieldPolynomial(weight.0.iter().map(|w| w * bx * by).collect());
+                Term { weight, x, y }
+            })
+            .collect();
+        let light = |t: &Term| t.weight.0.first().copied().unwrap_or(0.0) * t.x.total() * t.y.total();
+        terms.sort_by(|a, b| light(b).total_cmp(&light(a)));
+        let total: f64 = terms.iter().map(light).sum();
+        if !(total.is_finite() && total > 0.0) {
+            return None;
+        }
         normalise(&mut terms);
-        Some(Self {
-            field: template.field,
-            terms,
-        })
+        Some(Self { field, terms })
     }
 }
 

@@ -1,0 +1,77 @@
+//! Which shape explains the spots: one that is the same everywhere, that of a lens's wavefront, or one that changes over the field.
+
+use super::error::Error;
+use super::grouping::Image;
+use super::learn::Learner;
+use super::statistics;
+use crate::optics::Camera;
+
+/// Learns for a number of rounds and says which stage that is.
+type Run<'a> = &'a mut dyn FnMut(&mut Learner, usize, &'static str);
+
+const SHAPE_ROUNDS: usize = 12;
+const WAVEFRONT_ROUNDS: usize = 30;
+const FIELD_ROUNDS: usize = 4;
+/// Degrees that are tried in turn while the held-out frames gain by them.
+const FIELD_DEGREES: [usize; 3] = [2, 3, 4];
+/// Fall of the score that is more than chance.
+const BETTER: f64 = 30.0;
+/// Share of the light that a wavefront may leave unexplained for no other shape to be tried.
+const EXPLAINED: f64 = 0.03;
+/// Parameters of a spot, each of which lowers χ² by chance (Akaike, 1974).
+const PER_SPOT: usize = 3;
+
+/// The same shape everywhere; where that passes no check, a lens's wavefront.
+pub fn first<'a>(
+    detected: Learner<'a>,
+    run: Run,
+    check: &dyn Fn(&Learner) -> Result<(), Error>,
+) -> Result<Learner<'a>, Error> {
+    let (camera, images, noise_j) = (detected.camera, detected.images, detected.noise_j);
+    let mut shape = detected;
+    run(&mut shape, SHAPE_ROUNDS, "the spot's shape");
+    let Err(error) = check(&shape) else {
+        return Ok(shape);
+    };
+    let wavefront = wavefront(camera, images, noise_j, run);
+    check(&wavefront).map_err(|_| error)?;
+    Ok(wavefront)
+}
+
+/// What explains the held-out images best.
+pub fn best<'a>(first: Learner<'a>, held: &[&Image], is_field_covered: bool, run: Run) -> Learner<'a> {
+    if first.model.pupil.is_some() {
+        return first;
+    }
+    let on_held = |learner: &Learner| {
+        let held = Learner::with_model(learner.camera, held, learner.noise_j, &learner.model, learner.misfit);
+        let score = held.chi2_of_images() + (2 * PER_SPOT * held.sources()) as f64;
+        (score, statistics::unexplained(&held))
+    };
+    let (mut least, _) = on_held(&first);
+    let wavefront = wavefront(first.camera, first.images, first.noise_j, run);
+    let (score, unexplained) = on_held(&wavefront);
+    if score < least && unexplained < EXPLAINED {
+        return wavefront;
+    }
+    let mut best = first;
+    for degree in FIELD_DEGREES.into_iter().filter(|_| is_field_covered) {
+        let mut varied = Learner::with_model(best.camera, best.images, best.noise_j, &best.model, best.misfit);
+        let radius_m = varied.field_radius_m();
+        varied.model.vary(degree, radius_m);
+        run(&mut varied, FIELD_ROUNDS, "its change over the field");
+        let (score, _) = on_held(&varied);
+        if least - score < BETTER {
+            break;
+        }
+        (least, best) = (score, varied);
+    }
+    if score < least { wavefront } else { best }
+}
+
+fn wavefront<'a>(camera: &'a Camera, images: &'a [&'a Image], noise_j: f64, run: Run) -> Learner<'a> {
+    let mut learner = Learner::new(camera, images, noise_j);
+    learner.begin_wavefront();
+    run(&mut learner, WAVEFRONT_ROUNDS, "the lens's wavefront");
+    learner
+}

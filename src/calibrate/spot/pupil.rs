@@ -1,0 +1,290 @@
+//! The spot of a round aperture whose wavefront departs from a sphere by a few Zernike polynomials that change over the field.
+
+use faer::{Mat, c64};
+use ndarray::Array2;
+
+use super::template_model::TemplateModel;
+use crate::optics::Camera;
+use crate::optics::spot::{FieldPolynomial, Template};
+
+/// Noll's polynomials 4 to 11: defocus, astigmatism, coma, trefoil, spherical (Noll, 1976). Tilt is the spot's place.
+pub const ZERNIKES: usize = 8;
+/// Coefficients of 1, u, v, u², uv, v², u and v over half the sensor.
+const FIELD: usize = 6;
+/// Samples across the pupil: the image repeats after as many λF.
+const SAMPLES: usize = 64;
+/// Parts of a sample along an axis by which the aperture's edge is told.
+const EDGE_PARTS: usize = 8;
+/// First zero of J₁ (Abramowitz and Stegun, 1964, table 9.5).
+const AIRY_ZERO: f64 = 3.831_705_970_207_512;
+/// An Airy disc's first dark ring over the σ of the Gaussian nearest to its core.
+const ZERO_PER_SIGMA: f64 = 2.7;
+/// Even polynomials at the start, waves: at zero the image does not change to first order with them.
+const START_WAVES: f64 = 0.03;
+
+/// ln of the first dark ring's radius, m, and for each polynomial its root mean square in waves over the field.
+#[derive(Clone, Copy, Debug)]
+pub struct Pupil(pub [f64; Self::PARAMETERS]);
+
+/// What a lens does to a plane wave, in an optical engineer's terms.
+#[derive(Clone, Copy, Debug, serde::Serialize)]
+pub struct Wavefront {
+    /// Radius of the first dark ring without aberrations, 1.22 λF, m.
+    pub first_zero_m: f64,
+    /// Root mean squares over pupil and sensor, waves.
+    pub defocus: f64,
+    pub astigmatism: f64,
+    pub coma: f64,
+    pub trefoil: f64,
+    pub spherical: f64,
+}
+
+impl Pupil {
+    pub const PARAMETERS: usize = 1 + ZERNIKES * FIELD;
+    /// Ways in which the image at one place changes: its width and each polynomial there.
+    pub const CHANGES: usize = 1 + ZERNIKES;
+
+    /// Nearly the Airy disc whose core is the camera's Gaussian.
+    pub fn of_camera(camera: &Camera) -> Self {
+        let mut parameters = [0.0; Self::PARAMETERS];
+        parameters[0] = (ZERO_PER_SIGMA * camera.spot_sigma_m).ln();
+        for even in [0, 1, 2] {
+            parameters[1 + FIELD * even] = START_WAVES;
+        }
+        Self(parameters)
+    }
+
+    /// The derivatives of what changes the image at a field place by the parameters: one factor for each of the parameters, those of
+    /// change `k` being [`Self::range`]`(k)`.
+    pub fn factors(k: usize, [u, v]: [f64; 2]) -> [f64; FIELD] {
+        match k {
+            0 => [1.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+            _ => [1.0, u, v, u * u, u * v, v * v],
+        }
+    }
+
+    /// The parameters on which change `k` depends.
+    pub fn range(k: usize) -> std::ops::Range<usize> {
+        match k {
+            0 => 0..1,
+            _ => 1 + FIELD * (k - 1)..1 + FIELD * k,
+        }
+    }
+
+    /// ln of the first dark ring's radius and each polynomial's waves at a field place.
+    fn local(&self, place: [f64; 2]) -> [f64; Self::CHANGES] {
+        std::array::from_fn(|k| {
+            let parameters = &self.0[Self::range(k)];
+            parameters.iter().zip(Self::factors(k, place)).map(|(p, f)| p * f).sum()
+        })
+    }
+
+    pub fn wavefront(&self) -> Wavefront {
+        let rms = |changes: std::ops::Range<usize>| {
+            let of = |k: usize| FieldPolynomial(self.0[Self::range(k)].to_vec()).rms().powi(2);
+            changes.map(of).sum::<f64>().sqrt()
+        };
+        Wavefront {
+            first_zero_m: self.0[0].exp(),
+            defocus: rms(1..2),
+            astigmatism: rms(2..4),
+            coma: rms(4..6),
+            trefoil: rms(6..8),
+            spherical: rms(8..9),
+        }
+    }
+
+    /// Its template on the knots of another.
+    pub fn template(self, like: &TemplateModel) -> TemplateModel {
+        let aperture = Aperture::new();
+        let mut found = like.projected(|place| vec![aperture.coefficients(&self.local(place), like)]);
+        TemplateModel {
+            pupil: Some(self),
+            ..found.remove(0)
+        }
+    }
+
+    /// Derivatives of the template's coefficients by each of the changes, as if it were the same change everywhere.
+    pub fn derivatives(&self, like: &TemplateModel) -> Vec<Vec<f64>> {
+        const STEP: f64 = 1e-5;
+        let aperture = Aperture::new();
+        let at = |place: [f64; 2]| {
+            let local = self.local(place);
+            let here = aperture.coefficients(&local, like);
+            let derivative = |k: usize| {
+                let mut there = local;
+                there[k] += STEP;
+                let mut change = aperture.coefficients(&there, like);
+                change.iter_mut().zip(&here).for_each(|(t, h)| *t = (*t - h) / STEP);
+                change
+            };
+            (0..Self::CHANGES).map(derivative).collect()
+        };
+        like.projected(at).into_iter().map(|model| model.coefficients).collect()
+    }
+}
+
+/// Samples of the unit pupil.
+struct Aperture {
+    /// Share of each sample that lies inside.
+    open: Mat<f64>,
+    polynomials: [Mat<f64>; ZERNIKES],
+}
+
+fn sample(k: usize) -> f64 {
+    (2.0 * k as f64 + 1.0) / SAMPLES as f64 - 1.0
+}
+
+impl Aperture {
+    fn new() -> Self {
+        let part = |k: usize, a: usize| sample(k) + ((2.0 * a as f64 + 1.0) / EDGE_PARTS as f64 - 1.0) / SAMPLES as f64;
+        // The mean of a function over the open part of each sample, by that share of it.
+        let over_open = |value: &dyn Fn(f64, f64) -> f64| {
+            Mat::from_fn(SAMPLES, SAMPLES, |j, i| {
+                let parts = (0..EDGE_PARTS * EDGE_PARTS).map(|p| (part(i, p % EDGE_PARTS), part(j, p / EDGE_PARTS)));
+                let open = parts.filter(|(x, y)| x * x + y * y < 1.0);
+                open.map(|(x, y)| value(x, y)).sum::<f64>() / (EDGE_PARTS * EDGE_PARTS) as f64
+            })
+        };
+        let open = over_open(&|_, _| 1.0);
+        let polynomial = |k: usize| {
+            let sums = over_open(&|x, y| zernike(k, x, y));
+            Mat::from_fn(SAMPLES, SAMPLES, |j, i| {
+                if open[(j, i)] > 0.0 {
+                    sums[(j, i)] / open[(j, i)]
+                } else {
+                    0.0
+                }
+            })
+        };
+        Self {
+            polynomials: std::array::from_fn(polynomial),
+            open,
+        }
+    }
+
+    /// Spline coefficients of unit light of the spot on the knots of a template, by a Fourier transform that is sampled at them
+    /// (Soummer et al., 2007).
+    fn coefficients(&self, local: &[f64; Pupil::CHANGES], like: &TemplateModel) -> Vec<f64> {
+        let n = like.n;
+        let per_metre = AIRY_ZERO / local[0].exp();
+        let waves = &local[1..];
+        let wave = |j: usize, i: usize| {
+            let phase: f64 = waves.iter().zip(&self.polynomials).map(|(w, z)| w * z[(j, i)]).sum();
+            let (sin, cos) = (std::f64::consts::TAU * phase).sin_cos();
+            c64::new(cos, sin) * self.open[(j, i)]
+        };
+        let pupil = Mat::from_fn(SAMPLES, SAMPLES, wave);
+        let kernel = Mat::from_fn(n, SAMPLES, |k, q| {
+            let (sin, cos) = (per_metre * like.knot(k) * sample(q)).sin_cos();
+            c64::new(cos, -sin)
+        });
+        let field = &kernel * &pupil * kernel.transpose();
+        let density = Array2::from_shape_fn((n, n), |(j, i)| field[(j, i)].norm_sqr());
+        let mut coefficients = Template::interpolated(density).into_raw_vec_and_offset().0;
+        let total: f64 = coefficients.iter().sum();
+        coefficients.iter_mut().for_each(|c| *c /= total);
+        coefficients
+    }
+}
+
+/// Noll's polynomial 4 + `k`, of unit variance over the pupil.
+fn zernike(k: usize, x: f64, y: f64) -> f64 {
+    let r2 = x * x + y * y;
+    match k {
+        0 => 3f64.sqrt() * (2.0 * r2 - 1.0),
+        1 => 6f64.sqrt() * 2.0 * x * y,
+        2 => 6f64.sqrt() * (x * x - y * y),
+        3 => 8f64.sqrt() * (3.0 * r2 - 2.0) * y,
+        4 => 8f64.sqrt() * (3.0 * r2 - 2.0) * x,
+        5 => 8f64.sqrt() * (3.0 * x * x - y * y) * y,
+        6 => 8f64.sqrt() * (x * x - 3.0 * y * y) * x,
+        _ => 5f64.sqrt() * (6.0 * r2 * r2 - 6.0 * r2 + 1.0),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::optics::{self, spot::Field};
+
+    fn camera() -> Camera {
+        let config = optics::Config {
+            pixels: [40; 2],
+            sensor_size_m: [0.03; 2],
+            spot_sigma_m: Some(1e-3),
+            ..Default::default()
+        };
+        config.camera().expect("a camera")
+    }
+
+    #[test]
+    fn polynomials_are_orthonormal_over_the_aperture() {
+        let aperture = Aperture::new();
+        let area: f64 = aperture.open.sum();
+        for k in 0..ZERNIKES {
+            for l in 0..=k {
+                let product = |j: usize, i: usize| {
+                    aperture.open[(j, i)] * aperture.polynomials[k][(j, i)] * aperture.polynomials[l][(j, i)]
+                };
+                let mean = Mat::from_fn(SAMPLES, SAMPLES, product).sum() / area;
+                let expected = f64::from(u8::from(k == l));
+                assert!((mean - expected).abs() < 0.01, "{k} {l}: {mean}");
+            }
+        }
+    }
+
+    #[test]
+    fn without_aberrations_the_spot_is_an_airy_disc() {
+        let camera = camera();
+        let like = TemplateModel::gaussian(&camera, 0.3e-3, 9e-3);
+        let zero_m: f64 = 2.9e-3;
+        let mut local = [0.0; Pupil::CHANGES];
+        local[0] = zero_m.ln();
+        let found = Aperture::new().coefficients(&local, &like);
+        let airy = |x: f64, y: f64| {
+            let v = (AIRY_ZERO * x.hypot(y) / zero_m).max(1e-9);
+            (2.0 * libm::j1(v) / v).powi(2)
+        };
+        let field = Field {
+            half_sensor_m: [0.015; 2],
+        };
+        let template = Template::of_density(field, like.knot_m, like.radius_m() * (1.0 - 1e-9), airy);
+        let expected = &template.components[0].coefficients;
+        assert_eq!(expected.dim(), (like.n, like.n));
+        let (total, peak) = (expected.sum(), expected[(like.n / 2, like.n / 2)]);
+        for (f, e) in found.iter().zip(expected) {
+            assert!((f - e / total).abs() < 1e-3 * peak / total, "{f} {}", e / total);
+        }
+    }
+
+    #[test]
+    fn a_template_follows_its_pupil_over_the_field() {
+        let camera = camera();
+        let like = TemplateModel::gaussian(&camera, 0.3e-3, 9e-3);
+        let mut pupil = Pupil::of_camera(&camera);
+        // Coma along x that grows along u.
+        pupil.0[Pupil::range(5)][1] = 0.12;
+        let (model, changes) = (pupil.template(&like), pupil.derivatives(&like));
+        let at = [0.8 * 0.015, -0.3 * 0.015];
+        let (values, mut local) = (model.field_values(at), Vec::new());
+        let exact = |pupil: &Pupil| Aperture::new().coefficients(&pupil.local([0.8, -0.3]), &like);
+        let largest = |v: &[f64]| v.iter().fold(0.0, |a: f64, v| a.max(v.abs()));
+        let difference = |a: &[f64], b: &[f64]| largest(&a.iter().zip(b).map(|(a, b)| a - b).collect::<Vec<_>>());
+        model.local(&model.coefficients, &values, &mut local);
+        let expected = exact(&pupil);
+        assert!(difference(&local, &expected) < 0.02 * largest(&expected));
+        // What one parameter changes there.
+        let step = 1e-4;
+        let mut moved = pupil;
+        moved.0[Pupil::range(5)][1] += step;
+        let slope: Vec<f64> = exact(&moved)
+            .iter()
+            .zip(&expected)
+            .map(|(a, b)| (a - b) / step)
+            .collect();
+        model.local(&changes[5], &values, &mut local);
+        local.iter_mut().for_each(|v| *v *= Pupil::factors(5, [0.8, -0.3])[1]);
+        assert!(difference(&local, &slope) < 0.05 * largest(&slope));
+    }
+}

@@ -1,0 +1,101 @@
+//! Finds the wavefront of a lens from the spots that it makes, without knowing their places.
+
+use faer::Mat;
+use rayon::prelude::*;
+
+use super::learn::Learner;
+use super::patch::{Buffers, Patch};
+use super::pupil::Pupil;
+use super::template_model::TemplateModel;
+use crate::calibrate::exposure::ScaledCholesky;
+use crate::optics::Camera;
+
+/// Standard deviation of every parameter about zero, waves: what the spots do not tell stays small. The width is free.
+const PRIOR: f64 = 0.3;
+/// Patches that are used for one step, at most: they determine fifty parameters, and more take longer.
+const MOST_PATCHES: usize = 400;
+/// Longest step, waves or ln of the width.
+const LONGEST: f64 = 0.15;
+const DAMPING: f64 = 1e-4;
+/// Times that a step is halved until it lowers χ².
+const HALVINGS: usize = 5;
+/// Steps of the places within one of the wavefront.
+const PLACES: usize = 4;
+
+/// One step of Gauss and Newton of the wavefront, places, energies and backgrounds projected out (variable projection: Kaufman, 1975).
+/// Returns the new model; none where no step explains the spots better.
+pub fn step(learner: &Learner, pupil: Pupil) -> Option<TemplateModel> {
+    let (camera, model) = (learner.camera, &learner.model);
+    let stride = learner.patches.len().div_ceil(MOST_PATCHES).max(1);
+    let patches: Vec<&Patch> = learner.patches.iter().step_by(stride).collect();
+    let changes = pupil.derivatives(model);
+    let (mut h, mut g) = patches
+        .par_iter()
+        .filter_map(|patch| normal(camera, model, patch, &changes))
+        .reduce(
+            || {
+                (
+                    Mat::zeros(Pupil::PARAMETERS, Pupil::PARAMETERS),
+                    vec![0.0; Pupil::PARAMETERS],
+                )
+            },
+            |(h, g), (other, more)| (h + other, g.iter().zip(&more).map(|(a, b)| a + b).collect()),
+        );
+    for k in 1..Pupil::PARAMETERS {
+        h[(k, k)] += PRIOR.powi(-2);
+        g[k] -= pupil.0[k] * PRIOR.powi(-2);
+    }
+    let mut step = ScaledCholesky::new(&h, DAMPING)?.solve(&g);
+    let longest = step.iter().fold(0.0, |a: f64, s| a.max(s.abs()));
+    if longest > LONGEST {
+        step.iter_mut().for_each(|s| *s *= LONGEST / longest);
+    }
+    let cost = |model: &TemplateModel, pupil: &Pupil| -> f64 {
+        let chi2 = patches.par_iter().map(|patch| {
+            let mut patch = (*patch).clone();
+            patch.fit(camera, model, PLACES);
+            patch.chi2
+        });
+        chi2.sum::<f64>() + pupil.0[1..].iter().map(|p| (p / PRIOR).powi(2)).sum::<f64>()
+    };
+    let now = cost(model, &pupil);
+    for _ in 0..HALVINGS {
+        let mut next = pupil;
+        next.0.iter_mut().zip(&step).for_each(|(p, s)| *p += s);
+        let template = next.template(model);
+        if cost(&template, &next) < now {
+            return Some(template);
+        }
+        step.iter_mut().for_each(|s| *s *= 0.5);
+    }
+    None
+}
+
+/// Normal equations of one patch.
+fn normal(camera: &Camera, model: &TemplateModel, patch: &Patch, changes: &[Vec<f64>]) -> Option<(Mat<f64>, Vec<f64>)> {
+    let linear = patch.linearise(camera, model)?;
+    let mut columns = Mat::<f64>::zeros(patch.pixels(), Pupil::PARAMETERS);
+    let mut buffers = Buffers::default();
+    for (i, source) in patch.sources.iter().enumerate() {
+        let (place, _) = model.field.at(source.at);
+        for (k, change) in changes.iter().enumerate() {
+            let mut image = vec![0.0; patch.pixels()];
+            linear.source_change(patch, model, i, change, &mut buffers, &mut image);
+            for (c, factor) in Pupil::range(k).zip(Pupil::factors(k, place)) {
+                let column = columns.col_as_slice_mut(c);
+                column.iter_mut().zip(&image).for_each(|(c, v)| *c += factor * v);
+            }
+        }
+    }
+    for c in 0..Pupil::PARAMETERS {
+        let column = columns.col_as_slice_mut(c);
+        column.iter_mut().zip(&patch.weight).for_each(|(c, w)| *c *= w);
+        linear.project(patch, column);
+    }
+    let mut residual = linear.residual.clone();
+    linear.project(patch, &mut residual);
+    let gradient = (0..Pupil::PARAMETERS)
+        .map(|c| columns.col_as_slice(c).iter().zip(&residual).map(|(c, r)| c * r).sum())
+        .collect();
+    Some((columns.transpose() * &columns, gradient))
+}
