@@ -312,18 +312,18 @@ impl<'a> Learner<'a> {
         let like = self
             .model
             .widened((knots | 1).clamp(self.model.n, MOST_SPLINES.max(self.model.n)));
-        self.adopt(Pupil::of_camera(self.camera).template(&like));
+        self.adopt(like.with_pupil(Pupil::of_camera(self.camera)));
     }
 
     /// One step of the template and of everything else at once.
     fn step(&mut self, is_first: bool) {
         match self.model.pupil {
             Some(pupil) => {
-                if let Some(model) = wavefront::step(self, pupil) {
+                if let Some(model) = wavefront::step(self.camera, &self.model, pupil, &self.patches) {
                     self.model = model;
                 }
             }
-            None => solve::step(self, is_first),
+            None => solve::step(self.camera, &mut self.model, &mut self.patches, is_first),
         }
     }
 

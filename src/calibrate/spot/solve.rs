@@ -3,9 +3,9 @@
 use rayon::prelude::*;
 
 use super::constraints;
-use super::learn::Learner;
 use super::patch::{Buffers, Linearised, Patch};
 use super::template_model::TemplateModel;
+use crate::optics::Camera;
 
 /// Largest number of steps of conjugate gradients. The outer iteration continues where one was cut short.
 const STEPS: usize = 30;
@@ -16,27 +16,23 @@ const ACCURACY: f64 = 3e-4;
 type Linear<'a> = Vec<(&'a Patch, Linearised)>;
 
 /// One step of the template and of everything else at once.
-pub fn step(learner: &mut Learner, is_first: bool) {
-    let (camera, model) = (learner.camera, &learner.model);
+pub fn step(camera: &Camera, model: &mut TemplateModel, patches: &mut [Patch], is_first: bool) {
     let prior = constraints::prior(model, is_first);
-    let linear: Linear = learner
-        .patches
+    let linear: Linear = patches
         .par_iter()
         .filter_map(|patch| patch.linearise(camera, model).map(|l| (patch, l)))
         .collect();
     let step = template_step(model, &linear, &prior);
     drop(linear);
-    let mut model = model.clone();
     model.coefficients.iter_mut().zip(&step).for_each(|(c, s)| *c += s);
-    let shift = constraints::centre(&mut model, camera.spot_sigma_m);
+    let shift = constraints::centre(model, camera.spot_sigma_m);
     let light = model.normalise();
-    for source in learner.patches.iter_mut().flat_map(|patch| &mut patch.sources) {
+    for source in patches.iter_mut().flat_map(|patch| &mut patch.sources) {
         let values = model.field_values(source.at);
         source.energy_j *= light(&values);
         let moved = shift(&values);
         (0..2).for_each(|k| source.at[k] += moved[k]);
     }
-    learner.model = model;
 }
 
 /// Change δ of the coefficients that minimises Σ_patches ‖P(r − D δ)‖² + ‖(c + δ)/τ‖², where P removes what places, energies and

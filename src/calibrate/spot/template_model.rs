@@ -3,7 +3,7 @@
 use faer::Mat;
 use rayon::prelude::*;
 
-use super::pupil::Pupil;
+use super::pupil::{Aperture, Pupil};
 use crate::optics::Camera;
 use crate::optics::spot::{Field, FieldPolynomial, Template};
 
@@ -108,6 +108,35 @@ impl TemplateModel {
         models
     }
 
+    /// The template of a pupil on these knots.
+    pub fn with_pupil(&self, pupil: Pupil) -> Self {
+        let aperture = Aperture::new();
+        let at = |place: [f64; 2]| vec![aperture.coefficients(&pupil.local(place), self.n, self.knot_m)];
+        Self {
+            pupil: Some(pupil),
+            ..self.projected(at).remove(0)
+        }
+    }
+
+    /// Derivatives of a pupil's coefficients on these knots by each of its changes, as if it were the same change everywhere.
+    pub fn pupil_changes(&self, pupil: &Pupil) -> Vec<Vec<f64>> {
+        const STEP: f64 = 1e-5;
+        let aperture = Aperture::new();
+        let at = |place: [f64; 2]| {
+            let local = pupil.local(place);
+            let here = aperture.coefficients(&local, self.n, self.knot_m);
+            let derivative = |k: usize| {
+                let mut there = local;
+                there[k] += STEP;
+                let mut change = aperture.coefficients(&there, self.n, self.knot_m);
+                change.iter_mut().zip(&here).for_each(|(t, h)| *t = (*t - h) / STEP);
+                change
+            };
+            (0..Pupil::CHANGES).map(derivative).collect()
+        };
+        self.projected(at).into_iter().map(|model| model.coefficients).collect()
+    }
+
     pub fn radius_m(&self) -> f64 {
         0.5 * (self.n + 3) as f64 * self.knot_m
     }
@@ -148,11 +177,12 @@ impl TemplateModel {
     /// The same spot on `n` splines a side: the first component, or the pupil's.
     pub fn widened(&self, n: usize) -> Self {
         if let Some(pupil) = self.pupil {
-            return pupil.template(&Self {
+            let wider = Self {
                 n,
                 coefficients: Vec::new(),
                 ..*self
-            });
+            };
+            return wider.with_pupil(pupil);
         }
         let margin = (n - self.n) / 2;
         let mut coefficients = vec![0.0; n * n];
@@ -298,4 +328,46 @@ fn legendre_monomials(n: i32) -> [f64; MOST_DEGREE + 1] {
 
 fn legendre(n: i32, t: f64) -> f64 {
     legendre_monomials(n).iter().rev().fold(0.0, |sum, c| sum * t + c)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::optics;
+
+    #[test]
+    fn a_template_follows_its_pupil_over_the_field() {
+        let config = optics::Config {
+            pixels: [40; 2],
+            sensor_size_m: [0.03; 2],
+            spot_sigma_m: Some(1e-3),
+            ..Default::default()
+        };
+        let camera = config.camera().expect("a camera");
+        let like = TemplateModel::gaussian(&camera, 0.3e-3, 9e-3);
+        let mut pupil = Pupil::of_camera(&camera);
+        // Coma along x that grows along u.
+        pupil.0[Pupil::range(5)][1] = 0.12;
+        let (model, changes) = (like.with_pupil(pupil), like.pupil_changes(&pupil));
+        let at = [0.8 * 0.015, -0.3 * 0.015];
+        let (values, mut local) = (model.field_values(at), Vec::new());
+        let exact = |pupil: &Pupil| Aperture::new().coefficients(&pupil.local([0.8, -0.3]), like.n, like.knot_m);
+        let largest = |v: &[f64]| v.iter().fold(0.0, |a: f64, v| a.max(v.abs()));
+        let difference = |a: &[f64], b: &[f64]| largest(&a.iter().zip(b).map(|(a, b)| a - b).collect::<Vec<_>>());
+        model.local(&model.coefficients, &values, &mut local);
+        let expected = exact(&pupil);
+        assert!(difference(&local, &expected) < 0.02 * largest(&expected));
+        // What one parameter changes there.
+        let step = 1e-4;
+        let mut moved = pupil;
+        moved.0[Pupil::range(5)][1] += step;
+        let slope: Vec<f64> = exact(&moved)
+            .iter()
+            .zip(&expected)
+            .map(|(a, b)| (a - b) / step)
+            .collect();
+        model.local(&changes[5], &values, &mut local);
+        local.iter_mut().for_each(|v| *v *= Pupil::factors(5, [0.8, -0.3])[1]);
+        assert!(difference(&local, &slope) < 0.05 * largest(&slope));
+    }
 }

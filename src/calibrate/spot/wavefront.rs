@@ -3,7 +3,6 @@
 use faer::Mat;
 use rayon::prelude::*;
 
-use super::learn::Learner;
 use super::patch::{Buffers, Patch};
 use super::pupil::Pupil;
 use super::template_model::TemplateModel;
@@ -24,11 +23,10 @@ const PLACES: usize = 4;
 
 /// One step of Gauss and Newton of the wavefront, places, energies and backgrounds projected out (variable projection: Kaufman, 1975).
 /// Returns the new model; none where no step explains the spots better.
-pub fn step(learner: &Learner, pupil: Pupil) -> Option<TemplateModel> {
-    let (camera, model) = (learner.camera, &learner.model);
-    let stride = learner.patches.len().div_ceil(MOST_PATCHES).max(1);
-    let patches: Vec<&Patch> = learner.patches.iter().step_by(stride).collect();
-    let changes = pupil.derivatives(model);
+pub fn step(camera: &Camera, model: &TemplateModel, pupil: Pupil, patches: &[Patch]) -> Option<TemplateModel> {
+    let stride = patches.len().div_ceil(MOST_PATCHES).max(1);
+    let patches: Vec<&Patch> = patches.iter().step_by(stride).collect();
+    let changes = model.pupil_changes(&pupil);
     let (mut h, mut g) = patches
         .par_iter()
         .filter_map(|patch| normal(camera, model, patch, &changes))
@@ -62,7 +60,7 @@ pub fn step(learner: &Learner, pupil: Pupil) -> Option<TemplateModel> {
     for _ in 0..HALVINGS {
         let mut next = pupil;
         next.0.iter_mut().zip(&step).for_each(|(p, s)| *p += s);
-        let template = next.template(model);
+        let template = model.with_pupil(next);
         if cost(&template, &next) < now {
             return Some(template);
         }
