@@ -11,6 +11,9 @@ use crate::pose::Pose;
 
 /// Poses kept: 20 s of an autopilot's 200 Hz, so that the frames of a slow estimator still find theirs.
 const CAPACITY: usize = 4096;
+/// Poses nearer than this in time are one that came twice, s: no autopilot sends that fast, and a stamp is related to UTC anew
+/// with each message, by two clocks that are read one after the other.
+const SAME_S: f64 = 50e-6;
 /// A pose this much older than the newest, or this much newer, s, is taken for a wrong stamp at first.
 const JUMP_BACK_S: f64 = 2.0;
 const JUMP_AHEAD_S: f64 = 30.0;
@@ -46,7 +49,7 @@ pub struct Counts {
     pub accepted: u64,
     /// Accepted, but older than one before it.
     pub out_of_order: u64,
-    /// Refused: the time of one that is there already.
+    /// Refused: the time of one that is there already, or next to it.
     pub duplicate: u64,
     /// Refused: older than all that are kept.
     pub too_old: u64,
@@ -116,7 +119,8 @@ impl PoseBuffer {
         }
         self.jumps = 0;
         let place = self.poses.partition_point(|p| p.time < pose.time);
-        if self.poses.get(place).is_some_and(|p| p.time == pose.time) {
+        let mut nearest = self.poses.range(place.saturating_sub(1)..self.poses.len().min(place + 1));
+        if nearest.any(|p| seconds(p.time, pose.time).abs() < SAME_S) {
             return Outcome::Duplicate;
         }
         let is_full = self.poses.len() >= CAPACITY;
@@ -256,9 +260,11 @@ mod tests {
     #[test]
     fn order_does_not_matter_and_each_time_counts_once() {
         let mut buffer = filled(&[10.0, 10.2, 10.1]);
-        assert_eq!(buffer.insert(pose(10.1)), Outcome::Duplicate);
+        for again in [10.1, 10.1 - 1e-7, 10.1 + 1e-7, 10.2 + 1e-7] {
+            assert_eq!(buffer.insert(pose(again)), Outcome::Duplicate);
+        }
         let counts = buffer.counts();
-        assert_eq!((counts.accepted, counts.out_of_order, counts.duplicate), (3, 1, 1));
+        assert_eq!((counts.accepted, counts.out_of_order, counts.duplicate), (3, 1, 4));
         let found = buffer.at(at(10.15)).expect("known").pose;
         assert!((found.position_m[0] - 20.3).abs() < 1e-9);
         assert!((found.euler_rad()[0] - 1.015).abs() < 1e-9);

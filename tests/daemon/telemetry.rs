@@ -28,9 +28,9 @@ fn an_autopilot_s_poses_are_used_shown_and_missed() {
     let before = daemon.wait_for("/v1/pose", "a status", |v| v["source"] == "mavlink");
     assert!(before["pose"].is_null(), "{before}");
 
-    // A heartbeat of system 7 and one pose, again and again until the pose is seen.
-    let stop = Arc::new(AtomicBool::new(false));
-    let flying = stop.clone();
+    // A heartbeat of system 7 and one pose, again and again, five times at least, until the pose is seen.
+    let is_flying = Arc::new(AtomicBool::new(true));
+    let flying = is_flying.clone();
     let sender = std::thread::spawn(move || {
         let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
         let frames = [
@@ -38,7 +38,10 @@ fn an_autopilot_s_poses_are_used_shown_and_missed() {
             include_str!("../platform/odometry.hex"),
         ]
         .map(bytes);
-        while !flying.load(Ordering::Relaxed) {
+        for round in 0.. {
+            if round >= 5 && !flying.load(Ordering::Relaxed) {
+                break;
+            }
             for frame in &frames {
                 let _ = socket.send_to(frame, ("127.0.0.1", port));
             }
@@ -53,7 +56,7 @@ fn an_autopilot_s_poses_are_used_shown_and_missed() {
         "{seen}"
     );
     // The autopilot falls silent.
-    stop.store(true, Ordering::Relaxed);
+    is_flying.store(false, Ordering::Relaxed);
     sender.join().unwrap();
     daemon.wait_for("/v1/alerts?kind=pose_lost", "that poses are lost", |v| {
         !alerts(v).is_empty()
