@@ -119,7 +119,9 @@ impl PoseBuffer {
         }
         self.jumps = 0;
         let place = self.poses.partition_point(|p| p.time < pose.time);
-        let mut nearest = self.poses.range(place.saturating_sub(1)..self.poses.len().min(place + 1));
+        let mut nearest = self
+            .poses
+            .range(place.saturating_sub(1)..self.poses.len().min(place + 1));
         if nearest.any(|p| seconds(p.time, pose.time).abs() < SAME_S) {
             return Outcome::Duplicate;
         }
