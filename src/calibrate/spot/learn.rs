@@ -185,15 +185,13 @@ impl<'a> Learner<'a> {
 
     /// χ² of all pixels of the images, those of patches and those between them.
     pub fn chi2_of_images(&self) -> f64 {
-        let chi2 = self.by_image().into_par_iter().map(|(image, patches)| {
+        let of = |(image, patches): (&Image, Vec<&Patch>)| {
             let residual = grouping::residual(self.camera, &self.model, image, &patches);
-            residual
-                .iter()
-                .zip(&image.weight)
-                .map(|(r, w)| (r * w).powi(2))
-                .sum::<f64>()
-        });
-        chi2.sum()
+            let weighted = residual.iter().zip(&image.weight);
+            weighted.map(|(r, w)| (r * w).powi(2)).sum::<f64>()
+        };
+        let chi2: Vec<f64> = self.by_image().into_par_iter().map(of).collect();
+        chi2.iter().sum()
     }
 
     fn by_image(&self) -> Vec<(&'a Image, Vec<&Patch>)> {

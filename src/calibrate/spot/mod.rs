@@ -24,6 +24,7 @@ use std::sync::Arc;
 use ndarray::Array2;
 
 use crate::optics::{Calibration, Camera, PixelMaps, SpotShape};
+use candidates::BETTER;
 pub use coverage::{CELLS, Coverage};
 pub use error::Error;
 use error::{MIN_FRAMES, MIN_SPOTS};
@@ -94,8 +95,6 @@ impl Learned {
 
 /// Change of the noise that is worth a calibration: 3 % is within what sixty frames of overlapping spots measure.
 const NOISE_CHANGE: f64 = 0.03;
-/// Fall of χ² that is more than chance.
-const BETTER: f64 = 30.0;
 
 /// Most frames that are learned from, evenly spaced: more teach little and take long.
 const MOST_FRAMES: usize = 250;

@@ -140,7 +140,8 @@ fn chi2(learner: &Learner, patches: &[Patch], maps: &PixelMaps) -> f64 {
         patch.fit(learner.camera, &learner.model, 6);
         patch.chi2
     };
-    patches.par_iter().map(one).sum()
+    let chi2: Vec<f64> = patches.par_iter().map(one).collect();
+    chi2.iter().sum()
 }
 
 /// Relative scatter of the gains; none where they are alike.

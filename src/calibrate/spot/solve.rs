@@ -12,6 +12,9 @@ const STEPS: usize = 30;
 /// Relative fall of the residual at which a solution is accurate enough for the outer iteration.
 const ACCURACY: f64 = 3e-4;
 
+/// Patches whose gradients one thread adds up.
+const CHUNK: usize = 32;
+
 /// A patch with its Jacobian at the present state; none where its own parameters are not determined.
 type Linear<'a> = Vec<(&'a Patch, Linearised)>;
 
@@ -41,19 +44,21 @@ pub fn step(camera: &Camera, model: &mut TemplateModel, patches: &mut [Patch], i
 fn template_step(model: &TemplateModel, patches: &Linear, prior: &[f64]) -> Vec<f64> {
     let n = model.coefficients.len();
     let over_patches = |image: &(dyn Fn(&Patch, &Linearised, &mut Buffers) -> Vec<f64> + Sync)| -> Vec<f64> {
-        patches
-            .par_iter()
-            .fold(
-                || (vec![0.0; n], Buffers::default()),
-                |(mut gradient, mut buffers), (patch, linear)| {
-                    let mut weighted = image(patch, linear, &mut buffers);
-                    linear.project(patch, &mut weighted);
-                    linear.gradient(patch, model, &mut weighted, &mut buffers, &mut gradient);
-                    (gradient, buffers)
-                },
-            )
-            .map(|(gradient, _)| gradient)
-            .reduce(|| vec![0.0; n], |a, b| a.iter().zip(&b).map(|(a, b)| a + b).collect())
+        let of_chunk = |chunk: &[(&Patch, Linearised)]| {
+            let (mut gradient, mut buffers) = (vec![0.0; n], Buffers::default());
+            for (patch, linear) in chunk {
+                let mut weighted = image(patch, linear, &mut buffers);
+                linear.project(patch, &mut weighted);
+                linear.gradient(patch, model, &mut weighted, &mut buffers, &mut gradient);
+            }
+            gradient
+        };
+        // Added up in their order, so that the same frames always give the same calibration.
+        let gradients: Vec<Vec<f64>> = patches.par_chunks(CHUNK).map(of_chunk).collect();
+        gradients.iter().fold(vec![0.0; n], |mut sum, gradient| {
+            sum.iter_mut().zip(gradient).for_each(|(s, g)| *s += g);
+            sum
+        })
     };
     let apply = |v: &[f64]| -> Vec<f64> {
         let mut out = over_patches(&|patch, linear, buffers| linear.template_change(patch, model, v, buffers));

@@ -27,18 +27,17 @@ pub fn step(camera: &Camera, model: &TemplateModel, pupil: Pupil, patches: &[Pat
     let stride = patches.len().div_ceil(MOST_PATCHES).max(1);
     let patches: Vec<&Patch> = patches.iter().step_by(stride).collect();
     let changes = model.pupil_changes(&pupil);
-    let (mut h, mut g) = patches
+    // Added up in their order, so that the same frames always give the same calibration.
+    let normals: Vec<(Mat<f64>, Vec<f64>)> = patches
         .par_iter()
         .filter_map(|patch| normal(camera, model, patch, &changes))
-        .reduce(
-            || {
-                (
-                    Mat::zeros(Pupil::PARAMETERS, Pupil::PARAMETERS),
-                    vec![0.0; Pupil::PARAMETERS],
-                )
-            },
-            |(h, g), (other, more)| (h + other, g.iter().zip(&more).map(|(a, b)| a + b).collect()),
-        );
+        .collect();
+    let mut h = Mat::<f64>::zeros(Pupil::PARAMETERS, Pupil::PARAMETERS);
+    let mut g = vec![0.0; Pupil::PARAMETERS];
+    for (of_h, of_g) in &normals {
+        h += of_h;
+        g.iter_mut().zip(of_g).for_each(|(g, v)| *g += v);
+    }
     for k in 1..Pupil::PARAMETERS {
         h[(k, k)] += PRIOR.powi(-2);
         g[k] -= pupil.0[k] * PRIOR.powi(-2);
@@ -49,12 +48,13 @@ pub fn step(camera: &Camera, model: &TemplateModel, pupil: Pupil, patches: &[Pat
         step.iter_mut().for_each(|s| *s *= LONGEST / longest);
     }
     let cost = |model: &TemplateModel, pupil: &Pupil| -> f64 {
-        let chi2 = patches.par_iter().map(|patch| {
+        let fitted = patches.par_iter().map(|patch| {
             let mut patch = (*patch).clone();
             patch.fit(camera, model, PLACES);
             patch.chi2
         });
-        chi2.sum::<f64>() + pupil.0[1..].iter().map(|p| (p / PRIOR).powi(2)).sum::<f64>()
+        let chi2: Vec<f64> = fitted.collect();
+        chi2.iter().sum::<f64>() + pupil.0[1..].iter().map(|p| (p / PRIOR).powi(2)).sum::<f64>()
     };
     let now = cost(model, &pupil);
     for _ in 0..HALVINGS {
