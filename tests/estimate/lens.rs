@@ -108,6 +108,40 @@ fn strangers_beside_users_raise_no_spot_error() {
     assert_eq!(estimate.spot_error, 0.0);
 }
 
+/// Coma that grows from the sensor's middle: a satellite outwards of each spot.
+fn spots_with_satellites(turn: f64) -> Vec<([f64; 2], f64)> {
+    let users = [
+        [-9e-3, -9e-3],
+        [2.5e-3, -10e-3],
+        [10e-3, 6e-3],
+        [-3e-3, 2e-3],
+        [3e-3, 4e-3],
+    ];
+    let with_satellite = |[x, y]: [f64; 2]| {
+        let r = f64::hypot(x, y);
+        let (sin, cos) = (y.atan2(x) + turn * r).sin_cos();
+        let satellite = [x + 2.2 * SIGMA_M * cos, y + 2.2 * SIGMA_M * sin];
+        [([x, y], 300.0), (satellite, 300.0 * 0.12 * r / 12.7e-3)]
+    };
+    let beyond = |spots: &[([f64; 2], f64); 2]| spots[1].1 > 20.0;
+    let (outer, inner): (Vec<_>, Vec<_>) = users.map(with_satellite).into_iter().partition(beyond);
+    [outer.concat(), inner.iter().map(|spots| spots[0]).collect()].concat()
+}
+
+#[test]
+fn satellites_outwards_of_the_outer_spots_are_the_lens_s() {
+    let camera = camera();
+    let gaussian = |x: f64, y: f64| (-0.5 * (x * x + y * y) / (SIGMA_M * SIGMA_M)).exp();
+    let mut rng = ChaCha8Rng::seed_from_u64(29);
+    for (turn, count) in [(0.0, 5), (500.0, 8)] {
+        let spots = spots_with_satellites(turn);
+        assert_eq!(spots.len(), 8);
+        let frame = frame(render_density(&camera, &gaussian, &spots, &mut rng));
+        let estimate = estimator(None, &camera).estimate(&frame).unwrap();
+        assert_eq!(estimate.emitters.len(), count, "{turn}: {:?}", places(&estimate));
+    }
+}
+
 /// A round spot, and its reflection of 2 % beside it.
 fn ghost(x: f64, y: f64) -> f64 {
     let spot = |x: f64, y: f64| (-0.5 * (x * x + y * y) / (SIGMA_M * SIGMA_M)).exp();

@@ -31,6 +31,9 @@ const COMMON: f64 = 0.75;
 /// Other bright spots within [`NEAR`] σ of half of the spots, up to which these are no crowd.
 const MAX_NEAR: usize = 1;
 const NEAR: f64 = 5.0;
+/// A misfit that grows from the sensor's middle is compared among spots beyond this share of the farthest one's distance from there.
+const TELLING_GROWTH: f64 = 0.5;
+
 /// How far spots must agree for a misfit to be the lens's.
 #[derive(Clone, Copy)]
 pub(crate) struct Agreement {
@@ -38,6 +41,11 @@ pub(crate) struct Agreement {
     share: f64,
     /// Largest ratio of a spot's misfit to the common one with which it follows that.
     most_growth: f64,
+    /// Spots that an offset needs to itself, and spots that must show the misfit.
+    least: usize,
+    least_showing: f64,
+    /// Largest misfit as a share of the light, over the halo's height.
+    most: f64,
 }
 
 impl Agreement {
@@ -45,20 +53,36 @@ impl Agreement {
     pub const ALONE: Self = Self {
         share: COMMON,
         most_growth: 2.5,
+        least: 2,
+        least_showing: 1.0,
+        most: f64::INFINITY,
     };
     /// Where many frames decide together: three of four spots are enough, as the fourth's ghost may fall beside the sensor; and coma that
     /// grows from the sensor's middle is several times as strong at its corners as in most spots.
     pub const OF_FRAMES: Self = Self {
         share: 0.7,
         most_growth: 10.0,
+        ..Self::ALONE
     };
+
+    /// Of the few spots where a misfit that grows shows: crowds and glints have next to nothing in common but by chance, and then much.
+    fn of_few(self) -> Self {
+        Self {
+            least: 3,
+            least_showing: 2.0,
+            most: LEFT * MAX_SPOT_ERROR,
+            ..self
+        }
+    }
 }
 
 /// Significance that the common misfit keeps under the weights: well below a source's threshold (5.5), so that spots that differ from
 /// the common one are covered too.
 const LEFT: f64 = 2.0;
-/// Largest spot error found: more is no lens.
-pub(crate) const MAX_SPOT_ERROR: f64 = 0.1;
+/// Largest spot error found, under which spots 2 σ apart stay two: fixed at 0.07, `oapwatch study lens` counts all of them right through the Airy disc,
+/// Moffat halo, defocus disc, coma and ghost; at 0.1 it merges all through coma and the ghost, and at 0.04 a Moffat halo still makes 6 %
+/// of invented emitters.
+pub(crate) const MAX_SPOT_ERROR: f64 = 0.07;
 /// Largest common misfit, as a share of the light, within the core. Two equal sources 2 σ apart, taken for one, show 0.14 and more; Airy
 /// discs, Moffat profiles, defocus, coma and astigmatism up to 0.06.
 const MAX_CORE: f64 = 0.1;
@@ -172,36 +196,74 @@ pub(crate) fn common_misfit(
     }
     let ends = bases.axes().map(|b| [b.edges[0], b.edges[b.n]]);
     let middle = ends.map(|[low, high]| 0.5 * (low + high));
-    let radial = |s: &&PointSource| {
-        let d = [0, 1].map(|k| s.u[k] - middle[k]);
-        let length = d[0].hypot(d[1]);
-        if length > 0.0 {
-            d.map(|v| v / length)
-        } else {
-            [1.0, 0.0]
-        }
-    };
-    let views = |turn: &dyn Fn(&&PointSource) -> [f64; 2]| bright.iter().map(|s| (*s, turn(s))).collect::<Vec<View>>();
+    let along = |direction: [f64; 2]| bright.iter().map(|spot| View::new(spot, direction)).collect::<Vec<_>>();
     // Along the sensor's axes; along each spot's direction from the sensor's middle, as for coma; and each spot with itself turned by half a
     // turn, as few spots have little else to be compared with.
-    let along_axes = views(&|_| [1.0, 0.0]);
-    let mirrored = [along_axes.clone(), views(&|_| [-1.0, 0.0])].concat();
-    [along_axes, views(&radial), mirrored]
+    let along_axes = along([1.0, 0.0]);
+    let outwards: Vec<View> = bright.iter().map(|spot| View::outwards(spot, middle)).collect();
+    let mirrored = [along_axes.clone(), along([-1.0, 0.0])].concat();
+    let growing = growing(&outwards, middle);
+    let response = |_: &PointSource, u| filter.response_at(u);
+    // What is the same in all directions, as another width, does not tell whether it grows.
+    let directed = |spot: &PointSource, u: [f64; 2]| {
+        let [x, y] = [0, 1].map(|k| u[k] - spot.u[k]);
+        let turned = [[-y, x], [-x, -y], [y, -x]].map(|d| filter.response_at([0, 1].map(|k| spot.u[k] + d[k])));
+        let r = filter.response_at(u)?;
+        let others = turned.into_iter().sum::<Option<f64>>()?;
+        // As uncertain as a single response.
+        Some((0.75 * r - 0.25 * others) / 0.75f64.sqrt())
+    };
+    [along_axes, outwards, mirrored]
         .iter()
-        .map(|views| compare(views, sources, norm, ends, agreement, |u| filter.response_at(u)))
+        .map(|views| compare(views, sources, norm, ends, agreement, response))
         .fold(ring, f64::max)
+        .max(compare(&growing, sources, norm, ends, agreement.of_few(), directed))
 }
 
-/// A spot and the direction that its offsets are taken along.
-type View<'a> = (&'a PointSource, [f64; 2]);
+/// A spot as it is compared with others.
+#[derive(Clone, Copy)]
+struct View<'a> {
+    spot: &'a PointSource,
+    /// The direction that offsets are taken along.
+    direction: [f64; 2],
+    /// How strong the common misfit is here, of the strongest.
+    growth: f64,
+}
+
+impl<'a> View<'a> {
+    fn new(spot: &'a PointSource, direction: [f64; 2]) -> Self {
+        Self {
+            spot,
+            direction,
+            growth: 1.0,
+        }
+    }
+
+    fn outwards(spot: &'a PointSource, middle: [f64; 2]) -> Self {
+        let d = [0, 1].map(|k| spot.u[k] - middle[k]);
+        let far = d[0].hypot(d[1]);
+        Self::new(spot, if far > 0.0 { d.map(|v| v / far) } else { [1.0, 0.0] })
+    }
+}
+
+/// The spots where a misfit that grows from the sensor's middle, as coma, shows: those farther out.
+fn growing<'a>(outwards: &[View<'a>], middle: [f64; 2]) -> Vec<View<'a>> {
+    let radius = |view: &View| distance2(view.spot.u, middle).sqrt();
+    let farthest = outwards.iter().map(radius).fold(f64::MIN_POSITIVE, f64::max);
+    let grown = outwards.iter().map(|view| View {
+        growth: radius(view) / farthest,
+        ..*view
+    });
+    grown.filter(|view| view.growth > TELLING_GROWTH).collect()
+}
 
 fn compare(
     views: &[View],
     sources: &[PointSource],
     norm: f64,
     ends: [[f64; 2]; 2],
-    Agreement { share, most_growth }: Agreement,
-    response: impl Fn([f64; 2]) -> Option<f64>,
+    agreement: Agreement,
+    response: impl Fn(&PointSource, [f64; 2]) -> Option<f64>,
 ) -> f64 {
     let (mut largest, mut core) = (0.0f64, 0.0f64);
     // Per spot: Σ r², Σ r t and Σ t² over the offsets that tell something.
@@ -215,7 +277,8 @@ fn compare(
                 continue;
             }
             values.clear();
-            for (i, (spot, [c, s])) in views.iter().enumerate() {
+            for (i, view) in views.iter().enumerate() {
+                let (spot, [c, s]) = (view.spot, view.direction);
                 let u = [
                     spot.u[0] + c * offset[0] - s * offset[1],
                     spot.u[1] + s * offset[0] + c * offset[1],
@@ -226,13 +289,13 @@ fn compare(
                 let own = spot.a * halo::height(d2);
                 let is_own = sources
                     .iter()
-                    .all(|t| std::ptr::eq(t, *spot) || t.a * halo::height(distance2(t.u, u)) < own);
-                if let Some(r) = response(u).filter(|_| is_own) {
-                    values.push((r / (spot.a * norm), r, i));
+                    .all(|t| std::ptr::eq(t, spot) || t.a * halo::height(distance2(t.u, u)) < own);
+                if let Some(r) = response(spot, u).filter(|_| is_own) {
+                    values.push((r / (view.growth * spot.a * norm), r, i));
                 }
             }
             // In a crowd few spots have an offset to themselves, and a few agree by chance.
-            if values.len() < 2 || 2 * values.len() < views.len() {
+            if values.len() < agreement.least || 2 * values.len() < views.len() {
                 continue;
             }
             let need = (COMMON * values.len() as f64).ceil() as usize;
@@ -252,7 +315,7 @@ fn compare(
             let is_visible = values.iter().any(|v| v.1.abs() > VISIBLE);
             for &(_, r, i) in &values {
                 if is_visible {
-                    let t = common * views[i].0.a * norm;
+                    let t = common * views[i].growth * views[i].spot.a * norm;
                     sums[i][0] += r * r - 1.0;
                     sums[i][1] += r * t;
                     sums[i][2] += t * t;
@@ -269,12 +332,13 @@ fn compare(
         visible += f64::from(rr > SIGNIFICANT);
         // Aberrations grow towards the edge: a spot may show the common misfit more strongly than most.
         if rr - follows < MAX_LEFT_OF_ONE * rr {
-            following += f64::from(rr > SIGNIFICANT && rt < most_growth * tt);
-            strongest = strongest.max((rt / tt).min(most_growth));
+            following += f64::from(rr > SIGNIFICANT && rt < agreement.most_growth * tt);
+            strongest = strongest.max((rt / tt).min(agreement.most_growth));
         }
     }
-    let is_common = left < MAX_LEFT * whole && following > share * visible;
-    if is_common && core < MAX_CORE {
+    let is_common =
+        left < MAX_LEFT * whole && following >= agreement.least_showing && following > agreement.share * visible;
+    if is_common && core < MAX_CORE && largest < agreement.most {
         (strongest * largest / LEFT).min(MAX_SPOT_ERROR)
     } else {
         0.0

@@ -29,10 +29,6 @@ const HIGH_PEAK: f64 = 0.2;
 /// something in common.
 const LEAST_SPOTS: usize = 3;
 const CHANCE: f64 = 5.0;
-/// Largest spot error under which spots 2 σ apart stay two: fixed at 0.07, `oapwatch study lens` counts all of them right through the Airy disc,
-/// Moffat halo, defocus disc, coma and ghost; at 0.1 it merges all through coma and the ghost, and at 0.04 a Moffat halo still makes 6 %
-/// of invented emitters.
-pub(crate) const RESOLVING_SPOT_ERROR: f64 = 0.07;
 /// Share of the variance that the halo of other spots adds to a position: their misfit is smooth across a spot, while the weights must hold
 /// at its worst place. Found from Airy discs at SNR 1000, the kind of spot whose positions others move most.
 const POSITION_SHARE: f64 = 0.1;
@@ -57,7 +53,7 @@ impl Shape {
             converged: false,
             ..hypothesis.clone()
         };
-        Self::Different(spot_error.min(MAX_SPOT_ERROR), start)
+        Self::Different(spot_error, start)
     }
 }
 
@@ -171,7 +167,7 @@ pub(crate) fn try_spot_error(
         sources,
         ..with_known_width(hypothesis)
     };
-    let spots = search_with_spot_error(space, compressed, frame, RESOLVING_SPOT_ERROR, start, budget);
+    let spots = search_with_spot_error(space, compressed, frame, MAX_SPOT_ERROR, start, budget);
     let error = shown_spot_error(space, compressed, frame, &spots, true, budget);
     (error > 0.0).then_some((error, spots))
 }
@@ -260,7 +256,6 @@ pub(crate) fn search_with_spot_error(
 /// Removes sources that do not exceed the halo of the others, the faintest first.
 pub(crate) fn drop_halo(bases: &Bases, spot_error: f64, penalty: f64, sources: &mut Vec<PointSource>) {
     let norm = spot_norm(bases);
-    let error = spot_error.min(MAX_SPOT_ERROR);
     sources.sort_by(|a, b| b.a.total_cmp(&a.a));
     let mut kept: Vec<PointSource> = Vec::with_capacity(sources.len());
     for source in sources.drain(..) {
@@ -268,7 +263,7 @@ pub(crate) fn drop_halo(bases: &Bases, spot_error: f64, penalty: f64, sources: &
             .iter()
             .map(|s| (s.a * norm * height(distance2(s.u, source.u))).powi(2))
             .sum();
-        if (source.a * norm).powi(2) > penalty * (1.0 + error * error * halo) {
+        if (source.a * norm).powi(2) > penalty * (1.0 + spot_error * spot_error * halo) {
             kept.push(source);
         }
     }

@@ -2,8 +2,6 @@
 
 use std::collections::VecDeque;
 
-use crate::estimate::model_order::spot_error::RESOLVING_SPOT_ERROR;
-
 /// Frames that are remembered. Over so many a glint on water, which passes for a lens's halo while it lasts, shows a spot error in at most 22 %
 /// of the frames (`config/scenes/hazy-noon.toml`; 41 % over 32 frames), and crowds of Gaussian spots in 5 % (`dense-crowd.toml`).
 const FRAMES: usize = 128;
@@ -32,7 +30,7 @@ impl SpotErrorHistory {
         sorted[..count].sort_by(f64::total_cmp);
         let without = sorted[..count].partition_point(|e| *e == 0.0);
         let with = count - without;
-        (with > without).then(|| sorted[without + with / 2].min(RESOLVING_SPOT_ERROR))
+        (with > without).then(|| sorted[without + with / 2])
     }
 }
 
@@ -52,11 +50,6 @@ mod tests {
         assert_eq!(history([0.03]).spot_error(), Some(0.03));
         assert_eq!(history([0.03, 0.0]).spot_error(), None);
         assert_eq!(history([0.03, 0.0, 0.02]).spot_error(), Some(0.03));
-    }
-
-    #[test]
-    fn spots_stay_apart_under_what_is_remembered() {
-        assert_eq!(history([0.1; 5]).spot_error(), Some(RESOLVING_SPOT_ERROR));
     }
 
     #[test]
