@@ -6,14 +6,22 @@ use super::super::measured::{Measured, Say, exceptions};
 use crate::study::stories::pixels::{PixelStory, RATE_HZ, review};
 
 /// Spots on the story's pixels of 0.75 mm, as wide as its Gaussian of 1 mm.
-const SPOTS: [(&str, &str); 6] = [
+const SPOTS: [(&str, &str); 8] = [
     ("Gaussian", ""),
     ("Airy disc", "kind = \"airy\"\nfirst_zero_m = 2.9e-3"),
     ("Moffat, β 2.5", "kind = \"moffat\"\ncore_m = 2.05e-3\nindex = 2.5"),
     ("defocus disc", "kind = \"defocus\"\nradius_m = 1.8e-3\nblur_m = 2.5e-4"),
     (
-        "coma, growing off axis",
+        "coma, to 0.08 waves at the edge",
+        "kind = \"zernike\"\nfirst_zero_m = 2.9e-3\n[[effects.spot.term]]\nnoll = 8\nwaves = [0.0, 0.08]\n[[effects.spot.term]]\nnoll = 7\nwaves = [0.0, 0.0, 0.08]",
+    ),
+    (
+        "coma, to 0.2 waves at the edge",
         "kind = \"zernike\"\nfirst_zero_m = 2.9e-3\n[[effects.spot.term]]\nnoll = 8\nwaves = [0.0, 0.2]\n[[effects.spot.term]]\nnoll = 7\nwaves = [0.0, 0.0, 0.2]",
+    ),
+    (
+        "astigmatism of 0.1 waves at 45°",
+        "kind = \"zernike\"\nfirst_zero_m = 2.9e-3\n[[effects.spot.term]]\nnoll = 5\nwaves = [0.1]",
     ),
     (
         "ghost of 2 %",
