@@ -20,3 +20,4 @@ pub mod ring_misfit;
 pub mod search;
 pub mod spot_error;
 pub mod spot_error_history;
+pub mod width_history;

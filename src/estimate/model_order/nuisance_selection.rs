@@ -15,7 +15,7 @@ pub(crate) const EARLY_ROUNDS: usize = 3;
 /// Ratio of energies from which overlapping sources may be an artefact of a wrong width or background. Users' energies scatter by a tenth;
 /// smaller would test nuisances in frames of honest users of two powers, which only costs time.
 const MAX_ENERGY_RATIO: f64 = 3.0;
-const ROTATED_ELLIPSE: Nuisances = Nuisances {
+pub(crate) const ROTATED_ELLIPSE: Nuisances = Nuisances {
     background: true,
     width: Width::RotatedEllipse,
 };
