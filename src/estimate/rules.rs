@@ -77,6 +77,9 @@ rules! {
     /// A frame that another width or an elongated spot explains is searched from there, before it is asked whether its lens is another. Needed
     /// most in E2/64 with the condition `ellipse`.
     explain_by_width,
+    /// A frame that round spots do not explain is searched with the ellipse that most recent frames showed. Needed where spots overlap through
+    /// a lens with astigmatism (`oapwatch study lens`).
+    remember_ellipse,
     /// A rotated elliptical PSF is tried in the place of more sources. Needed with the condition `ellipse`.
     rotated_ellipse,
     /// Sources that do not exceed the misfit around them are removed. No cell of the trade-off needs it; the scene `hazy-noon` does: without

@@ -4,7 +4,7 @@
 use std::sync::Arc;
 
 use ndarray::Array2;
-use oapwatch::estimate::{Emitter, position_bound};
+use oapwatch::estimate::{Emitter, Estimate, position_bound};
 use oapwatch::frame::Frame;
 use oapwatch::optics::spot::{Field, SpotShape, Template};
 use oapwatch::optics::{self, Camera, Smear, add_spot};
@@ -146,6 +146,34 @@ fn satellites_outwards_of_the_outer_spots_are_the_lens_s() {
 fn ghost(x: f64, y: f64) -> f64 {
     let spot = |x: f64, y: f64| (-0.5 * (x * x + y * y) / (SIGMA_M * SIGMA_M)).exp();
     spot(x, y) + 0.02 * spot(x - 4.3e-3, y + 2.9e-3)
+}
+
+/// A round spot that astigmatism of 45° has made 40 % longer than wide.
+fn elongated(x: f64, y: f64) -> f64 {
+    let [a, b] = [x + y, x - y].map(|d| d / (2f64.sqrt() * SIGMA_M));
+    (-0.5 * ((a / 1.19).powi(2) + (b / 0.85).powi(2))).exp()
+}
+
+#[test]
+fn spots_apart_teach_the_widths_of_those_that_overlap() {
+    let camera = camera();
+    let mut rng = ChaCha8Rng::seed_from_u64(30);
+    let draw = |spots: &[([f64; 2], f64)], rng: &mut ChaCha8Rng| frame(render_density(&camera, &elongated, spots, rng));
+    let mut experienced = estimator(None, &camera);
+    let apart = draw(&FIVE.map(|at| (at, 1000.0)), &mut rng);
+    assert_eq!(experienced.estimate(&apart).unwrap().emitters.len(), 5);
+    let (mut alone, mut told, frames) = (0, 0, 6);
+    for _ in 0..frames {
+        let pairs = [FIVE[0], FIVE[1], FIVE[3]].map(|at| {
+            let (sin, cos) = rng.random_range(0.0..std::f64::consts::PI).sin_cos();
+            [-1e-3, 1e-3].map(|d| (([at[0] + d * cos, at[1] + d * sin]), 1000.0))
+        });
+        let frame = draw(pairs.as_flattened(), &mut rng);
+        let is_right = |estimate: Estimate| u32::from(estimate.emitters.len() == 6);
+        alone += is_right(estimator(None, &camera).estimate(&frame).unwrap());
+        told += is_right(experienced.estimate(&frame).unwrap());
+    }
+    assert!(told == frames && alone < frames / 2, "{told} and {alone} of {frames}");
 }
 
 #[test]

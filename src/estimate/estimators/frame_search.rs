@@ -10,16 +10,15 @@ use crate::estimate::model::hypothesis::{Hypothesis, Nuisances};
 use crate::estimate::model::svd_basis::Basis;
 use crate::estimate::model_order::candidate::Candidate;
 use crate::estimate::model_order::common_misfit::is_narrow;
+use crate::estimate::model_order::ellipse_history::EllipseHistory;
 use crate::estimate::model_order::initialise::{add_residual_peaks, filter_peaks, initial_hypothesis, initialise};
 use crate::estimate::model_order::maximum_likelihood::maximum_likelihood;
-use crate::estimate::model_order::nuisance_selection::{ROTATED_ELLIPSE, ROUNDS};
 use crate::estimate::model_order::pruning::without_insignificant;
-use crate::estimate::model_order::refine::{refine, shrink};
+use crate::estimate::model_order::refine::shrink;
 use crate::estimate::model_order::reweighting::Reweighting;
 use crate::estimate::model_order::search::{Search, SearchSpace};
 use crate::estimate::model_order::spot_error::{Shape, explained_by_width, inspect_shape};
 use crate::estimate::model_order::spot_error_history::SpotErrorHistory;
-use crate::estimate::model_order::width_history::WidthHistory;
 use crate::estimate::preprocess::noise_variance::VarianceFunction;
 use crate::estimate::preprocess::outliers::NoiseInspection;
 use crate::estimate::preprocess::screening::PreprocessedFrame;
@@ -55,7 +54,7 @@ pub(crate) struct Found {
 }
 
 impl Found {
-    fn of(hypothesis: Hypothesis, kind: SearchKind) -> Self {
+    pub fn of(hypothesis: Hypothesis, kind: SearchKind) -> Self {
         Self {
             hypothesis,
             kind,
@@ -72,7 +71,7 @@ pub(crate) struct FrameSearch {
     pub spot_error: Option<f64>,
     /// What recent frames showed, where none is configured and the sensor is wide enough to show it.
     pub history: Option<SpotErrorHistory>,
-    widths: WidthHistory,
+    pub ellipse: EllipseHistory,
     pub frame: PreprocessedFrame,
     inspection: NoiseInspection,
     /// The frame in bases that leave a part to measure the noise, where the search's own do not.
@@ -106,7 +105,7 @@ impl FrameSearch {
             spec,
             spot_error: camera.spot_error,
             history: (is_sought && !is_narrow(&reweighting.space.bases)).then(SpotErrorHistory::default),
-            widths: WidthHistory::default(),
+            ellipse: EllipseHistory::default(),
             frame: PreprocessedFrame::default(),
             inspection: NoiseInspection::default(),
             noise_bases: noise_bases.map(|bases| (bases, CompressedFrame::default())),
@@ -146,6 +145,9 @@ impl FrameSearch {
 
     /// The emitters of the frame.
     pub fn run(&mut self, budgets: &mut Budgets) -> Found {
+        if let Some(found) = self.find_with_usual_ellipse(budgets) {
+            return found;
+        }
         let remembered = self.history.as_ref().and_then(SpotErrorHistory::spot_error);
         let remembered = match remembered.map(|error| self.find_as_remembered(error, budgets)) {
             Some((found, true)) => return found,
@@ -175,8 +177,8 @@ impl FrameSearch {
             self.keep_fewer(&mut found, remembered);
         }
         let is_explained = self.compressed_of(found.kind).is_explained_by(&found.hypothesis);
-        if is_explained && found.spot_error == 0.0 && !found.hypothesis.sources.is_empty() {
-            self.widths.push(&found.hypothesis);
+        if is_explained && found.spot_error == 0.0 {
+            self.ellipse.push(&found.hypothesis);
         }
         found
     }
@@ -238,9 +240,6 @@ impl FrameSearch {
                 let is_explained = self.compressed.is_explained_by(&initial);
                 if !is_explained {
                     self.network_start.improve(&mut search, &mut initial);
-                    if let Some(found) = self.try_usual_widths(&initial, &mut budgets.search) {
-                        return found;
-                    }
                 }
                 let by_pencil = if is_explained {
                     None
@@ -283,27 +282,6 @@ impl FrameSearch {
         (self.frame, self.compressed) = kept;
         budget.restart();
         self.search_with_outliers(initial, budget)
-    }
-
-    /// The emitters with the widths that recent frames showed, if these explain the frame within little work.
-    fn try_usual_widths(&mut self, initial: &Hypothesis, budget: &mut WorkBudget) -> Option<Found> {
-        let [x, y, covariance_xy] = self.widths.usual()?;
-        let limit = budget.limit(TRY_WORK);
-        let mut search = self.search(budget);
-        let mut candidate = Candidate::from(Hypothesis {
-            width: [x, y],
-            covariance_xy,
-            converged: false,
-            ..initial.clone()
-        });
-        search.fit_trial(&mut candidate);
-        candidate = add_residual_peaks(&mut search, candidate);
-        refine(&mut search, &mut candidate, ROUNDS);
-        candidate.nuisances = ROTATED_ELLIPSE;
-        search.converge(&mut candidate);
-        let is_explained = search.is_explained_by(&candidate);
-        budget.restore_limit(limit);
-        is_explained.then(|| Found::of(candidate.into_hypothesis(), SearchKind::Main))
     }
 
     /// The hypothesis from the pencil's positions, if it explains the frame within little work.

@@ -2,12 +2,51 @@
 
 use crate::estimate::estimators::budgets::Budgets;
 use crate::estimate::estimators::frame_search::{Found, FrameSearch, SearchKind};
+use crate::estimate::model_order::candidate::Candidate;
+use crate::estimate::model_order::initialise::initial_hypothesis;
+use crate::estimate::model_order::nuisance_selection::{EARLY_ROUNDS, ROTATED_ELLIPSE, ROUNDS};
+use crate::estimate::model_order::refine::refine;
 use crate::estimate::model_order::reweighting::Reweighting;
 use crate::estimate::model_order::spot_error::{
     Shape, drop_halo, inspect_shape, load_weighted, search_with_spot_error, shown_spot_error, try_spot_error,
 };
 
+/// Share of a frame's work for a try with the ellipse that recent frames showed: spots that overlap are split one after another.
+const USUAL_ELLIPSE_WORK: f64 = 0.4;
+
 impl FrameSearch {
+    /// The emitters as elongated as recent frames showed, if that explains a frame which round ones do not. Not where spots melt: there
+    /// emitters explain an ellipse, and an ellipse emitters.
+    pub fn find_with_usual_ellipse(&mut self, budgets: &mut Budgets) -> Option<Found> {
+        let [x, y, covariance_xy] = self.ellipse.usual().filter(|_| self.space.rules.remember_ellipse)?;
+        let mut search = self.space.search(&self.compressed, &self.frame, &mut budgets.search);
+        if search.pencil.is_some() {
+            return None;
+        }
+        let limit = search.context.budget.limit(USUAL_ELLIPSE_WORK);
+        let mut candidate = Candidate::from(initial_hypothesis(&mut search));
+        let is_round = search.is_explained_by(&candidate);
+        if !is_round {
+            candidate.width = [x, y];
+            candidate.covariance_xy = covariance_xy;
+            search.fit_trial(&mut candidate);
+            refine(&mut search, &mut candidate, ROUNDS);
+            candidate.nuisances = ROTATED_ELLIPSE;
+            search.fit_trial(&mut candidate);
+            refine(&mut search, &mut candidate, EARLY_ROUNDS);
+            search.converge(&mut candidate);
+        }
+        let is_elongated = !is_round && search.is_explained_by(&candidate);
+        search.context.budget.restore_limit(limit);
+        if !is_elongated {
+            return None;
+        }
+        let hypothesis = candidate.into_hypothesis();
+        self.ellipse.push(&hypothesis);
+        self.history.iter_mut().for_each(|history| history.push(0.0));
+        Some(Found::of(hypothesis, SearchKind::Main))
+    }
+
     /// Where the spots differ from the PSF, searches again with that allowed for. Returns whether fewer sources explain the frame under equal
     /// weights.
     pub fn allow_for_shape(&mut self, found: &mut Found, budgets: &mut Budgets) -> bool {

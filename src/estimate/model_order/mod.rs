@@ -3,6 +3,7 @@
 pub mod candidate;
 pub mod common_misfit;
 pub mod criterion;
+pub mod ellipse_history;
 pub mod evidence;
 pub mod initialise;
 pub mod map_search;
@@ -20,4 +21,3 @@ pub mod ring_misfit;
 pub mod search;
 pub mod spot_error;
 pub mod spot_error_history;
-pub mod width_history;
