@@ -1,5 +1,6 @@
 //! The number of emitters: hypotheses are proposed, fitted and compared.
 
+pub mod bright_spots;
 pub mod candidate;
 pub mod common_misfit;
 pub mod criterion;

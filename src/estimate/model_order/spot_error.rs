@@ -6,11 +6,9 @@ use crate::estimate::model::bases::Bases;
 use crate::estimate::model::compressed_frame::CompressedFrame;
 use crate::estimate::model::halo::{Halo, height, spot_norm};
 use crate::estimate::model::hypothesis::{Hypothesis, Nuisances, PointSource, Width};
+use crate::estimate::model_order::bright_spots::{CORE, are_pairs_alike, bright_spots, distance2, is_faint_beside};
 use crate::estimate::model_order::candidate::Candidate;
-use crate::estimate::model_order::common_misfit::{
-    Agreement, CORE, MAX_SPOT_ERROR, are_pairs_alike, bright_spots, common_misfit, distance2, is_faint_beside,
-    is_narrow,
-};
+use crate::estimate::model_order::common_misfit::{Agreement, MAX_SPOT_ERROR, common_misfit, is_narrow};
 use crate::estimate::model_order::maximum_likelihood::refit_reweighted;
 use crate::estimate::model_order::proposals::split_all;
 use crate::estimate::model_order::search::{Search, SearchSpace};
