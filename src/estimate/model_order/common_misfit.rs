@@ -10,13 +10,10 @@ use crate::estimate::model_order::bright_spots::{CORE, distance2};
 use crate::estimate::model_order::candidate::Candidate;
 use crate::estimate::model_order::ring_misfit::Rings;
 use crate::estimate::model_order::search::Search;
+use crate::estimate::model_order::spot_views::{Surroundings, View, comparable, offsets};
 
-/// Offsets at which spots are compared: their spacing and the largest along an axis, σ.
+/// Distance from one offset to the next, σ.
 const SPACING: f64 = 0.75;
-const OFFSETS: i32 = 16;
-/// Spots of less than this share of the brightest one's energy, and more than this number, are not compared.
-const BRIGHT: f64 = 0.1;
-const MAX_SPOTS: usize = 12;
 /// Combined significance, squared, of the spots that agree at an offset; noise alone reaches it at one of 4,000 offsets in a few of a
 /// million frames.
 const SIGNIFICANT: f64 = 36.0;
@@ -27,12 +24,7 @@ const VISIBLE: f64 = 5.0;
 const MAX_LEFT: f64 = 0.35;
 const MAX_LEFT_OF_ONE: f64 = 0.5;
 /// Share of the spots that a misfit is common to, at an offset and in all. Half agree by chance where a crowd is not resolved yet.
-const COMMON: f64 = 0.75;
-/// Other bright spots within [`NEAR`] σ of half of the spots, up to which these are no crowd.
-const MAX_NEAR: usize = 1;
-const NEAR: f64 = 5.0;
-/// A misfit that grows from the sensor's middle is compared among spots beyond this share of the farthest one's distance from there.
-const TELLING_GROWTH: f64 = 0.5;
+pub(crate) const COMMON: f64 = 0.75;
 
 /// How far spots must agree for a misfit to be the lens's.
 #[derive(Clone, Copy)]
@@ -78,14 +70,14 @@ impl Agreement {
 
 /// Significance that the common misfit keeps under the weights: well below a source's threshold (5.5), so that spots that differ from
 /// the common one are covered too.
-const LEFT: f64 = 2.0;
+pub(crate) const LEFT: f64 = 2.0;
 /// Largest spot error found, under which spots 2 σ apart stay two: fixed at 0.07, `oapwatch study lens` counts all of them right through the Airy disc,
 /// Moffat halo, defocus disc, coma and ghost; at 0.1 it merges all through coma and the ghost, and at 0.04 a Moffat halo still makes 6 %
 /// of invented emitters.
 pub(crate) const MAX_SPOT_ERROR: f64 = 0.07;
 /// Largest common misfit, as a share of the light, within the core. Two equal sources 2 σ apart, taken for one, show 0.14 and more; Airy
 /// discs, Moffat profiles, defocus, coma and astigmatism up to 0.06.
-const MAX_CORE: f64 = 0.1;
+pub(crate) const MAX_CORE: f64 = 0.1;
 
 /// Width of a sensor, σ, up to which one or two spots show no shape beside a width: on narrower ones spots are all core. Smaller takes melted
 /// spots of another width for a lens's, larger leaves two spots of a lens on 20 × 20 pixels to invented sources.
@@ -111,14 +103,9 @@ pub(crate) fn common_misfit(
     search.matched_filter.respond(&residual, mx, my);
     let filter = &*search.matched_filter;
     let sources = &candidate.sources;
-    let brightest = sources.iter().fold(0.0, |m: f64, s| m.max(s.a));
-    let mut bright: Vec<&PointSource> = sources.iter().filter(|s| s.a > BRIGHT * brightest).collect();
-    bright.sort_by(|a, b| b.a.total_cmp(&a.a));
-    let near = |s: &&PointSource| bright.iter().filter(|t| distance2(s.u, t.u) < NEAR * NEAR).count() - 1;
-    if bright.is_empty() || 2 * bright.iter().filter(|s| near(s) > MAX_NEAR).count() > bright.len() {
+    let Some(bright) = comparable(sources) else {
         return 0.0;
-    }
-    bright.truncate(MAX_SPOTS);
+    };
     let rings = Rings {
         axes: bases.axes(),
         residual: &residual,
@@ -137,15 +124,15 @@ pub(crate) fn common_misfit(
     if bright.len() < least {
         return ring;
     }
-    let ends = bases.axes().map(|b| [b.edges[0], b.edges[b.n]]);
-    let middle = ends.map(|[low, high]| 0.5 * (low + high));
+    let surroundings = Surroundings::new(bases, sources);
+    let middle = surroundings.middle();
     let along = |direction: [f64; 2]| bright.iter().map(|spot| View::new(spot, direction)).collect::<Vec<_>>();
     // Along the sensor's axes; along each spot's direction from the sensor's middle, as for coma; and each spot with itself turned by half a
     // turn, as few spots have little else to be compared with.
     let along_axes = along([1.0, 0.0]);
     let outwards: Vec<View> = bright.iter().map(|spot| View::outwards(spot, middle)).collect();
     let mirrored = [along_axes.clone(), along([-1.0, 0.0])].concat();
-    let growing = growing(&outwards, middle);
+    let growing = surroundings.growing(&bright, surroundings.farthest(&bright));
     let response = |_: &PointSource, u| filter.response_at(u);
     // What is the same in all directions, as another width, does not tell whether it grows.
     let directed = |spot: &PointSource, u: [f64; 2]| {
@@ -158,53 +145,14 @@ pub(crate) fn common_misfit(
     };
     [along_axes, outwards, mirrored]
         .iter()
-        .map(|views| compare(views, sources, norm, ends, agreement, response))
+        .map(|views| compare(views, &surroundings, agreement, response))
         .fold(ring, f64::max)
-        .max(compare(&growing, sources, norm, ends, agreement.of_few(), directed))
-}
-
-/// A spot as it is compared with others.
-#[derive(Clone, Copy)]
-struct View<'a> {
-    spot: &'a PointSource,
-    /// The direction that offsets are taken along.
-    direction: [f64; 2],
-    /// How strong the common misfit is here, of the strongest.
-    growth: f64,
-}
-
-impl<'a> View<'a> {
-    fn new(spot: &'a PointSource, direction: [f64; 2]) -> Self {
-        Self {
-            spot,
-            direction,
-            growth: 1.0,
-        }
-    }
-
-    fn outwards(spot: &'a PointSource, middle: [f64; 2]) -> Self {
-        let d = [0, 1].map(|k| spot.u[k] - middle[k]);
-        let far = d[0].hypot(d[1]);
-        Self::new(spot, if far > 0.0 { d.map(|v| v / far) } else { [1.0, 0.0] })
-    }
-}
-
-/// The spots where a misfit that grows from the sensor's middle, as coma, shows: those farther out.
-fn growing<'a>(outwards: &[View<'a>], middle: [f64; 2]) -> Vec<View<'a>> {
-    let radius = |view: &View| distance2(view.spot.u, middle).sqrt();
-    let farthest = outwards.iter().map(radius).fold(f64::MIN_POSITIVE, f64::max);
-    let grown = outwards.iter().map(|view| View {
-        growth: radius(view) / farthest,
-        ..*view
-    });
-    grown.filter(|view| view.growth > TELLING_GROWTH).collect()
+        .max(compare(&growing, &surroundings, agreement.of_few(), directed))
 }
 
 fn compare(
     views: &[View],
-    sources: &[PointSource],
-    norm: f64,
-    ends: [[f64; 2]; 2],
+    surroundings: &Surroundings,
     agreement: Agreement,
     response: impl Fn(&PointSource, [f64; 2]) -> Option<f64>,
 ) -> f64 {
@@ -212,57 +160,39 @@ fn compare(
     // Per spot: Σ r², Σ r t and Σ t² over the offsets that tell something.
     let mut sums = vec![[0.0; 3]; views.len()];
     let mut values: Vec<(f64, f64, usize)> = Vec::with_capacity(views.len());
-    for p in -OFFSETS..=OFFSETS {
-        for q in -OFFSETS..=OFFSETS {
-            let offset = [f64::from(p) * SPACING, f64::from(q) * SPACING];
-            let d2 = offset[0].powi(2) + offset[1].powi(2);
-            if d2 > (f64::from(OFFSETS) * SPACING).powi(2) {
-                continue;
+    for offset in offsets(SPACING) {
+        let d2 = distance2(offset, [0.0; 2]);
+        values.clear();
+        for (i, view) in views.iter().enumerate() {
+            if let Some(r) = surroundings.own_response(view, offset, &response) {
+                values.push((r / surroundings.scale(view), r, i));
             }
-            values.clear();
-            for (i, view) in views.iter().enumerate() {
-                let (spot, [c, s]) = (view.spot, view.direction);
-                let u = [
-                    spot.u[0] + c * offset[0] - s * offset[1],
-                    spot.u[1] + s * offset[0] + c * offset[1],
-                ];
-                if (0..2).any(|k| u[k] < ends[k][0] || u[k] > ends[k][1]) {
-                    continue;
-                }
-                let own = spot.a * halo::height(d2);
-                let is_own = sources
-                    .iter()
-                    .all(|t| std::ptr::eq(t, spot) || t.a * halo::height(distance2(t.u, u)) < own);
-                if let Some(r) = response(spot, u).filter(|_| is_own) {
-                    values.push((r / (view.growth * spot.a * norm), r, i));
-                }
-            }
-            // In a crowd few spots have an offset to themselves, and a few agree by chance.
-            if values.len() < agreement.least || 2 * values.len() < views.len() {
-                continue;
-            }
-            let need = (COMMON * values.len() as f64).ceil() as usize;
-            let mut common = 0.0f64;
-            for sign in [1.0, -1.0] {
-                values.sort_by(|a, b| (sign * b.0).total_cmp(&(sign * a.0)));
-                let least = sign * values[need - 1].0;
-                let square: f64 = values[..need].iter().map(|v| v.1 * v.1).sum();
-                if least > 0.0 && square > SIGNIFICANT && values[..need].iter().all(|v| sign * v.1 > 1.0) {
-                    common = sign * least;
-                    largest = largest.max(least / halo::height(d2));
-                    if d2 < CORE * CORE {
-                        core = core.max(least);
-                    }
+        }
+        // In a crowd few spots have an offset to themselves, and a few agree by chance.
+        if values.len() < agreement.least || 2 * values.len() < views.len() {
+            continue;
+        }
+        let need = (COMMON * values.len() as f64).ceil() as usize;
+        let mut common = 0.0f64;
+        for sign in [1.0, -1.0] {
+            values.sort_by(|a, b| (sign * b.0).total_cmp(&(sign * a.0)));
+            let least = sign * values[need - 1].0;
+            let square: f64 = values[..need].iter().map(|v| v.1 * v.1).sum();
+            if least > 0.0 && square > SIGNIFICANT && values[..need].iter().all(|v| sign * v.1 > 1.0) {
+                common = sign * least;
+                largest = largest.max(least / halo::height(d2));
+                if d2 < CORE * CORE {
+                    core = core.max(least);
                 }
             }
-            let is_visible = values.iter().any(|v| v.1.abs() > VISIBLE);
-            for &(_, r, i) in &values {
-                if is_visible {
-                    let t = common * views[i].growth * views[i].spot.a * norm;
-                    sums[i][0] += r * r - 1.0;
-                    sums[i][1] += r * t;
-                    sums[i][2] += t * t;
-                }
+        }
+        let is_visible = values.iter().any(|v| v.1.abs() > VISIBLE);
+        for &(_, r, i) in &values {
+            if is_visible {
+                let t = common * surroundings.scale(&views[i]);
+                sums[i][0] += r * r - 1.0;
+                sums[i][1] += r * t;
+                sums[i][2] += t * t;
             }
         }
     }

@@ -22,3 +22,4 @@ pub mod ring_misfit;
 pub mod search;
 pub mod spot_error;
 pub mod spot_error_history;
+pub mod spot_views;
