@@ -25,10 +25,10 @@ pub struct Args {
     /// Of lens, lens-calibrated, lens-alerts: only the rows whose name begins so ("airy disc 300"); may be repeated
     #[arg(long, value_name = "ROW")]
     only: Vec<String>,
-    /// Of honest-pixels to flights: the estimator
+    /// Of honest-pixels to flights and the lens studies: the estimator
     #[arg(long, value_name = "NAME", value_parser = clap::builder::PossibleValuesParser::new(ESTIMATORS.iter().map(|e| e.name)))]
     estimator: Option<String>,
-    /// Of sequence and honest-pixels to flights: a rule of the estimator to leave out
+    /// Of sequence, honest-pixels to flights and the lens studies: a rule of the estimator to leave out
     #[arg(long, value_name = "RULE", value_parser = clap::builder::PossibleValuesParser::new(Rules::NAMES.iter().chain(Rules::OF_SEQUENCES)))]
     without: Option<String>,
 }

@@ -30,12 +30,14 @@ pub struct Measurement {
     run: Run,
 }
 
+type RunRows = fn(stories: u64, seed: u64, only: &[String], estimator: &estimate::Config, say: Say) -> Measured;
+
 enum Run {
     Whole(fn(stories: u64, seed: u64) -> Measured),
     /// Of the program with an estimator and its rules.
     With(fn(stories: u64, seed: u64, estimator: &estimate::Config) -> Measured),
-    /// Of the rows that are named; each is said as soon as it is measured.
-    Rows(fn(stories: u64, seed: u64, only: &[String], say: Say) -> Measured),
+    /// The same, of the rows that are named; each is said as soon as it is measured.
+    Rows(RunRows),
 }
 
 impl Measurement {
@@ -45,7 +47,7 @@ impl Measurement {
         match self.run {
             Run::Whole(run) => run(stories, seed),
             Run::With(run) => run(stories, seed, estimator),
-            Run::Rows(run) => run(stories, seed, only, say),
+            Run::Rows(run) => run(stories, seed, only, estimator, say),
         }
     }
 }
@@ -94,7 +96,7 @@ const fn with(name: &'static str, stories: u64, run: fn(u64, u64, &estimate::Con
     }
 }
 
-const fn rows(name: &'static str, stories: u64, run: fn(u64, u64, &[String], Say) -> Measured) -> Measurement {
+const fn rows(name: &'static str, stories: u64, run: RunRows) -> Measurement {
     Measurement {
         name,
         stories,

@@ -3,6 +3,7 @@
 use rayon::prelude::*;
 
 use super::super::measured::{Measured, Say, exceptions};
+use crate::estimate;
 use crate::study::stories::pixels::{PixelStory, RATE_HZ, review};
 
 /// Spots on the story's pixels of 0.75 mm, as wide as its Gaussian of 1 mm.
@@ -32,7 +33,7 @@ const SPOTS: [(&str, &str); 8] = [
 const HONEST_S: f64 = 120.0;
 
 /// Four honest users through each lens, so many stories of two minutes: thirty make an hour.
-pub fn honest(stories: u64, seed: u64, only: &[String], say: Say) -> Measured {
+pub fn honest(stories: u64, seed: u64, only: &[String], estimator: &estimate::Config, say: Say) -> Measured {
     say("| lens | honest frames | alerts |\n|---|---|---|");
     let mut all = Vec::new();
     for (name, spot) in SPOTS.into_iter().filter(|(name, _)| super::is_named(name, only)) {
@@ -44,6 +45,7 @@ pub fn honest(stories: u64, seed: u64, only: &[String], say: Say) -> Measured {
             };
             let mut story = PixelStory::with(k, &table);
             story.seconds = HONEST_S;
+            story.config.estimator = estimator.clone();
             (k, review(&story).raised())
         };
         let mut raised: Vec<_> = (seed..seed + stories).into_par_iter().map(tell).collect();

@@ -21,7 +21,7 @@ const MOST_INVENTED: f64 = 1.0;
 const FIGURES: &str = "number right %, invented %, missed %, in ellipse %, error over bound, median and longest ms";
 
 /// So many frames of each lens, peak SNR and layout, without a calibration; of the rows that `only` names.
-pub fn uncalibrated(frames: u64, seed: u64, only: &[String], say: Say) -> Measured {
+pub fn uncalibrated(frames: u64, seed: u64, only: &[String], estimator: &estimate::Config, say: Say) -> Measured {
     say(&format!(
         "| lens | SNR | {FIGURES}: 64×64 apart | 64×64, pairs 2 σ apart | 20×20 |\n|---|---|---|---|---|"
     ));
@@ -30,7 +30,7 @@ pub fn uncalibrated(frames: u64, seed: u64, only: &[String], say: Say) -> Measur
         let cells = [(64, Layout::Apart), (64, Layout::Pairs), (20, Layout::Apart)].map(|(pixels, layout)| {
             let mut bench = Bench::new(lens, pixels, snr, seed);
             let camera = bench.camera.clone();
-            measure(&mut bench, layout, &camera, frames)
+            measure(&mut bench, layout, &camera, estimator, frames)
         });
         holds &= 100.0 * cells[0].invented as f64 <= MOST_INVENTED * cells[0].spots as f64;
         let cells = cells.map(Tally::cell);
@@ -43,7 +43,7 @@ pub fn uncalibrated(frames: u64, seed: u64, only: &[String], say: Say) -> Measur
 }
 
 /// The same with a calibration that was learned from other frames of the lens, whose positions it was not told.
-pub fn calibrated(frames: u64, seed: u64, only: &[String], say: Say) -> Measured {
+pub fn calibrated(frames: u64, seed: u64, only: &[String], estimator: &estimate::Config, say: Say) -> Measured {
     say(&format!(
         "| lens | SNR | 64×64: learned | {FIGURES}: apart | pairs 2 σ apart | 20×20: learned | apart |\n|---|---|---|---|---|---|---|"
     ));
@@ -54,7 +54,7 @@ pub fn calibrated(frames: u64, seed: u64, only: &[String], say: Say) -> Measured
             let (camera, learned) = calibrate(&mut bench);
             cells.push(learned);
             for layout in layouts {
-                let tally = measure(&mut bench, *layout, &camera, frames);
+                let tally = measure(&mut bench, *layout, &camera, estimator, frames);
                 let tally = match lens.is_uniform {
                     true => tally,
                     false => tally.without_distortion(),
@@ -107,9 +107,9 @@ fn calibrate(bench: &mut Bench) -> (Camera, String) {
     }
 }
 
-/// What `ml` makes of so many frames as `camera` describes them.
-fn measure(bench: &mut Bench, layout: Layout, camera: &Camera, frames: u64) -> Tally {
-    let mut estimator = estimate::build(&estimate::Config::default(), camera).expect("an estimator");
+/// What the estimator makes of so many frames as `camera` describes them.
+fn measure(bench: &mut Bench, layout: Layout, camera: &Camera, estimator: &estimate::Config, frames: u64) -> Tally {
+    let mut estimator = estimate::build(estimator, camera).expect("an estimator");
     let mut tally = Tally::default();
     for index in 0..frames {
         let (frame, spots) = bench.frame(index, layout);
