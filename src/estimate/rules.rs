@@ -80,6 +80,9 @@ rules! {
     /// A frame that round spots do not explain is searched with the ellipse that most recent frames showed. Needed where spots overlap through
     /// a lens with astigmatism (`oapwatch study lens`).
     remember_ellipse,
+    /// What the bright spots of recent frames have in common, too faint for a single frame, is taken for the lens's. Needed where a faint ghost
+    /// stands beside every user (`oapwatch study lens-alerts --only ghost`).
+    stack_misfits,
     /// A rotated elliptical PSF is tried in the place of more sources. Needed with the condition `ellipse`.
     rotated_ellipse,
     /// Sources that do not exceed the misfit around them are removed. No cell of the trade-off needs it; the scene `hazy-noon` does: without

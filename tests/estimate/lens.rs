@@ -4,7 +4,7 @@
 use std::sync::Arc;
 
 use ndarray::Array2;
-use oapwatch::estimate::{Emitter, Estimate, position_bound};
+use oapwatch::estimate::{Emitter, position_bound};
 use oapwatch::frame::Frame;
 use oapwatch::optics::spot::{Field, SpotShape, Template};
 use oapwatch::optics::{self, Camera, Smear, add_spot};
@@ -15,13 +15,13 @@ use rand_distr::{Distribution, Normal};
 use crate::frames::{estimator, frame, places};
 
 const ENERGY_J: f64 = 7e-3;
-const SIGMA_M: f64 = 1e-3;
+pub const SIGMA_M: f64 = 1e-3;
 /// Places on the sensor, m.
 const INNER: [[f64; 2]; 5] = [[-9e-3, -8e-3], [8e-3, -9e-3], [0.0, 0.0], [4e-3, 2e-3], [-8e-3, 9e-3]];
 /// Moments of an exposure: the midpoint rule of smears of 3 σ is then exact to 10⁻⁴ of the peak, a tenth of the noise.
 const MOMENTS: usize = 60;
 
-fn camera() -> Camera {
+pub fn camera() -> Camera {
     let config = optics::Config {
         spot_sigma_m: Some(SIGMA_M),
         ..Default::default()
@@ -37,7 +37,7 @@ fn moffat(sigma_m: f64) -> impl Fn(f64, f64) -> f64 {
 }
 
 /// Spots of any density at places on the sensor, m, each with a peak of `snr` standard deviations of the noise.
-fn render_density(
+pub fn render_density(
     camera: &Camera,
     density: &dyn Fn(f64, f64) -> f64,
     spots: &[([f64; 2], f64)],
@@ -60,7 +60,7 @@ fn render_density(
     pixels
 }
 
-const FIVE: [[f64; 2]; 5] = [
+pub const FIVE: [[f64; 2]; 5] = [
     [-9.1e-3, 8.3e-3],
     [8.7e-3, 9.2e-3],
     [0.4e-3, -0.7e-3],
@@ -140,75 +140,6 @@ fn satellites_outwards_of_the_outer_spots_are_the_lens_s() {
         let estimate = estimator(None, &camera).estimate(&frame).unwrap();
         assert_eq!(estimate.emitters.len(), count, "{turn}: {:?}", places(&estimate));
     }
-}
-
-/// A round spot, and its reflection of 2 % beside it.
-fn ghost(x: f64, y: f64) -> f64 {
-    let spot = |x: f64, y: f64| (-0.5 * (x * x + y * y) / (SIGMA_M * SIGMA_M)).exp();
-    spot(x, y) + 0.02 * spot(x - 4.3e-3, y + 2.9e-3)
-}
-
-/// A round spot that astigmatism of 45° has made 40 % longer than wide.
-fn elongated(x: f64, y: f64) -> f64 {
-    let [a, b] = [x + y, x - y].map(|d| d / (2f64.sqrt() * SIGMA_M));
-    (-0.5 * ((a / 1.19).powi(2) + (b / 0.85).powi(2))).exp()
-}
-
-#[test]
-fn spots_apart_teach_the_widths_of_those_that_overlap() {
-    let camera = camera();
-    let mut rng = ChaCha8Rng::seed_from_u64(30);
-    let draw = |spots: &[([f64; 2], f64)], rng: &mut ChaCha8Rng| frame(render_density(&camera, &elongated, spots, rng));
-    let mut experienced = estimator(None, &camera);
-    let apart = draw(&FIVE.map(|at| (at, 1000.0)), &mut rng);
-    assert_eq!(experienced.estimate(&apart).unwrap().emitters.len(), 5);
-    let (mut alone, mut told, frames) = (0, 0, 6);
-    for _ in 0..frames {
-        let pairs = [FIVE[0], FIVE[1], FIVE[3]].map(|at| {
-            let (sin, cos) = rng.random_range(0.0..std::f64::consts::PI).sin_cos();
-            [-1e-3, 1e-3].map(|d| (([at[0] + d * cos, at[1] + d * sin]), 1000.0))
-        });
-        let frame = draw(pairs.as_flattened(), &mut rng);
-        let is_right = |estimate: Estimate| u32::from(estimate.emitters.len() == 6);
-        alone += is_right(estimator(None, &camera).estimate(&frame).unwrap());
-        told += is_right(experienced.estimate(&frame).unwrap());
-    }
-    assert!(told == frames && alone < frames / 2, "{told} and {alone} of {frames}");
-}
-
-#[test]
-fn frames_of_many_spots_teach_the_lens_that_a_frame_of_two_hides() {
-    let camera = camera();
-    let mut rng = ChaCha8Rng::seed_from_u64(27);
-    let mut draw = |places: &[[f64; 2]]| {
-        let spots: Vec<_> = places.iter().map(|at| (*at, 300.0)).collect();
-        frame(render_density(&camera, &ghost, &spots, &mut rng))
-    };
-    let (many, two) = (draw(&FIVE), draw(&FIVE[..2]));
-    let alone = estimator(None, &camera).estimate(&two).unwrap();
-    assert_eq!(alone.emitters.len(), 4, "two spots and their ghosts may be four users");
-    let mut experienced = estimator(None, &camera);
-    assert_eq!(experienced.estimate(&many).unwrap().emitters.len(), 5);
-    let estimate = experienced.estimate(&two).unwrap();
-    assert_eq!(estimate.emitters.len(), 2, "{:?}", places(&estimate));
-    assert!(estimate.spot_error > 0.0);
-}
-
-#[test]
-fn a_lens_that_most_frames_do_not_show_hides_no_user() {
-    let camera = camera();
-    let mut rng = ChaCha8Rng::seed_from_u64(28);
-    let mut ml = estimator(None, &camera);
-    let lens = frame(render_density(&camera, &ghost, &FIVE.map(|at| (at, 300.0)), &mut rng));
-    assert!(ml.estimate(&lens).unwrap().spot_error > 0.0);
-    let gaussian = |x: f64, y: f64| (-0.5 * (x * x + y * y) / (SIGMA_M * SIGMA_M)).exp();
-    let mut spots: Vec<_> = FIVE.map(|at| (at, 300.0)).into();
-    spots.push((FIVE[2].map(|v| v + 3e-3), 5.0));
-    let stranger = frame(render_density(&camera, &gaussian, &spots, &mut rng));
-    ml.estimate(&stranger).unwrap();
-    let estimate = ml.estimate(&stranger).unwrap();
-    assert_eq!(estimate.emitters.len(), 6, "{:?}", places(&estimate));
-    assert_eq!(estimate.spot_error, 0.0);
 }
 
 #[test]

@@ -3,6 +3,7 @@
 mod bound;
 mod frames;
 mod lens;
+mod lens_memory;
 mod moving;
 mod sequence;
 mod windows;

@@ -135,6 +135,28 @@ impl MatchedFilter {
         }
     }
 
+    /// Subtracts from each response what stands on its sides at this distance, σ, as far as they are on the grid, and leaves it as uncertain
+    /// as it was. What is smooth over the sensor vanishes. NaN where there are none.
+    pub fn subtract_sides(&mut self, distance: f64) {
+        let [nx, ny] = self.grid.each_ref().map(Vec::len);
+        let [dx, dy] = self
+            .grid
+            .each_ref()
+            .map(|grid| (distance / (grid[1] - grid[0])).round() as usize);
+        let map = std::mem::take(&mut self.map);
+        let at = |i: usize, j: usize| map[j * nx + i];
+        self.map = (0..ny)
+            .flat_map(|j| (0..nx).map(move |i| (i, j)))
+            .map(|(i, j)| {
+                let along_x = (i >= dx && i + dx < nx).then(|| at(i - dx, j) + at(i + dx, j));
+                let along_y = (j >= dy && j + dy < ny).then(|| at(i, j - dy) + at(i, j + dy));
+                let count = 2.0 * [along_x, along_y].iter().flatten().count() as f64;
+                let sides = along_x.unwrap_or(0.0) + along_y.unwrap_or(0.0);
+                (at(i, j) - sides / count) / (1.0 + 1.0 / count).sqrt()
+            })
+            .collect();
+    }
+
     /// Response at a position, σ, by bilinear interpolation of the map; `None` outside the grid.
     pub fn response_at(&self, u: [f64; 2]) -> Option<f64> {
         let mut cell = [(0, 0.0); 2];

@@ -145,6 +145,14 @@ impl FrameSearch {
 
     /// The emitters of the frame.
     pub fn run(&mut self, budgets: &mut Budgets) -> Found {
+        let found = self.find_as_usual(budgets);
+        if self.rules.stack_misfits {
+            self.stack_misfit(&found.hypothesis, budgets);
+        }
+        found
+    }
+
+    fn find_as_usual(&mut self, budgets: &mut Budgets) -> Found {
         if let Some(found) = self.find_with_usual_ellipse(budgets) {
             return found;
         }

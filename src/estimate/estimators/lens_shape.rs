@@ -2,6 +2,8 @@
 
 use crate::estimate::estimators::budgets::Budgets;
 use crate::estimate::estimators::frame_search::{Found, FrameSearch, SearchKind};
+use crate::estimate::model::hypothesis::Hypothesis;
+use crate::estimate::model_order::bright_spots::bright_spots;
 use crate::estimate::model_order::candidate::Candidate;
 use crate::estimate::model_order::initialise::initial_hypothesis;
 use crate::estimate::model_order::nuisance_selection::{EARLY_ROUNDS, ROTATED_ELLIPSE, ROUNDS};
@@ -116,6 +118,24 @@ impl FrameSearch {
             load_weighted(space, compressed, &self.frame, error, sources);
             *found = remembered;
         }
+    }
+
+    /// Adds what the frame's bright spots leave to what recent frames left.
+    pub fn stack_misfit(&mut self, hypothesis: &Hypothesis, budgets: &mut Budgets) {
+        let Some(history) = self.history.as_mut().filter(|_| !hypothesis.sources.is_empty()) else {
+            return;
+        };
+        if !history.stacked.is_due() || budgets.search.is_exhausted() {
+            return;
+        }
+        let mut search = self.space.search(&self.compressed, &self.frame, &mut budgets.search);
+        let mut candidate = Candidate::from(Hypothesis {
+            sources: bright_spots(hypothesis, false),
+            converged: false,
+            ..hypothesis.clone()
+        });
+        search.fit_trial(&mut candidate);
+        history.stacked.add(&mut search, &mut candidate);
     }
 
     /// Remembers the spot error that the frame shows. Where emitters explain the frame and a lens does as well, the frames decide.

@@ -23,3 +23,4 @@ pub mod search;
 pub mod spot_error;
 pub mod spot_error_history;
 pub mod spot_views;
+pub mod stacked_misfit;

@@ -2,6 +2,8 @@
 
 use std::collections::VecDeque;
 
+use crate::estimate::model_order::stacked_misfit::StackedMisfit;
+
 /// Frames that are remembered. Over so many a glint on water, which passes for a lens's halo while it lasts, shows a spot error in at most 22 %
 /// of the frames (`config/scenes/hazy-noon.toml`; 41 % over 32 frames), and crowds of Gaussian spots in 5 % (`dense-crowd.toml`).
 const FRAMES: usize = 128;
@@ -9,6 +11,7 @@ const FRAMES: usize = 128;
 /// The spot errors of a stream's last frames with light; 0 where a frame shows none.
 #[derive(Default)]
 pub(crate) struct SpotErrorHistory {
+    pub stacked: StackedMisfit,
     recent: VecDeque<f64>,
 }
 
@@ -20,8 +23,14 @@ impl SpotErrorHistory {
         self.recent.push_back(shown);
     }
 
-    /// The lens's spot error where more than half of the frames show one: their median.
+    /// The lens's spot error, of each frame or of all together.
     pub fn spot_error(&self) -> Option<f64> {
+        let errors = [self.usual(), self.stacked.spot_error()];
+        errors.into_iter().flatten().reduce(f64::max)
+    }
+
+    /// Where more than half of the frames show one: their median.
+    fn usual(&self) -> Option<f64> {
         let count = self.recent.len();
         let mut sorted = [0.0; FRAMES];
         for (out, error) in sorted.iter_mut().zip(&self.recent) {

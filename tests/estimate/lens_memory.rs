@@ -1,0 +1,110 @@
+//! Lenses whose spots differ from the PSF, as frame after frame shows them.
+
+use oapwatch::estimate::{Config, Estimate, Rules, build};
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+use crate::frames::{estimator, frame, places};
+use crate::lens::{FIVE, SIGMA_M, camera, render_density};
+
+/// A round spot, and its reflection of 2 % beside it.
+fn ghost(x: f64, y: f64) -> f64 {
+    let spot = |x: f64, y: f64| (-0.5 * (x * x + y * y) / (SIGMA_M * SIGMA_M)).exp();
+    spot(x, y) + 0.02 * spot(x - 4.3e-3, y + 2.9e-3)
+}
+
+/// A round spot that astigmatism of 45° has made 40 % longer than wide.
+fn elongated(x: f64, y: f64) -> f64 {
+    let [a, b] = [x + y, x - y].map(|d| d / (2f64.sqrt() * SIGMA_M));
+    (-0.5 * ((a / 1.19).powi(2) + (b / 0.85).powi(2))).exp()
+}
+
+#[test]
+fn spots_apart_teach_the_widths_of_those_that_overlap() {
+    let camera = camera();
+    let mut rng = ChaCha8Rng::seed_from_u64(30);
+    let draw = |spots: &[([f64; 2], f64)], rng: &mut ChaCha8Rng| frame(render_density(&camera, &elongated, spots, rng));
+    let mut experienced = estimator(None, &camera);
+    let apart = draw(&FIVE.map(|at| (at, 1000.0)), &mut rng);
+    assert_eq!(experienced.estimate(&apart).unwrap().emitters.len(), 5);
+    let (mut alone, mut told, frames) = (0, 0, 6);
+    for _ in 0..frames {
+        let pairs = [FIVE[0], FIVE[1], FIVE[3]].map(|at| {
+            let (sin, cos) = rng.random_range(0.0..std::f64::consts::PI).sin_cos();
+            [-1e-3, 1e-3].map(|d| (([at[0] + d * cos, at[1] + d * sin]), 1000.0))
+        });
+        let frame = draw(pairs.as_flattened(), &mut rng);
+        let is_right = |estimate: Estimate| u32::from(estimate.emitters.len() == 6);
+        alone += is_right(estimator(None, &camera).estimate(&frame).unwrap());
+        told += is_right(experienced.estimate(&frame).unwrap());
+    }
+    assert!(told == frames && alone < frames / 2, "{told} and {alone} of {frames}");
+}
+
+#[test]
+fn frames_of_many_spots_teach_the_lens_that_a_frame_of_two_hides() {
+    let camera = camera();
+    let mut rng = ChaCha8Rng::seed_from_u64(27);
+    let mut draw = |places: &[[f64; 2]]| {
+        let spots: Vec<_> = places.iter().map(|at| (*at, 300.0)).collect();
+        frame(render_density(&camera, &ghost, &spots, &mut rng))
+    };
+    let (many, two) = (draw(&FIVE), draw(&FIVE[..2]));
+    let alone = estimator(None, &camera).estimate(&two).unwrap();
+    assert_eq!(alone.emitters.len(), 4, "two spots and their ghosts may be four users");
+    let mut experienced = estimator(None, &camera);
+    assert_eq!(experienced.estimate(&many).unwrap().emitters.len(), 5);
+    let estimate = experienced.estimate(&two).unwrap();
+    assert_eq!(estimate.emitters.len(), 2, "{:?}", places(&estimate));
+    assert!(estimate.spot_error > 0.0);
+}
+
+#[test]
+fn a_lens_that_most_frames_do_not_show_hides_no_user() {
+    let camera = camera();
+    let mut rng = ChaCha8Rng::seed_from_u64(28);
+    let mut ml = estimator(None, &camera);
+    let lens = frame(render_density(&camera, &ghost, &FIVE.map(|at| (at, 300.0)), &mut rng));
+    assert!(ml.estimate(&lens).unwrap().spot_error > 0.0);
+    let gaussian = |x: f64, y: f64| (-0.5 * (x * x + y * y) / (SIGMA_M * SIGMA_M)).exp();
+    let mut spots: Vec<_> = FIVE.map(|at| (at, 300.0)).into();
+    spots.push((FIVE[2].map(|v| v + 3e-3), 5.0));
+    let stranger = frame(render_density(&camera, &gaussian, &spots, &mut rng));
+    ml.estimate(&stranger).unwrap();
+    let estimate = ml.estimate(&stranger).unwrap();
+    assert_eq!(estimate.emitters.len(), 6, "{:?}", places(&estimate));
+    assert_eq!(estimate.spot_error, 0.0);
+}
+
+/// The numbers of emitters of the later half of so many frames through `spot`, in turns.
+fn later_numbers(rules: Rules, spot: &dyn Fn(f64, f64) -> f64, spots: &[([f64; 2], f64)]) -> Vec<usize> {
+    let camera = camera();
+    let config = Config {
+        rules,
+        ..Default::default()
+    };
+    let mut ml = build(&config, &camera).unwrap();
+    let mut rng = ChaCha8Rng::seed_from_u64(31);
+    let mut count = |_| {
+        let frame = frame(render_density(&camera, &spot, spots, &mut rng));
+        ml.estimate(&frame).unwrap().emitters.len()
+    };
+    (0..200).map(&mut count).skip(100).collect()
+}
+
+#[test]
+fn what_is_too_faint_for_a_frame_is_the_lens_s_where_all_frames_show_it() {
+    let mut spots: Vec<_> = FIVE.map(|at| (at, 40.0)).into();
+    let right = |numbers: &[usize]| numbers.iter().filter(|n| **n == 5).count();
+    let without = Rules::without("stack_misfits").unwrap();
+    let alone = right(&later_numbers(without, &ghost, &spots));
+    let together = right(&later_numbers(Rules::default(), &ghost, &spots));
+    assert!(alone < 90 && together == 100, "{alone} and {together} of 100");
+    spots.push(([FIVE[2][0] + 4.3e-3, FIVE[2][1] - 2.9e-3], 4.0));
+    let gaussian = |x: f64, y: f64| (-0.5 * (x * x + y * y) / (SIGMA_M * SIGMA_M)).exp();
+    let with_stranger = later_numbers(Rules::default(), &gaussian, &spots);
+    assert!(
+        with_stranger.iter().all(|n| *n >= 6),
+        "a stranger beside one user is none of the lens's"
+    );
+}
