@@ -43,7 +43,7 @@ pub(crate) fn offsets(spacing: f64) -> impl Iterator<Item = [f64; 2]> {
 pub(crate) struct View<'a> {
     pub spot: &'a PointSource,
     /// The direction that offsets are taken along.
-    pub direction: [f64; 2],
+    direction: [f64; 2],
     /// How strong the common misfit is here, of the strongest.
     pub growth: f64,
 }
