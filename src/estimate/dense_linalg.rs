@@ -75,6 +75,42 @@ pub(crate) fn weighted_dot(w: &[f64], a: &[f64], b: &[f64]) -> f64 {
     sum_lanes(lanes)
 }
 
+/// Adds the products of numbers, whose count is a multiple of four, to sixteen sums.
+#[inline(always)]
+pub(crate) fn add_products<const N: usize>(factors: [&[f64]; N], sums: &mut [[f64; 4]; 4]) {
+    let count = factors[0].len();
+    let mut rows = factors;
+    for k in 0..N {
+        rows[k] = &factors[k][..count];
+    }
+    let mut first = 0;
+    while first + 16 <= count {
+        for c in 0..4 {
+            add_four(rows, first + 4 * c, &mut sums[c]);
+        }
+        first += 16;
+    }
+    for c in 0..4 {
+        if first + 4 * c < count {
+            add_four(rows, first + 4 * c, &mut sums[c]);
+        }
+    }
+}
+
+#[inline(always)]
+fn add_four<const N: usize>(rows: [&[f64]; N], first: usize, sums: &mut [f64; 4]) {
+    let mut products = [1.0; 4];
+    for row in rows {
+        let row = &row[first..first + 4];
+        for l in 0..4 {
+            products[l] *= row[l];
+        }
+    }
+    for l in 0..4 {
+        sums[l] += products[l];
+    }
+}
+
 /// y += s x.
 #[inline(always)]
 pub(crate) fn axpy(s: f64, x: &[f64], y: &mut [f64]) {
@@ -112,8 +148,14 @@ pub(crate) fn combine<const K: usize>(
 ) {
     let count = weights[0].len().div_ceil(step);
     let mut x = 0;
+    // An addition takes several clock cycles: eight vectors of sums keep the adders busy.
     while x < width {
-        x = if width - x >= 8 {
+        let left = width - x;
+        x = if K == 1 && left >= 32 {
+            columns::<K, 32>(weights, step, count, rows, stride, width, x, out)
+        } else if K <= 2 && left >= 16 {
+            columns::<K, 16>(weights, step, count, rows, stride, width, x, out)
+        } else if left >= 8 {
             columns::<K, 8>(weights, step, count, rows, stride, width, x, out)
         } else {
             columns::<K, 4>(weights, step, count, rows, stride, width, x, out)

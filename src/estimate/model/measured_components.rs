@@ -8,8 +8,9 @@
 
 use std::sync::Arc;
 
-use crate::estimate::dense_linalg::{axpy, combine, dot, weighted_dot};
+use crate::estimate::dense_linalg::{add_products, axpy, combine};
 use crate::estimate::model::measured_terms::{MeasuredTerms, Part, Span, size};
+use crate::estimate::model::patch_pool::{Patch, PatchPool, Place};
 use crate::estimate::model::svd_basis::Basis;
 use crate::optics::spot::SpotShape;
 
@@ -46,21 +47,13 @@ const fn array(a: usize, b: usize) -> usize {
 /// An array that covers the core alone.
 const ARRAY_OF_CORE: usize = EACH;
 
-/// Where a component's arrays are: (rows, arrays, columns) of the whole, then of the core.
-struct Patch {
-    spans: [Span; 2],
-    starts: [usize; 2],
-    arrays: [usize; 2],
-}
-
-/// Patches in the order they were pushed.
+/// Components in the order they were pushed.
 #[derive(Default)]
 pub(crate) struct MeasuredComponents {
     mx: usize,
-    patches: Vec<Patch>,
-    /// As long as it ever was; beyond `used` it holds what was there before.
-    values: Vec<f64>,
-    used: usize,
+    pool: PatchPool,
+    /// The patch of each.
+    patches: Vec<usize>,
     terms: MeasuredTerms,
     parts: Vec<Part>,
 }
@@ -100,7 +93,7 @@ impl MeasuredComponents {
     pub fn clear(&mut self, mx: usize) {
         self.mx = mx;
         self.patches.clear();
-        self.used = 0;
+        self.pool.begin_model();
     }
 
     /// A spot of unit energy at `u`, σ, smeared over `displacement`, σ: by its parts and the shares of the light.
@@ -120,7 +113,19 @@ impl MeasuredComponents {
                 MeasuredShape::span(axes[1], u[1], reach(1)),
             ]
         });
-        self.start_patch(spans, [EACH; 2]);
+        let place = Place {
+            u,
+            displacement,
+            parts: parts.to_vec(),
+            origin_m: shape.origin_m,
+            spans,
+        };
+        if let Some(index) = self.pool.find(&place) {
+            self.patches.push(index);
+            return;
+        }
+        let (index, values) = self.pool.add(Some(place), spans, [EACH; 2]);
+        self.patches.push(index);
         let [whole, core] = spans;
         let ([columns, rows], [core_columns, core_rows]) = (size(whole), size(core));
         if columns * rows == 0 {
@@ -138,11 +143,9 @@ impl MeasuredComponents {
         let n = terms.count;
         let reach = if terms.is_uniform { n } else { 2 * n };
         let [of_f2, of_f1, of_f] = [0, 1, 2].map(|k| k * n * columns);
-        let Patch { starts, .. } = self.patches[self.patches.len() - 1];
-        let (first, second) = self.values.split_at_mut(starts[1]);
+        let (first, second) = values.split_at_mut(EACH * columns * rows);
         let x = &terms.along_x;
-        for row in 0..rows {
-            let out = &mut first[starts[0] + row * EACH * columns..starts[0] + (row + 1) * EACH * columns];
+        for (row, out) in first.chunks_exact_mut(EACH * columns).enumerate() {
             let (value_and_y, along_x) = out.split_at_mut(2 * columns);
             let factors = [&terms.value[row..n * rows], &terms.slope[row..n * rows]];
             combine(factors, rows, &x[of_f..], columns, columns, value_and_y);
@@ -188,33 +191,24 @@ impl MeasuredComponents {
     pub fn push_profiles(&mut self, axes: [&Basis; 2], profiles: [&[f64]; 2]) {
         let [nx, ny] = axes.map(|b| b.n);
         let columns = nx.next_multiple_of(4);
-        self.start_patch([[[0, columns], [0, ny]]; 2], [1, 0]);
-        let start = self.used - columns * ny;
-        let rows = self.values[start..self.used].chunks_exact_mut(columns);
+        let (index, values) = self.pool.add(None, [[[0, columns], [0, ny]]; 2], [1, 0]);
+        self.patches.push(index);
+        let rows = values.chunks_exact_mut(columns);
         for (row, y) in rows.zip(&profiles[1][..ny]) {
             row.fill(0.0);
             axpy(*y, &profiles[0][..nx], row);
         }
     }
 
-    /// Makes room for a component of so many arrays over the whole and the core.
-    fn start_patch(&mut self, spans: [Span; 2], arrays: [usize; 2]) {
-        let [whole, core] = [0, 1].map(|k| arrays[k] * size(spans[k]).iter().product::<usize>());
-        let start = self.used;
-        self.patches.push(Patch {
-            spans,
-            starts: [start, start + whole],
-            arrays,
-        });
-        self.used = start + whole + core;
-        if self.values.len() < self.used {
-            self.values.resize(self.used, 0.0);
-        }
+    #[inline(always)]
+    fn patch(&self, i: usize) -> &Patch {
+        self.pool.get(self.patches[i])
     }
 
     /// Numbers in all patches together.
     pub fn footprint(&self) -> f64 {
-        self.used as f64
+        let lengths = (0..self.patches.len()).map(|i| self.patch(i).lengths().iter().sum::<usize>());
+        lengths.sum::<usize>() as f64
     }
 
     /// Numbers that a step multiplies in pairs of components.
@@ -236,7 +230,7 @@ impl MeasuredComponents {
     /// What an array of component `i` covers: nothing where it has none.
     #[inline(always)]
     fn span(&self, i: usize, array: usize) -> Span {
-        let patch = &self.patches[i];
+        let patch = self.patch(i);
         let part = array / EACH;
         if array % EACH < patch.arrays[part] {
             patch.spans[part]
@@ -248,11 +242,12 @@ impl MeasuredComponents {
     /// Columns of an array of component `i` in row `y`, both within its span.
     #[inline(always)]
     fn row(&self, i: usize, array: usize, y: usize, [x0, x1]: [usize; 2]) -> &[f64] {
-        let patch = &self.patches[i];
+        let patch = self.patch(i);
         let part = array / EACH;
         let [[first, last], [top, _]] = patch.spans[part];
-        let start = patch.starts[part] + ((y - top) * patch.arrays[part] + array % EACH) * (last - first);
-        &self.values[start + x0 - first..start + x1 - first]
+        let before = if part == 0 { 0 } else { patch.lengths()[0] };
+        let start = before + ((y - top) * patch.arrays[part] + array % EACH) * (last - first);
+        &patch.values[start + x0 - first..start + x1 - first]
     }
 
     /// Adds `scale` times the derivative of orders `a` and `b` along x and y of component `i` to a matrix (my, mx).
@@ -272,12 +267,12 @@ impl MeasuredComponents {
         for k in 0..N {
             let of = array(derivatives[k][0], derivatives[k][1]);
             let [[x0, x1], [y0, y1]] = self.span(i, of);
+            let mut sums = [[0.0; 4]; 4];
             for y in y0..y1 {
-                sum[k] += dot(
-                    self.row(i, of, y, [x0, x1]),
-                    &matrix[y * self.mx + x0..y * self.mx + x1],
-                );
+                let row = self.row(i, of, y, [x0, x1]);
+                add_products([row, &matrix[y * self.mx + x0..y * self.mx + x1]], &mut sums);
             }
+            sum[k] = sums.as_flattened().iter().sum();
         }
         sum
     }
@@ -287,16 +282,16 @@ impl MeasuredComponents {
     pub fn inner_product(&self, i: usize, a: [usize; 2], j: usize, b: [usize; 2], weights: &[f64]) -> f64 {
         let (a, b) = (array(a[0], a[1]), array(b[0], b[1]));
         let [[x0, x1], [y0, y1]] = overlap(self.span(i, a), self.span(j, b));
-        let mut sum = 0.0;
+        let mut sums = [[0.0; 4]; 4];
         for y in y0..y1 {
             let (p, q) = (self.row(i, a, y, [x0, x1]), self.row(j, b, y, [x0, x1]));
-            sum += if weights.is_empty() {
-                dot(p, q)
+            if weights.is_empty() {
+                add_products([p, q], &mut sums);
             } else {
-                weighted_dot(&weights[y * self.mx + x0..y * self.mx + x1], p, q)
-            };
+                add_products([&weights[y * self.mx + x0..y * self.mx + x1], p, q], &mut sums);
+            }
         }
-        sum
+        sums.as_flattened().iter().sum()
     }
 
     /// Inner products of (f_x, f_y, f) of component `i` with those of component `j`, 3 × 3 row-major: of two sources, over their cores.
@@ -304,7 +299,7 @@ impl MeasuredComponents {
     pub fn gram_block(&self, i: usize, j: usize, weights: &[f64]) -> [f64; 9] {
         const ORDERS: [[usize; 2]; 3] = [[1, 0], [0, 1], [0, 0]];
         let mut out = [0.0; 9];
-        let has_cores = self.patches[i].arrays[1] > 0 && self.patches[j].arrays[1] > 0;
+        let has_cores = self.patch(i).arrays[1] > 0 && self.patch(j).arrays[1] > 0;
         if !has_cores || weights.is_empty() {
             for r in 0..3 {
                 for c in 0..3 {

@@ -8,6 +8,7 @@ pub mod measured_components;
 #[cfg(test)]
 mod measured_components_test;
 pub mod measured_terms;
+mod patch_pool;
 pub mod psf_table;
 pub mod separable_model;
 pub mod separable_terms;

@@ -40,16 +40,34 @@ impl FieldPolynomial {
         (0..).flat_map(|degree| (0..=degree).map(move |j| (degree - j, j)))
     }
 
-    /// The value and its derivatives by u and v.
-    pub fn value(&self, [u, v]: [f64; 2]) -> (f64, [f64; 2]) {
-        let mut sum = (0.0, [0.0; 2]);
-        for (c, (i, j)) in self.0.iter().zip(Self::powers()) {
-            sum.0 += c * u.powi(i) * v.powi(j);
-            if i > 0 {
-                sum.1[0] += c * f64::from(i) * u.powi(i - 1) * v.powi(j);
+    /// The first `count` of the uⁱ vʲ, at least one, each with its derivatives by u and v.
+    pub fn monomials([u, v]: [f64; 2], count: usize) -> Vec<[f64; 3]> {
+        let mut all = Vec::with_capacity(count + 1);
+        all.push([1.0, 0.0, 0.0]);
+        for degree in 1.. {
+            if all.len() >= count {
+                break;
             }
-            if j > 0 {
-                sum.1[1] += c * f64::from(j) * u.powi(i) * v.powi(j - 1);
+            let below = all.len() - degree;
+            for j in 0..=degree {
+                let [without_u, without_v] =
+                    [(j < degree, j), (j > 0, j.saturating_sub(1))].map(|(has, k)| match has {
+                        true => all[below + k][0],
+                        false => 0.0,
+                    });
+                let value = if j < degree { u * without_u } else { v * without_v };
+                all.push([value, (degree - j) as f64 * without_u, j as f64 * without_v]);
+            }
+        }
+        all
+    }
+
+    /// The value and its derivatives by u and v, from at least as many monomials as there are coefficients.
+    pub fn value(&self, monomials: &[[f64; 3]]) -> [f64; 3] {
+        let mut sum = [0.0; 3];
+        for (c, monomial) in self.0.iter().zip(monomials) {
+            for k in 0..3 {
+                sum[k] += c * monomial[k];
             }
         }
         sum
@@ -76,9 +94,21 @@ mod tests {
     fn a_polynomial_has_its_derivatives_and_its_mean_square() {
         // 1 + 2u − v + 3uv
         let p = FieldPolynomial(vec![1.0, 2.0, -1.0, 0.0, 3.0, 0.0]);
-        let (value, [du, dv]) = p.value([0.5, -0.25]);
-        assert_eq!((value, du, dv), (1.0 + 1.0 + 0.25 - 0.375, 2.0 - 0.75, -1.0 + 1.5));
+        let value = p.value(&FieldPolynomial::monomials([0.5, -0.25], 6));
+        assert_eq!(value, [1.0 + 1.0 + 0.25 - 0.375, 2.0 - 0.75, -1.0 + 1.5]);
         // 1 + 4/3 + 1/3 + 9/9
         assert!((p.rms().powi(2) - (1.0 + 5.0 / 3.0 + 1.0)).abs() < 1e-12);
+    }
+
+    #[test]
+    fn monomials_are_in_the_order_of_the_powers() {
+        let (u, v): (f64, f64) = (0.7, -1.1);
+        let powers = FieldPolynomial::powers();
+        for ([value, du, dv], (i, j)) in FieldPolynomial::monomials([u, v], 28).into_iter().zip(powers) {
+            let of = |i: i32, j: i32| u.powi(i) * v.powi(j);
+            assert!((value - of(i, j)).abs() < 1e-14);
+            assert!((du - f64::from(i) * of(i - 1, j)).abs() < 1e-14);
+            assert!((dv - f64::from(j) * of(i, j - 1)).abs() < 1e-13);
+        }
     }
 }

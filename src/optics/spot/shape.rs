@@ -56,8 +56,10 @@ impl SpotShape {
     /// Of each term in turn: (w, ∂w/∂u, ∂w/∂v) of a spot at a place on the sensor, m; the derivatives in 1/m.
     pub fn weights_at(&self, u_m: f64, v_m: f64) -> impl Iterator<Item = (f64, f64, f64)> {
         let (at, scale) = self.field.at([u_m, v_m]);
+        let most = self.terms.iter().map(|term| term.weight.0.len()).max().unwrap_or(1);
+        let monomials = FieldPolynomial::monomials(at, most);
         self.terms.iter().map(move |term| {
-            let (w, [du, dv]) = term.weight.value(at);
+            let [w, du, dv] = term.weight.value(&monomials);
             (w, du * scale[0], dv * scale[1])
         })
     }
