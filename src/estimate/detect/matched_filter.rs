@@ -25,6 +25,8 @@ pub(crate) struct MatchedFilter {
     grid: [Vec<f64>; 2],
     /// (grid, stride), each row of unit norm over the full basis.
     templates: [Vec<f64>; 2],
+    /// Squares of the templates; empty until pixels have weights.
+    squares: [Vec<f64>; 2],
     norms: [Vec<f64>; 2],
     /// Columns outside which a template is zero.
     spans: [Vec<[usize; 2]>; 2],
@@ -67,6 +69,7 @@ impl MatchedFilter {
         Self {
             grid: [gx, gy],
             templates: [tx, ty],
+            squares: Default::default(),
             norms: [wx, wy],
             spans: [sx, sy],
             strides: [bx.stride, by.stride],
@@ -105,28 +108,35 @@ impl MatchedFilter {
         radius: f64,
     ) -> &[Peak] {
         self.respond(residual, mx, my);
-        self.normalise(weights, mx, my);
+        for (squares, templates) in self.squares.iter_mut().zip(&self.templates) {
+            if squares.is_empty() {
+                squares.extend(templates.iter().map(|v| v * v));
+            }
+        }
+        dispatch!(<'a>
+            matched_filter: &'a mut MatchedFilter = self,
+            weights: &'a [f64] = weights,
+            mx: usize = mx,
+            my: usize = my
+            => (): matched_filter.normalise(weights, mx, my));
         self.find(threshold, radius)
     }
 
     /// Divides the map by the standard deviation of each response under `weights`.
+    #[inline(always)]
     fn normalise(&mut self, weights: &[f64], mx: usize, my: usize) {
         let nx = self.grid[0].len();
-        let squares = self
-            .templates
-            .each_ref()
-            .map(|t| t.iter().map(|v| v * v).collect::<Vec<f64>>());
         self.scale.resize(self.map.len(), 0.0);
         let rows = self.map.chunks_exact_mut(nx).zip(self.scale.chunks_exact_mut(nx));
         for (j, (out, scale)) in rows.enumerate() {
-            let row = &squares[1][j * self.strides[1]..(j + 1) * self.strides[1]];
+            let row = &self.squares[1][j * self.strides[1]..(j + 1) * self.strides[1]];
             let [lo, hi] = self.spans[1][j];
             self.strip.fill(0.0);
             for c in lo..hi.min(my) {
                 axpy(row[c], &weights[c * mx..(c + 1) * mx], &mut self.strip);
             }
             for (i, (o, s)) in out.iter_mut().zip(scale).enumerate() {
-                let column = &squares[0][i * self.strides[0]..(i + 1) * self.strides[0]];
+                let column = &self.squares[0][i * self.strides[0]..(i + 1) * self.strides[0]];
                 let [lo, hi] = self.spans[0][i];
                 let variance = dot(&self.strip[lo..hi.min(mx)], &column[lo..hi.min(mx)]);
                 *s = if variance > 0.0 { 1.0 / variance.sqrt() } else { 0.0 };

@@ -19,6 +19,8 @@ const SMEAR_LOSS: f64 = 0.1;
 const MAX_SOURCES: usize = 80;
 /// Excess of the deviance up to which noise alone explains it. Larger leaves faint sources unfound, smaller searches frames again.
 const MOST_EXCESS: f64 = 2.5;
+/// Variances of which one logarithm is taken: their product stays finite.
+const AT_ONCE: usize = 8;
 
 /// Coefficients of a preprocessed frame and the statistics of the rest of it.
 #[derive(Clone, Default)]
@@ -154,10 +156,16 @@ impl CompressedFrame {
         self.weights.clear();
         self.weights.resize(self.coefficients.len(), 0.0);
         self.log_det = 0.0;
-        for (k, _) in frame.is_masked.iter().enumerate().filter(|(_, bad)| !**bad) {
-            let v = variance(k);
-            self.log_det += v.ln();
-            self.weights[k / nx * self.mx + k % nx] = 1.0 / v;
+        for (y, row) in frame.is_masked.chunks_exact(nx).enumerate() {
+            for first in (0..nx).step_by(AT_ONCE) {
+                let mut product = 1.0;
+                for x in (first..nx.min(first + AT_ONCE)).filter(|x| !row[*x]) {
+                    let v = variance(y * nx + x);
+                    product *= v;
+                    self.weights[y * self.mx + x] = 1.0 / v;
+                }
+                self.log_det += f64::ln(product);
+            }
         }
         self.masked.clear();
         self.update_weighted(axes);

@@ -6,6 +6,7 @@
 //! they are many. The profile falls with the square of the distance: slower than the halo of a Moffat profile of index 2.5 (d⁻⁵) and the
 //! rings of an Airy disc (d⁻³), and slow enough that a ghost reflection at 10 σ is covered.
 
+use crate::estimate::dense_linalg::dispatch;
 use crate::estimate::model::bases::Bases;
 use crate::estimate::model::hypothesis::PointSource;
 use crate::estimate::model::svd_basis::Basis;
@@ -40,6 +41,14 @@ pub(crate) struct Halo {
 
 impl Halo {
     pub fn new(bases: &Bases, sources: &[PointSource]) -> Self {
+        dispatch!(<'a>
+            bases: &'a Bases = bases,
+            sources: &'a [PointSource] = sources
+            => Halo: Halo::over_pixels(bases, sources))
+    }
+
+    #[inline(always)]
+    fn over_pixels(bases: &Bases, sources: &[PointSource]) -> Self {
         let (bx, by) = (&bases.x, &bases.y);
         let norm = spot_norm(bases);
         let centre = |b: &Basis, k: usize| 0.5 * (b.edges[k] + b.edges[k + 1]);

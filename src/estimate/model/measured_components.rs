@@ -294,16 +294,22 @@ impl MeasuredComponents {
         sums.as_flattened().iter().sum()
     }
 
-    /// Inner products of (f_x, f_y, f) of component `i` with those of component `j`, 3 × 3 row-major: of two sources, over their cores.
+    /// Inner products of three derivatives of component `i` with three of component `j`, 3 × 3 row-major: of two sources, over their cores.
     #[inline(always)]
-    pub fn gram_block(&self, i: usize, j: usize, weights: &[f64]) -> [f64; 9] {
-        const ORDERS: [[usize; 2]; 3] = [[1, 0], [0, 1], [0, 0]];
+    pub fn inner_products(
+        &self,
+        i: usize,
+        a: [[usize; 2]; 3],
+        j: usize,
+        b: [[usize; 2]; 3],
+        weights: &[f64],
+    ) -> [f64; 9] {
         let mut out = [0.0; 9];
         let has_cores = self.patch(i).arrays[1] > 0 && self.patch(j).arrays[1] > 0;
         if !has_cores || weights.is_empty() {
             for r in 0..3 {
                 for c in 0..3 {
-                    out[3 * r + c] = self.inner_product(i, ORDERS[r], j, ORDERS[c], weights);
+                    out[3 * r + c] = self.inner_product(i, a[r], j, b[c], weights);
                 }
             }
             return out;
@@ -312,9 +318,8 @@ impl MeasuredComponents {
         for y in y0..y1 {
             let mut rows = [[&[][..]; 3]; 2];
             for k in 0..3 {
-                let of = array(ORDERS[k][0], ORDERS[k][1]);
-                rows[0][k] = self.row(i, of, y, columns);
-                rows[1][k] = self.row(j, of, y, columns);
+                rows[0][k] = self.row(i, array(a[k][0], a[k][1]), y, columns);
+                rows[1][k] = self.row(j, array(b[k][0], b[k][1]), y, columns);
             }
             add_weighted_products(
                 &weights[y * self.mx + columns[0]..y * self.mx + columns[1]],

@@ -85,7 +85,7 @@ fn the_core_holds_all_but_a_thousandth_of_the_products() {
     let weights: Vec<f64> = (0..x.stride * y.n).map(|k| 1.0 + 0.3 * (k as f64).sin()).collect();
     const ORDERS: [[usize; 2]; 3] = [[1, 0], [0, 1], [0, 0]];
     for (i, j) in [(0, 0), (0, 1), (1, 0)] {
-        let block = components.gram_block(i, j, &weights);
+        let block = components.inner_products(i, ORDERS, j, ORDERS, &weights);
         for r in 0..3 {
             for c in 0..3 {
                 let whole = components.inner_product(i, ORDERS[r], j, ORDERS[c], &weights);

@@ -39,6 +39,9 @@ const ONE: [f64; 1] = [1.0];
 /// Orders of the derivatives along x and y that go with a source's energy, x and y.
 pub(crate) const SLOPES: [[usize; 2]; 3] = [[0, 0], [1, 0], [0, 1]];
 
+/// The same in the order of a Gram matrix's blocks.
+const GRAM: [[usize; 2]; 3] = [[1, 0], [0, 1], [0, 0]];
+
 /// Σ share·f(k) over the terms k of component `i`, f an array. A macro, because a closure is not compiled for the instructions that its
 /// caller was dispatched to.
 macro_rules! sum_terms {
@@ -333,6 +336,29 @@ impl SeparableModel {
         sum
     }
 
+    /// Inner products of three derivatives of component `i` with three of component `j`, 3 × 3 row-major.
+    #[inline(always)]
+    pub fn inner_products(
+        &self,
+        i: usize,
+        a: [[usize; 2]; 3],
+        j: usize,
+        b: [[usize; 2]; 3],
+        weights: &[f64],
+        scratch: &mut Vec<f64>,
+    ) -> [f64; 9] {
+        if let Some(m) = &self.measured {
+            return m.inner_products(i, a, j, b, weights);
+        }
+        let mut products = [0.0; 9];
+        for r in 0..3 {
+            for c in 0..3 {
+                products[3 * r + c] = self.inner_product(i, a[r], j, b[c], weights, scratch);
+            }
+        }
+        products
+    }
+
     /// Inner products along x and along y of component `i`'s f, f′ and f″ with component `j`'s f and f′; `None` where they share nothing.
     /// Only of sources that are upright.
     #[inline(always)]
@@ -345,7 +371,7 @@ impl SeparableModel {
     #[inline(always)]
     pub fn gram_block(&self, i: usize, j: usize, weights: &[f64], scratch: &mut Vec<f64>) -> [f64; 9] {
         if let Some(m) = &self.measured {
-            return m.gram_block(i, j, weights);
+            return m.inner_products(i, GRAM, j, GRAM, weights);
         }
         sum_pairs!(self, i, j, |k, l| self.terms.gram_block(k, l, weights, scratch))
     }

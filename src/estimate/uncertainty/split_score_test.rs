@@ -11,7 +11,8 @@ use crate::estimate::uncertainty::covariance::Covariance;
 
 /// Orders and factors of the derivatives for the second moments xx, xy, yy: a source spread by M changes by
 /// ½A(M_xx f_xx + 2 M_xy f_xy + M_yy f_yy).
-const SECOND: [([usize; 2], f64); 3] = [([2, 0], 0.5), ([1, 1], 1.0), ([0, 2], 0.5)];
+const SECOND_ORDERS: [[usize; 2]; 3] = [[2, 0], [1, 1], [0, 2]];
+const SECOND_FACTORS: [f64; 3] = [0.5, 1.0, 0.5];
 /// Directions tested, over half a turn: the best is missed by at most 6°.
 const DIRECTIONS: usize = 16;
 /// Smallest share of a moment's information that must remain after projection off the fitted parameters: less is rounding.
@@ -107,20 +108,17 @@ fn unprojected_score(
     let compressed = problem.compressed;
     let model = &at.evaluation.model;
     let widths = at.equations.widths();
-    let own = SECOND.map(|(_, f)| f * model.amplitude(i));
+    let own = SECOND_FACTORS.map(|f| f * model.amplitude(i));
     let strip = &mut at.scratch.strip;
     let mut information = [[0.0; 3]; 3];
     if compressed.weights.is_empty() && compressed.masked.runs().is_empty() && widths.is_empty() && model.is_upright() {
-        for (r, (second, _)) in SECOND.into_iter().enumerate() {
-            for (c, (other, _)) in SECOND.into_iter().enumerate() {
-                information[r][c] = own[r] * own[c] * model.inner_product(i, second, i, other, &[], strip);
-            }
-        }
+        let products = model.inner_products(i, SECOND_ORDERS, i, SECOND_ORDERS, &[], strip);
+        information = information_of(own, products);
         cross_information(model, i, own, cross);
         let row = &mut at.scratch.vector;
         row.resize(p, 0.0);
         for bad in compressed.masked.scattered() {
-            let values = model.derivatives_at(i, [bad.x, bad.y], SECOND.map(|(second, _)| second));
+            let values = model.derivatives_at(i, [bad.x, bad.y], SECOND_ORDERS);
             if values == [0.0; 3] {
                 continue;
             }
@@ -133,23 +131,19 @@ fn unprojected_score(
             }
         }
     } else if model.is_measured() {
-        for (r, (second, _)) in SECOND.into_iter().enumerate() {
-            for (c, (other, _)) in SECOND.into_iter().enumerate() {
-                information[r][c] =
-                    own[r] * own[c] * model.inner_product(i, second, i, other, &compressed.weights, strip);
-            }
-            let row = &mut cross[r * p..(r + 1) * p];
-            for j in 0..model.components() {
-                let mut products = [0.0; 3];
-                for (k, slope) in SLOPES.into_iter().enumerate() {
-                    products[k] = own[r] * model.inner_product(i, second, j, slope, &compressed.weights, strip);
-                }
-                model.set_jacobian(j, products, row);
+        let weights = &compressed.weights;
+        let products = model.inner_products(i, SECOND_ORDERS, i, SECOND_ORDERS, weights, strip);
+        information = information_of(own, products);
+        for j in 0..model.components() {
+            let products = model.inner_products(i, SECOND_ORDERS, j, SLOPES, weights, strip);
+            for r in 0..3 {
+                let products = [0, 1, 2].map(|c| own[r] * products[3 * r + c]);
+                model.set_jacobian(j, products, &mut cross[r * p..(r + 1) * p]);
             }
         }
     } else {
         let derivative = &mut at.scratch.matrix;
-        for (r, (second, _)) in SECOND.into_iter().enumerate() {
+        for (r, second) in SECOND_ORDERS.into_iter().enumerate() {
             derivative.clear();
             derivative.resize(compressed.mx * compressed.my, 0.0);
             model.accumulate(i, second[0], second[1], own[r], derivative);
@@ -169,6 +163,17 @@ fn unprojected_score(
     ([0, 1, 2].map(|r| own[r] * projected[r]), information)
 }
 
+#[inline(always)]
+fn information_of(own: [f64; 3], products: [f64; 9]) -> [[f64; 3]; 3] {
+    let mut information = [[0.0; 3]; 3];
+    for r in 0..3 {
+        for c in 0..3 {
+            information[r][c] = own[r] * own[c] * products[3 * r + c];
+        }
+    }
+    information
+}
+
 /// Cross information of source `i`'s second moments with all parameters in an unweighted frame, (3, p).
 #[inline(always)]
 fn cross_information(model: &SeparableModel, i: usize, own: [f64; 3], cross: &mut [f64]) {
@@ -177,7 +182,7 @@ fn cross_information(model: &SeparableModel, i: usize, own: [f64; 3], cross: &mu
         let Some([x, y]) = model.axis_inner_products(i, j) else {
             continue;
         };
-        for (r, (second, _)) in SECOND.into_iter().enumerate() {
+        for (r, second) in SECOND_ORDERS.into_iter().enumerate() {
             let along = |first: [usize; 2]| own[r] * x[second[0]][first[0]] * y[second[1]][first[1]];
             if j >= n {
                 cross[r * p + 2 * n + j] = along([0, 0]);
