@@ -1,13 +1,8 @@
 //! The matched filter on a fine grid and its maxima: non-maximum suppression, sub-grid peaks.
 
-use crate::estimate::dense_linalg::{axpy, dispatch, dot};
+use crate::estimate::dense_linalg::dispatch;
+use crate::estimate::detect::templates::Templates;
 use crate::estimate::model::svd_basis::Basis;
-
-/// Grid spacing, σ: a spot half-way between grid points loses 3 % of its response. Half the spacing has four times the points.
-const SPACING: f64 = 0.5;
-
-/// Half-width of a template, σ: the rest holds 1e-5 of a spot's square.
-const REACH: f64 = 3.0;
 
 /// A maximum of the response.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -22,60 +17,27 @@ pub(crate) struct Peak {
 
 /// The matched filter: unit-norm spots on a grid, in the bases.
 pub(crate) struct MatchedFilter {
-    grid: [Vec<f64>; 2],
-    /// (grid, stride), each row of unit norm over the full basis.
-    templates: [Vec<f64>; 2],
-    /// Squares of the templates; empty until pixels have weights.
-    squares: [Vec<f64>; 2],
-    norms: [Vec<f64>; 2],
-    /// Columns outside which a template is zero.
-    spans: [Vec<[usize; 2]>; 2],
-    strides: [usize; 2],
+    templates: [Templates; 2],
+    /// Where pixels have weights.
+    squares: Option<[Templates; 2]>,
     /// Response over its standard deviation, (grid y, grid x).
     map: Vec<f64>,
     /// Factor on each response that made its standard deviation one; empty where all pixels have the same weight.
     scale: Vec<f64>,
     strip: Vec<f64>,
+    line: Vec<f64>,
     peaks: Vec<Peak>,
 }
 
 impl MatchedFilter {
     pub fn new(bx: &Basis, by: &Basis) -> Self {
-        let axis = |b: &Basis| {
-            // Centres up to half a σ outside; farther out only a fit can place them.
-            // Within a pixel much wider than the spot the response is constant: a grid of σ would only cost memory.
-            let spacing = SPACING.max(0.25 * b.pitch());
-            let (lo, hi) = (b.edges[0] - spacing, b.edges[b.n] + spacing);
-            let count = ((hi - lo) / spacing).ceil() as usize + 1;
-            let grid: Vec<f64> = (0..count)
-                .map(|k| lo + (hi - lo) * k as f64 / (count - 1) as f64)
-                .collect();
-            let mut templates = vec![0.0; count * b.stride];
-            let mut norms = Vec::with_capacity(count);
-            let mut spans = Vec::with_capacity(count);
-            let (mut scratch, mut profile) = (vec![0.0; 3 * b.n], vec![0.0; 3 * b.stride]);
-            for (k, row) in templates.chunks_exact_mut(b.stride).enumerate() {
-                let span = b.profile(grid[k], 1.0, REACH, b.stride, &mut scratch, &mut profile);
-                spans.push([span.start, span.end]);
-                let norm = dot(&profile[..b.stride], &profile[..b.stride]).sqrt().max(1e-12);
-                for (t, a) in row.iter_mut().zip(&profile) {
-                    *t = a / norm;
-                }
-                norms.push(norm);
-            }
-            (grid, templates, norms, spans)
-        };
-        let ((gx, tx, wx, sx), (gy, ty, wy, sy)) = (axis(bx), axis(by));
         Self {
-            grid: [gx, gy],
-            templates: [tx, ty],
-            squares: Default::default(),
-            norms: [wx, wy],
-            spans: [sx, sy],
-            strides: [bx.stride, by.stride],
+            templates: [bx, by].map(Templates::new),
+            squares: None,
             map: Vec::new(),
             scale: Vec::new(),
             strip: Vec::new(),
+            line: Vec::new(),
             peaks: Vec::new(),
         }
     }
@@ -108,11 +70,9 @@ impl MatchedFilter {
         radius: f64,
     ) -> &[Peak] {
         self.respond(residual, mx, my);
-        for (squares, templates) in self.squares.iter_mut().zip(&self.templates) {
-            if squares.is_empty() {
-                squares.extend(templates.iter().map(|v| v * v));
-            }
-        }
+        let templates = &self.templates;
+        self.squares
+            .get_or_insert_with(|| templates.each_ref().map(Templates::squared));
         dispatch!(<'a>
             matched_filter: &'a mut MatchedFilter = self,
             weights: &'a [f64] = weights,
@@ -125,22 +85,19 @@ impl MatchedFilter {
     /// Divides the map by the standard deviation of each response under `weights`.
     #[inline(always)]
     fn normalise(&mut self, weights: &[f64], mx: usize, my: usize) {
-        let nx = self.grid[0].len();
+        let Some([along_x, along_y]) = &self.squares else {
+            return;
+        };
+        let nx = along_x.points.len();
         self.scale.resize(self.map.len(), 0.0);
         let rows = self.map.chunks_exact_mut(nx).zip(self.scale.chunks_exact_mut(nx));
         for (j, (out, scale)) in rows.enumerate() {
-            let row = &self.squares[1][j * self.strides[1]..(j + 1) * self.strides[1]];
-            let [lo, hi] = self.spans[1][j];
-            self.strip.fill(0.0);
-            for c in lo..hi.min(my) {
-                axpy(row[c], &weights[c * mx..(c + 1) * mx], &mut self.strip);
-            }
-            for (i, (o, s)) in out.iter_mut().zip(scale).enumerate() {
-                let column = &self.squares[0][i * self.strides[0]..(i + 1) * self.strides[0]];
-                let [lo, hi] = self.spans[0][i];
-                let variance = dot(&self.strip[lo..hi.min(mx)], &column[lo..hi.min(mx)]);
-                *s = if variance > 0.0 { 1.0 / variance.sqrt() } else { 0.0 };
-                *o *= *s;
+            along_y.sum_rows(j, weights, [mx, my], &mut self.strip);
+            along_x.respond(&self.strip, &mut self.line);
+            for i in 0..nx {
+                let variance = self.line[i];
+                scale[i] = if variance > 0.0 { 1.0 / variance.sqrt() } else { 0.0 };
+                out[i] *= scale[i];
             }
         }
     }
@@ -148,11 +105,8 @@ impl MatchedFilter {
     /// Subtracts from each response what stands on its sides at this distance, σ, as far as they are on the grid, and leaves it as uncertain
     /// as it was. What is smooth over the sensor vanishes. NaN where there are none.
     pub fn subtract_sides(&mut self, distance: f64) {
-        let [nx, ny] = self.grid.each_ref().map(Vec::len);
-        let [dx, dy] = self
-            .grid
-            .each_ref()
-            .map(|grid| (distance / (grid[1] - grid[0])).round() as usize);
+        let [nx, ny] = [0, 1].map(|k| self.points(k).len());
+        let [dx, dy] = [0, 1].map(|k| (distance / (self.points(k)[1] - self.points(k)[0])).round() as usize);
         let map = std::mem::take(&mut self.map);
         let at = |i: usize, j: usize| map[j * nx + i];
         self.map = (0..ny)
@@ -171,7 +125,7 @@ impl MatchedFilter {
     pub fn response_at(&self, u: [f64; 2]) -> Option<f64> {
         let mut cell = [(0, 0.0); 2];
         for k in 0..2 {
-            let grid = &self.grid[k];
+            let grid = self.points(k);
             let position = (u[k] - grid[0]) / (grid[1] - grid[0]);
             if !(position >= 0.0 && position <= (grid.len() - 1) as f64) {
                 return None;
@@ -180,39 +134,30 @@ impl MatchedFilter {
             cell[k] = (index, position - index as f64);
         }
         let [(i, s), (j, t)] = cell;
-        let at = |i: usize, j: usize| self.map[j * self.grid[0].len() + i];
+        let at = |i: usize, j: usize| self.map[j * self.points(0).len() + i];
         let along = |j: usize| at(i, j) * (1.0 - s) + at(i + 1, j) * s;
         Some(along(j) * (1.0 - t) + along(j + 1) * t)
     }
 
     #[inline(always)]
     fn filter(&mut self, residual: &[f64], mx: usize, my: usize) {
-        let (nx, ny) = (self.grid[0].len(), self.grid[1].len());
-        self.map.resize(nx * ny, 0.0);
+        let [along_x, along_y] = &self.templates;
+        let nx = along_x.points.len();
+        self.map.resize(nx * along_y.points.len(), 0.0);
         self.scale.clear();
-        self.strip.resize(mx, 0.0);
         for (j, out) in self.map.chunks_exact_mut(nx).enumerate() {
-            let row = &self.templates[1][j * self.strides[1]..(j + 1) * self.strides[1]];
-            let [lo, hi] = self.spans[1][j];
-            self.strip.fill(0.0);
-            for c in lo..hi.min(my) {
-                axpy(row[c], &residual[c * mx..(c + 1) * mx], &mut self.strip);
-            }
-            for (i, o) in out.iter_mut().enumerate() {
-                let column = &self.templates[0][i * self.strides[0]..(i + 1) * self.strides[0]];
-                let [lo, hi] = self.spans[0][i];
-                let hi = hi.min(mx);
-                *o = dot(&self.strip[lo..hi], &column[lo..hi]);
-            }
+            along_y.sum_rows(j, residual, [mx, my], &mut self.strip);
+            along_x.respond(&self.strip, &mut self.line);
+            out.copy_from_slice(&self.line[..nx]);
         }
     }
 
     /// Response along one axis, 0 for x, to a profile along it, at each of the axis' grid points: a spot's response is the product of two.
     pub fn respond_along(&self, axis: usize, profile: &[f64]) -> Vec<f64> {
-        self.templates[axis]
-            .chunks_exact(self.strides[axis])
-            .map(|template| dot(&template[..profile.len()], profile))
-            .collect()
+        let mut responses = Vec::new();
+        self.templates[axis].respond(profile, &mut responses);
+        responses.truncate(self.templates[axis].points.len());
+        responses
     }
 
     /// Response over its standard deviation at every grid point.
@@ -220,20 +165,25 @@ impl MatchedFilter {
         &self.map
     }
 
+    /// Positions of the grid's points along an axis, σ.
+    fn points(&self, axis: usize) -> &[f64] {
+        &self.templates[axis].points
+    }
+
     /// Points of the grid along x.
     pub fn width(&self) -> usize {
-        self.grid[0].len()
+        self.points(0).len()
     }
 
     /// Position of a point of the map, σ.
     pub fn position(&self, index: usize) -> [f64; 2] {
         let nx = self.width();
-        [self.grid[0][index % nx], self.grid[1][index / nx]]
+        [self.points(0)[index % nx], self.points(1)[index / nx]]
     }
 
     /// Peaks of the map as it is; see `peaks`.
     pub fn find(&mut self, threshold: f64, radius: f64) -> &[Peak] {
-        let (nx, ny) = (self.grid[0].len(), self.grid[1].len());
+        let (nx, ny) = (self.points(0).len(), self.points(1).len());
         self.peaks.clear();
         let at = |i: usize, j: usize| self.map[j * nx + i];
         for (j, row) in self.map.chunks_exact(nx).enumerate() {
@@ -261,11 +211,12 @@ impl MatchedFilter {
                 let step = |g: &[f64]| g[1] - g[0];
                 self.peaks.push(Peak {
                     u: [
-                        self.grid[0][i] + dx * step(&self.grid[0]),
-                        self.grid[1][j] + dy * step(&self.grid[1]),
+                        self.points(0)[i] + dx * step(self.points(0)),
+                        self.points(1)[j] + dy * step(self.points(1)),
                     ],
                     significance: value,
-                    a: value * self.scale.get(j * nx + i).unwrap_or(&1.0) / (self.norms[0][i] * self.norms[1][j]),
+                    a: value * self.scale.get(j * nx + i).unwrap_or(&1.0)
+                        / (self.templates[0].norms[i] * self.templates[1].norms[j]),
                 });
             }
         }

@@ -4,3 +4,4 @@ pub mod heatmap_network;
 pub mod matched_filter;
 pub mod matrix_pencil;
 pub mod segmentation;
+mod templates;
