@@ -94,10 +94,10 @@ impl MatchedFilter {
         for (j, (out, scale)) in rows.enumerate() {
             along_y.sum_rows(j, weights, [mx, my], &mut self.strip);
             along_x.respond(&self.strip, &mut self.line);
-            for i in 0..nx {
-                let variance = self.line[i];
-                scale[i] = if variance > 0.0 { 1.0 / variance.sqrt() } else { 0.0 };
-                out[i] *= scale[i];
+            for ((out, scale), variance) in out.iter_mut().zip(scale).zip(&self.line) {
+                let std = variance.sqrt();
+                *scale = if *variance > 0.0 { 1.0 / std } else { 0.0 };
+                *out *= *scale;
             }
         }
     }

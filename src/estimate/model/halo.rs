@@ -17,7 +17,7 @@ const HALF_WIDTH: f64 = 3.0;
 /// Height of the halo at a squared distance, σ², relative to its centre.
 #[inline(always)]
 pub(crate) fn height(distance2: f64) -> f64 {
-    1.0 / (1.0 + distance2 / (HALF_WIDTH * HALF_WIDTH))
+    1.0 / (1.0 + distance2 * (1.0 / (HALF_WIDTH * HALF_WIDTH)))
 }
 
 /// Norm of a spot of unit energy over the pixels, √G.
@@ -63,7 +63,7 @@ impl Halo {
                 for ((h, most), dx2) in square.iter_mut().zip(largest).zip(&columns) {
                     let part = (own * height(dx2 + dy2)).powi(2);
                     *h += part;
-                    *most = most.max(part);
+                    *most = if part > *most { part } else { *most };
                 }
             }
         }

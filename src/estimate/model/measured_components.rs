@@ -239,6 +239,17 @@ impl MeasuredComponents {
         }
     }
 
+    /// What of an array shapes a step with a background: a source's slopes, over its core.
+    #[inline(always)]
+    fn span_of_step(&self, i: usize, array: usize) -> Span {
+        let patch = self.patch(i);
+        if array > 0 && patch.arrays[1] > 0 {
+            patch.spans[1]
+        } else {
+            self.span(i, array)
+        }
+    }
+
     /// Columns of an array of component `i` in row `y`, both within its span.
     #[inline(always)]
     fn row(&self, i: usize, array: usize, y: usize, [x0, x1]: [usize; 2]) -> &[f64] {
@@ -281,7 +292,13 @@ impl MeasuredComponents {
     #[inline(always)]
     pub fn inner_product(&self, i: usize, a: [usize; 2], j: usize, b: [usize; 2], weights: &[f64]) -> f64 {
         let (a, b) = (array(a[0], a[1]), array(b[0], b[1]));
-        let [[x0, x1], [y0, y1]] = overlap(self.span(i, a), self.span(j, b));
+        let within = overlap(self.span(i, a), self.span(j, b));
+        self.inner_product_over(within, i, a, j, b, weights)
+    }
+
+    #[inline(always)]
+    fn inner_product_over(&self, within: Span, i: usize, a: usize, j: usize, b: usize, weights: &[f64]) -> f64 {
+        let [[x0, x1], [y0, y1]] = within;
         let mut sums = [[0.0; 4]; 4];
         for y in y0..y1 {
             let (p, q) = (self.row(i, a, y, [x0, x1]), self.row(j, b, y, [x0, x1]));
@@ -294,7 +311,8 @@ impl MeasuredComponents {
         sums.as_flattened().iter().sum()
     }
 
-    /// Inner products of three derivatives of component `i` with three of component `j`, 3 × 3 row-major: of two sources, over their cores.
+    /// Inner products of three derivatives of component `i` with three of component `j`, 3 × 3 row-major: over the cores of sources, but
+    /// for the light of one with a background.
     #[inline(always)]
     pub fn inner_products(
         &self,
@@ -309,7 +327,9 @@ impl MeasuredComponents {
         if !has_cores || weights.is_empty() {
             for r in 0..3 {
                 for c in 0..3 {
-                    out[3 * r + c] = self.inner_product(i, a[r], j, b[c], weights);
+                    let (a, b) = (array(a[r][0], a[r][1]), array(b[c][0], b[c][1]));
+                    let within = overlap(self.span_of_step(i, a), self.span_of_step(j, b));
+                    out[3 * r + c] = self.inner_product_over(within, i, a, j, b, weights);
                 }
             }
             return out;

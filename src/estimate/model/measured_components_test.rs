@@ -82,6 +82,7 @@ fn the_core_holds_all_but_a_thousandth_of_the_products() {
     for u in [[0.3, -0.4], [1.9, 0.8]] {
         components.push(&shape, [x, y], u, [0.0; 2], &[(0.0, 1.0)]);
     }
+    components.push_profiles([x, y], [&vec![1.0; x.n], &vec![1.0; y.n]]);
     let weights: Vec<f64> = (0..x.stride * y.n).map(|k| 1.0 + 0.3 * (k as f64).sin()).collect();
     const ORDERS: [[usize; 2]; 3] = [[1, 0], [0, 1], [0, 0]];
     for (i, j) in [(0, 0), (0, 1), (1, 0)] {
@@ -97,5 +98,13 @@ fn the_core_holds_all_but_a_thousandth_of_the_products() {
                 );
             }
         }
+    }
+    // What a position's variance grows by with a background: the square of their correlation.
+    let block = components.inner_products(0, ORDERS, 2, ORDERS, &weights);
+    for r in 0..2 {
+        let of = |i: usize, a: [usize; 2], j: usize, b: [usize; 2]| components.inner_product(i, a, j, b, &weights);
+        let scale = of(0, ORDERS[r], 0, ORDERS[r]) * of(2, [0, 0], 2, [0, 0]);
+        let [cut, whole] = [block[3 * r + 2], of(0, ORDERS[r], 2, [0, 0])].map(|c| c * c / scale);
+        assert!((cut - whole).abs() < OUTSIDE_CORE, "{r}: {cut} {whole}");
     }
 }
