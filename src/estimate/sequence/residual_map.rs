@@ -127,50 +127,61 @@ impl ResidualSum {
     }
 }
 
-/// Divides by the share of a spot that lies outside the emitters' span: one minus cᵀG⁻¹c with c its overlaps with them and G theirs.
+/// Divides by the share of a spot that lies outside the emitters' span: one minus cᵀG⁻¹c with c its overlaps with them and G theirs. In each
+/// row of the map only emitters near it count.
 fn divide_by_outside(filter: &MatchedFilter, spots: &[UnitSpot], sum: &mut [f64]) {
     let n = spots.len();
-    let gram = DMatrix::from_fn(n, n, |i, j| {
-        let ridge = if i == j { 1.0 + 1e-12 } else { 1.0 };
-        ridge * spots[i].overlap(&spots[j])
-    });
-    let Some(factor) = gram.cholesky() else {
-        sum.fill(0.0);
-        return;
-    };
-    let factor = factor.l();
-    let scales: Vec<f64> = factor.diagonal().iter().map(|d| 1.0 / d).collect();
-    let rows: Vec<Vec<f64>> = factor.row_iter().map(|row| row.iter().copied().collect()).collect();
     let along = |k: usize| -> Vec<Vec<f64>> { spots.iter().map(|s| filter.respond_along(k, &s.profiles[k])).collect() };
     let [x, y] = [along(0), along(1)];
+    let (mut near, mut factor) = (Vec::new(), Vec::new());
     let mut overlaps = vec![0.0; n];
     let mut squares = vec![0.0; filter.width()];
     for (j, row) in sum.chunks_exact_mut(filter.width()).enumerate() {
+        let is_near = |k: &usize| y[*k][j] * y[*k][j] > NEGLIGIBLE_OVERLAP / (2 * n) as f64;
+        let nearest: Vec<usize> = (0..n).filter(is_near).collect();
+        if nearest != near {
+            near = nearest;
+            let Some(next) = factor_of(near.iter().map(|k| &spots[*k])) else {
+                sum.fill(0.0);
+                return;
+            };
+            factor = next;
+        }
         squares.fill(0.0);
-        for (x, y) in x.iter().zip(&y) {
-            let across = y[j] * y[j];
-            if across > NEGLIGIBLE_OVERLAP / (2 * n) as f64 {
-                let along = squares.iter_mut().zip(x);
-                along.for_each(|(square, x)| *square += across * x * x);
-            }
+        for k in &near {
+            let across = y[*k][j] * y[*k][j];
+            let along = squares.iter_mut().zip(&x[*k]);
+            along.for_each(|(square, x)| *square += across * x * x);
         }
         for (i, total) in row.iter_mut().enumerate() {
             if squares[i] < 0.5 * NEGLIGIBLE_OVERLAP {
                 continue;
             }
-            for (c, (x, y)) in overlaps.iter_mut().zip(x.iter().zip(&y)) {
-                *c = x[i] * y[j];
-            }
             let mut outside = 1.0;
-            for (r, row) in rows.iter().enumerate() {
-                let (before, after) = overlaps.split_at_mut(r);
-                let known: f64 = row.iter().zip(&*before).map(|(l, c)| l * c).sum();
-                after[0] = (after[0] - known) * scales[r];
-                outside -= after[0] * after[0];
+            for (r, k) in near.iter().enumerate() {
+                let (row, scale) = &factor[r];
+                let known: f64 = row.iter().zip(&overlaps).map(|(l, c)| l * c).sum();
+                overlaps[r] = (x[*k][i] * y[*k][j] - known) * scale;
+                outside -= overlaps[r] * overlaps[r];
             }
             *total = if outside > LEAST_OUTSIDE { *total / outside } else { 0.0 };
         }
     }
+}
+
+/// The rows of the Cholesky factor of the overlaps of spots: what is left of the diagonal, and one over that.
+fn factor_of<'a>(spots: impl Iterator<Item = &'a UnitSpot>) -> Option<Vec<(Vec<f64>, f64)>> {
+    let spots: Vec<&UnitSpot> = spots.collect();
+    let gram = DMatrix::from_fn(spots.len(), spots.len(), |i, j| {
+        let ridge = if i == j { 1.0 + 1e-12 } else { 1.0 };
+        ridge * spots[i].overlap(spots[j])
+    });
+    let factor = gram.cholesky()?.l();
+    let rows = factor.row_iter().enumerate();
+    Some(
+        rows.map(|(r, row)| (row.columns(0, r).iter().copied().collect(), 1.0 / row[r]))
+            .collect(),
+    )
 }
 
 /// Points of at least `least` that are above all their neighbours, the highest first, with their positions, σ.
