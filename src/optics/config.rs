@@ -202,7 +202,13 @@ impl Config {
             pixels: None,
         };
         match (&self.calibrated, &self.calibration) {
-            (Some(calibration), _) => Ok(calibration.applied_to(&camera)?),
+            (Some(calibration), _) => {
+                let camera = calibration.applied_to(&camera)?;
+                Ok(match self.spot_error {
+                    Some(_) => camera.with_one_spot_error(),
+                    None => camera,
+                })
+            }
             (None, Some(path)) => Err(Error::CalibrationNotRead(path.clone())),
             (None, None) => Ok(camera),
         }
