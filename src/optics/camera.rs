@@ -71,14 +71,6 @@ impl Camera {
     /// Largest `spot_error`: beyond half of the light there is no model.
     pub const LARGEST_SPOT_ERROR: f64 = 0.5;
 
-    /// The camera with its spot error everywhere, also where its spot's shape knows less.
-    pub fn with_one_spot_error(mut self) -> Self {
-        self.spot_shape = self
-            .spot_shape
-            .map(|shape| Arc::new(SpotShape::clone(&shape).with_beyond(None)));
-        self
-    }
-
     /// A pixel at or above this, J, is saturated; infinite where no level is known.
     pub fn saturation_limit_j(&self) -> f64 {
         self.saturation_j.unwrap_or(f64::INFINITY)

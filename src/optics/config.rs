@@ -202,13 +202,7 @@ impl Config {
             pixels: None,
         };
         match (&self.calibrated, &self.calibration) {
-            (Some(calibration), _) => {
-                let camera = calibration.applied_to(&camera)?;
-                Ok(match self.spot_error {
-                    Some(_) => camera.with_one_spot_error(),
-                    None => camera,
-                })
-            }
+            (Some(calibration), _) => Ok(calibration.applied_to(&camera)?),
             (None, Some(path)) => Err(Error::CalibrationNotRead(path.clone())),
             (None, None) => Ok(camera),
         }

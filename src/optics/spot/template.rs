@@ -137,11 +137,7 @@ impl SpotShape {
             return None;
         }
         normalise(&mut terms);
-        Some(Self {
-            field,
-            terms,
-            beyond: None,
-        })
+        Some(Self { field, terms })
     }
 }
 
