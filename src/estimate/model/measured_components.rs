@@ -29,6 +29,9 @@ pub(crate) struct MeasuredShape {
     pub(super) radii: [f64; 2],
 }
 
+/// Orders along x and y of three derivatives.
+pub(crate) type Orders = [[usize; 2]; 3];
+
 /// f, f_y, f_x of the whole; f_xx, f_xy, f_yy of the core.
 const EACH: usize = 3;
 
@@ -118,7 +121,6 @@ impl MeasuredComponents {
             displacement,
             parts: parts.to_vec(),
             origin_m: shape.origin_m,
-            spans,
         };
         if let Some(index) = self.pool.find(&place) {
             self.patches.push(index);
@@ -314,14 +316,7 @@ impl MeasuredComponents {
     /// Inner products of three derivatives of component `i` with three of component `j`, 3 × 3 row-major: over the cores of sources, but
     /// for the light of one with a background.
     #[inline(always)]
-    pub fn inner_products(
-        &self,
-        i: usize,
-        a: [[usize; 2]; 3],
-        j: usize,
-        b: [[usize; 2]; 3],
-        weights: &[f64],
-    ) -> [f64; 9] {
+    pub fn inner_products(&self, i: usize, a: Orders, j: usize, b: Orders, weights: &[f64]) -> [f64; 9] {
         let mut out = [0.0; 9];
         let has_cores = self.patch(i).arrays[1] > 0 && self.patch(j).arrays[1] > 0;
         if !has_cores || weights.is_empty() {

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use crate::estimate::model::measured_components::{MeasuredComponents, MeasuredShape, OUTSIDE_CORE};
+use crate::estimate::model::measured_components::{MeasuredComponents, MeasuredShape, OUTSIDE_CORE, Orders};
 use crate::estimate::model::svd_basis::Basis;
 use crate::optics::Config;
 use crate::optics::spot::{Component, Field, FieldPolynomial, SpotShape, Template};
@@ -45,6 +45,33 @@ fn frame(shape: &MeasuredShape, [x, y]: &[Basis; 2], u: [f64; 2], [a, b]: [usize
 }
 
 #[test]
+fn a_patch_that_was_kept_shows_what_a_new_one_does() {
+    let (mut shape, [x, y]) = lens();
+    let parts = [(-0.5, 0.4), (0.5, 0.6)];
+    let mut kept = MeasuredComponents::default();
+    // Each differs from the one before it in one respect; places come back at once, later, and after they were given up.
+    let models = [
+        ([0.3, -0.4], [0.0; 2], &parts[..], [0.0; 2]),
+        ([0.3, -0.4], [0.3, -0.2], &parts[..], [0.0; 2]),
+        ([0.3, -0.4], [0.3, -0.2], &parts[..1], [0.0; 2]),
+        ([0.3, -0.4], [0.3, -0.2], &parts[..1], [4e-3, -2e-3]),
+        ([-9.0, 6.5], [0.3, -0.2], &parts[..1], [4e-3, -2e-3]),
+    ];
+    for (u, displacement, parts, origin_m) in (0..4).flat_map(|turn| models.into_iter().cycle().skip(turn).take(7)) {
+        shape.origin_m = origin_m;
+        let mut new = MeasuredComponents::default();
+        let [kept, new] = [&mut kept, &mut new].map(|components| {
+            components.clear(x.stride);
+            components.push(&shape, [&x, &y], u, displacement, parts);
+            let mut light = vec![0.0; x.stride * y.n];
+            components.accumulate(0, 1, 0, 1.0, &mut light);
+            light
+        });
+        assert!(kept == new, "{u:?} {displacement:?} {origin_m:?}");
+    }
+}
+
+#[test]
 fn derivatives_agree_with_finite_differences() {
     let (shape, bases) = lens();
     let h = 1e-4;
@@ -84,7 +111,7 @@ fn the_core_holds_all_but_a_thousandth_of_the_products() {
     }
     components.push_profiles([x, y], [&vec![1.0; x.n], &vec![1.0; y.n]]);
     let weights: Vec<f64> = (0..x.stride * y.n).map(|k| 1.0 + 0.3 * (k as f64).sin()).collect();
-    const ORDERS: [[usize; 2]; 3] = [[1, 0], [0, 1], [0, 0]];
+    const ORDERS: Orders = [[1, 0], [0, 1], [0, 0]];
     for (i, j) in [(0, 0), (0, 1), (1, 0)] {
         let block = components.inner_products(i, ORDERS, j, ORDERS, &weights);
         for r in 0..3 {

@@ -6,13 +6,12 @@ use crate::estimate::model::measured_terms::{Span, size};
 const KEPT: usize = 3;
 
 /// What a patch shows of a measured spot.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(PartialEq)]
 pub(super) struct Place {
     pub u: [f64; 2],
     pub displacement: [f64; 2],
     pub parts: Vec<(f64, f64)>,
     pub origin_m: [f64; 2],
-    pub spans: [Span; 2],
 }
 
 /// Arrays of the whole and of the core: (rows, arrays, columns) of each.

@@ -7,7 +7,7 @@
 use crate::estimate::model::bases::Bases;
 use crate::estimate::model::compressed_frame::CompressedFrame;
 use crate::estimate::model::hypothesis::{Nuisances, PointSource};
-use crate::estimate::model::measured_components::MeasuredComponents;
+use crate::estimate::model::measured_components::{MeasuredComponents, Orders};
 use crate::estimate::model::separable_terms::SeparableTerms;
 use crate::estimate::preprocess::masked_pixels::Run;
 
@@ -37,10 +37,10 @@ const WHOLE: [(f64, f64); 1] = [(0.0, 1.0)];
 const ONE: [f64; 1] = [1.0];
 
 /// Orders of the derivatives along x and y that go with a source's energy, x and y.
-pub(crate) const SLOPES: [[usize; 2]; 3] = [[0, 0], [1, 0], [0, 1]];
+pub(crate) const SLOPES: Orders = [[0, 0], [1, 0], [0, 1]];
 
 /// The same in the order of a Gram matrix's blocks.
-const GRAM: [[usize; 2]; 3] = [[1, 0], [0, 1], [0, 0]];
+const GRAM: Orders = [[1, 0], [0, 1], [0, 0]];
 
 /// Σ share·f(k) over the terms k of component `i`, f an array. A macro, because a closure is not compiled for the instructions that its
 /// caller was dispatched to.
@@ -341,9 +341,9 @@ impl SeparableModel {
     pub fn inner_products(
         &self,
         i: usize,
-        a: [[usize; 2]; 3],
+        a: Orders,
         j: usize,
-        b: [[usize; 2]; 3],
+        b: Orders,
         weights: &[f64],
         scratch: &mut Vec<f64>,
     ) -> [f64; 9] {

@@ -6,12 +6,13 @@ use crate::estimate::emitter::SecondMomentScore;
 use crate::estimate::fit::levenberg_marquardt::Linearisation;
 use crate::estimate::fit::problem::Problem;
 use crate::estimate::fit::work_budget::WorkBudget;
+use crate::estimate::model::measured_components::Orders;
 use crate::estimate::model::separable_model::{SLOPES, SeparableModel};
 use crate::estimate::uncertainty::covariance::Covariance;
 
 /// Orders and factors of the derivatives for the second moments xx, xy, yy: a source spread by M changes by
 /// ½A(M_xx f_xx + 2 M_xy f_xy + M_yy f_yy).
-const SECOND_ORDERS: [[usize; 2]; 3] = [[2, 0], [1, 1], [0, 2]];
+const SECOND_ORDERS: Orders = [[2, 0], [1, 1], [0, 2]];
 const SECOND_FACTORS: [f64; 3] = [0.5, 1.0, 0.5];
 /// Directions tested, over half a turn: the best is missed by at most 6°.
 const DIRECTIONS: usize = 16;
