@@ -200,14 +200,14 @@ pub fn run(args: Args) -> Outcome {
             reduced_chi2: estimate.as_ref().ok().map(|e| e.reduced_chi2),
             spot_error: estimate.as_ref().ok().map(|e| e.spot_error).filter(|e| *e > 0.0),
         };
-        misshapen += u64::from(line.spot_error.is_some());
+        misshapen += u64::from(line.spot_error.is_some_and(|share| share > camera.spot_error.least()));
         serde_json::to_writer(&mut out, &line).map_err(|e| Failure::other(std::io::Error::from(e)))?;
         writeln!(out).map_err(Failure::other)?;
         bar.inc(1);
     }
     bar.finish_and_clear();
     out.flush().map_err(Failure::other)?;
-    if 2 * misshapen > usable && camera.spot_error.is_none() {
+    if 2 * misshapen > usable {
         eprintln!(
             "{misshapen} of {usable} frames: the spot is not what the config says (positions are less precise, faint emitters \
              beside bright ones are not seen); run `oapwatch calibrate --config {} --out CALIBRATION.toml {}`",

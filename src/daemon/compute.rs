@@ -158,7 +158,7 @@ impl Compute {
                 metrics::counter!(metric::FRAMES_LIMITED).increment(u64::from(estimate.is_limited));
                 metrics::gauge!(metric::REDUCED_CHI2).set(estimate.reduced_chi2);
                 metrics::gauge!(metric::SPOT_ERROR).set(estimate.spot_error);
-                s.explained(estimate, self.camera.spot_error.is_some());
+                s.explained(estimate, self.camera.spot_error.least());
                 if s.last_good.is_none() {
                     tracing::info!(frame = frame.index, "the first usable frame was processed");
                 }

@@ -78,9 +78,9 @@ impl State {
         push(&mut self.arrivals, at);
     }
 
-    /// Takes how a frame was explained; `is_known`: whether the spot error is configured.
-    pub fn explained(&mut self, estimate: &Estimate, is_known: bool) {
-        self.misshapen = match estimate.spot_error > 0.0 && !is_known {
+    /// Takes how a frame was explained, beside the spot error that is known.
+    pub fn explained(&mut self, estimate: &Estimate, known_spot_error: f64) {
+        self.misshapen = match estimate.spot_error > known_spot_error {
             true => (self.misshapen + 1).min(SPOT_FRAMES),
             false => self.misshapen.saturating_sub(1),
         };

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use super::camera::Camera;
+use super::camera::{Camera, SpotError};
 use super::distortion::Distortion;
 use super::error::CalibrationError;
 use super::pixel_maps::PixelMaps;
@@ -33,7 +33,7 @@ impl Calibration {
             spot_sigma_m: camera.spot_sigma_m,
             spot_growth: camera.spot_growth,
             spot_shape: camera.spot_shape.clone(),
-            spot_error: camera.spot_error,
+            spot_error: Some(camera.spot_error.least()).filter(|share| *share > 0.0),
             noise_std_j: camera.noise_std_j,
             pixels: camera.pixels.clone(),
         }
@@ -47,8 +47,10 @@ impl Calibration {
             spot_sigma_m: self.spot_sigma_m,
             spot_growth: self.spot_growth,
             spot_shape: self.spot_shape.clone(),
-            // What the config fixes holds.
-            spot_error: camera.spot_error.or(self.spot_error),
+            spot_error: match camera.spot_error {
+                SpotError::AtLeast(_) => SpotError::AtLeast(self.spot_error.unwrap_or_default()),
+                fixed => fixed,
+            },
             noise_std_j: self.noise_std_j,
             pixels: self.pixels.clone(),
             ..camera.clone()

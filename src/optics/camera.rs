@@ -55,8 +55,7 @@ pub struct Camera {
     /// The spot as a calibration measured it; without one it is a Gaussian of σ_eff. With one, σ_eff is the width of the
     /// Gaussian nearest to it.
     pub spot_shape: Option<Arc<SpotShape>>,
-    /// Share of a spot's light by which its shape may differ from the model, anywhere in its halo; none: not known.
-    pub spot_error: Option<f64>,
+    pub spot_error: SpotError,
     /// Standard deviation of the additive noise of one pixel.
     pub noise_std_j: f64,
     pub joules_per_count: Option<f64>,
@@ -65,6 +64,27 @@ pub struct Camera {
     pub distortion: Distortion,
     /// Per-pixel corrections that frames need before they are estimated.
     pub pixels: Option<Arc<PixelMaps>>,
+}
+
+/// Share of a spot's light by which its shape may differ from the model, anywhere in its halo.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum SpotError {
+    /// As the config says.
+    Fixed(f64),
+    /// As a calibration measured it, zero without one; more where the frames show more.
+    AtLeast(f64),
+}
+
+impl SpotError {
+    pub fn least(self) -> f64 {
+        match self {
+            Self::Fixed(share) | Self::AtLeast(share) => share,
+        }
+    }
+
+    pub fn is_fixed(self) -> bool {
+        matches!(self, Self::Fixed(_))
+    }
 }
 
 impl Camera {

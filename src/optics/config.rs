@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use serde::{Deserialize, Serialize};
 
 use super::calibration::Calibration;
-use super::camera::{Axis, Camera};
+use super::camera::{Axis, Camera, SpotError};
 use super::distortion::Distortion;
 use super::error::Error;
 use crate::toml_file::Key;
@@ -197,7 +197,7 @@ impl Config {
             saturation_j: self.saturation_j,
             spot_growth: 0.0,
             spot_shape: None,
-            spot_error: self.spot_error,
+            spot_error: self.spot_error.map_or(SpotError::AtLeast(0.0), SpotError::Fixed),
             distortion: Distortion::default(),
             pixels: None,
         };

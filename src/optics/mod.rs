@@ -16,7 +16,7 @@ pub mod spot;
 mod spot_pixels;
 
 pub use calibration::Calibration;
-pub use camera::{Axis, Camera};
+pub use camera::{Axis, Camera, SpotError};
 pub use config::{BlurConfig, Config};
 pub use distortion::Distortion;
 pub use error::{CalibrationError, Error};

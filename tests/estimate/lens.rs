@@ -7,7 +7,7 @@ use ndarray::Array2;
 use oapwatch::estimate::{Emitter, position_bound};
 use oapwatch::frame::Frame;
 use oapwatch::optics::spot::{Field, SpotShape, Template};
-use oapwatch::optics::{self, Camera, Smear, add_spot};
+use oapwatch::optics::{self, Camera, Smear, SpotError, add_spot};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, Normal};
@@ -34,6 +34,27 @@ fn moffat(sigma_m: f64) -> impl Fn(f64, f64) -> f64 {
     let scale = 2.05 * sigma_m;
     let peak = 1.5 / (std::f64::consts::PI * scale * scale);
     move |x, y| peak * (1.0 + (x * x + y * y) / (scale * scale)).powf(-2.5)
+}
+
+fn core_on_wide(sigma_m: f64) -> impl Fn(f64, f64) -> f64 {
+    move |x, y| {
+        let r2 = (x * x + y * y) / (sigma_m * sigma_m);
+        (-0.5 * r2).exp() + 0.05 * (-0.125 * r2).exp()
+    }
+}
+
+/// A camera that knows its spots by their density.
+fn camera_of(density: impl Fn(f64, f64) -> f64, spot_error: SpotError) -> Camera {
+    let camera = camera();
+    let field = Field {
+        half_sensor_m: [camera.x.half_width(), camera.y.half_width()],
+    };
+    let template = Template::of_density(field, 2.5e-4, 9e-3, density);
+    Camera {
+        spot_shape: Some(Arc::new(SpotShape::from_template(&template, 1e-5).unwrap())),
+        spot_error,
+        ..camera
+    }
 }
 
 /// Spots of any density at places on the sensor, m, each with a peak of `snr` standard deviations of the noise.
@@ -86,7 +107,7 @@ fn the_halo_of_a_lens_is_no_emitter_and_needs_no_calibration() {
         assert!(nearest.fold(f64::MAX, f64::min) < 5e-5, "{at:?}");
     }
     let trusting = Camera {
-        spot_error: Some(0.0),
+        spot_error: SpotError::Fixed(0.0),
         ..camera
     };
     let estimate = estimator(None, &trusting).estimate(&frame).unwrap();
@@ -169,13 +190,7 @@ fn a_frame_without_noise_does_not_lose_its_brightest_beam() {
 
 #[test]
 fn a_measured_spot_reaches_its_bound_with_an_honest_covariance() {
-    let mut camera = camera();
-    let field = Field {
-        half_sensor_m: [camera.x.half_width(), camera.y.half_width()],
-    };
-    let template = Template::of_density(field, 2.5e-4, 9e-3, moffat(1e-3));
-    camera.spot_shape = Some(Arc::new(SpotShape::from_template(&template, 1e-5).unwrap()));
-    camera.spot_error = Some(0.0);
+    let camera = camera_of(moffat(1e-3), SpotError::Fixed(0.0));
     for name in ["ml", "hybrid"] {
         let mut estimator = estimator(Some(name), &camera);
         let mut rng = ChaCha8Rng::seed_from_u64(25);
@@ -219,7 +234,7 @@ fn a_measured_spot_reaches_its_bound_with_an_honest_covariance() {
 #[test]
 fn frames_without_light_hold_no_emitters_under_a_spot_error() {
     let camera = Camera {
-        spot_error: Some(0.02),
+        spot_error: SpotError::Fixed(0.02),
         ..camera()
     };
     let mut ml = estimator(None, &camera);
@@ -287,7 +302,7 @@ fn smear() -> Smear {
 fn a_gaussian_spot_is_fitted_as_it_was_smeared() {
     // Taken for round, as what frames together show of the smear makes the ellipses wide enough for it.
     let round = Camera {
-        spot_error: Some(0.0),
+        spot_error: SpotError::Fixed(0.0),
         ..camera()
     };
     let (unknown, _) = measured(&round, &smear(), false);
@@ -300,18 +315,28 @@ fn a_gaussian_spot_is_fitted_as_it_was_smeared() {
 
 #[test]
 fn a_measured_spot_is_fitted_as_it_was_smeared() {
-    let mut camera = camera();
-    let field = Field {
-        half_sensor_m: [camera.x.half_width(), camera.y.half_width()],
-    };
-    // A narrow core on a wide one.
-    let density = |x: f64, y: f64| {
-        let r2 = (x * x + y * y) / (SIGMA_M * SIGMA_M);
-        (-0.5 * r2).exp() + 0.05 * (-0.125 * r2).exp()
-    };
-    let template = Template::of_density(field, 2.5e-4, 9e-3, density);
-    camera.spot_shape = Some(Arc::new(SpotShape::from_template(&template, 1e-5).unwrap()));
-    camera.spot_error = Some(0.0);
+    let camera = camera_of(core_on_wide(SIGMA_M), SpotError::Fixed(0.0));
     let (known, right) = measured(&camera, &smear(), true);
     assert!(right == 12 && (0.6..1.5).contains(&known), "{right} {known}");
+}
+
+#[test]
+fn a_lens_that_has_changed_since_it_was_learned_makes_no_emitters() {
+    const LEARNED: f64 = 1e-4;
+    let count = |spot_error| {
+        let mut estimator = estimator(None, &camera_of(core_on_wide(SIGMA_M), spot_error));
+        let mut rng = ChaCha8Rng::seed_from_u64(31);
+        let estimates = [1.0, 1.01, 1.01].map(|width| {
+            let spots = FIVE.map(|at| (at.map(|v| v + rng.random_range(-1e-3..1e-3)), 1000.0));
+            let pixels = render_density(&camera(), &core_on_wide(width * SIGMA_M), &spots, &mut rng);
+            estimator.estimate(&frame(pixels)).unwrap()
+        });
+        estimates.map(|e| (e.emitters.len(), e.spot_error))
+    };
+    let [as_learned, changed, again] = count(SpotError::AtLeast(LEARNED));
+    assert_eq!(as_learned, (5, LEARNED));
+    assert!(changed.0 == 5 && changed.1 > 10.0 * LEARNED, "{changed:?}");
+    assert!(again.0 == 5 && again.1 > 10.0 * LEARNED, "{again:?}");
+    let trusting = count(SpotError::Fixed(LEARNED));
+    assert!(trusting[1].0 > 5 && trusting[2].0 > 5, "{trusting:?}");
 }

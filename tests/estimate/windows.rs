@@ -6,7 +6,7 @@ use ndarray::{Array2, s};
 use oapwatch::estimate::{Config, Emitter, Estimate, Estimator, Flags, Rules, build};
 use oapwatch::frame::Frame;
 use oapwatch::optics::spot::{Component, Field, FieldPolynomial, SpotShape, Template};
-use oapwatch::optics::{self, Axis, Camera, Smear, add_spot, psf};
+use oapwatch::optics::{self, Axis, Camera, Smear, SpotError, add_spot, psf};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
@@ -336,7 +336,7 @@ fn spots_smeared_differently_over_the_sensor_are_the_same_in_windows() {
 #[test]
 fn a_ghost_in_a_window_of_its_own_is_no_emitter_under_a_spot_error() {
     let camera = Camera {
-        spot_error: Some(0.04),
+        spot_error: SpotError::Fixed(0.04),
         ..camera([256, 256])
     };
     let mut ml = estimator("ml", Rules::default(), &camera);

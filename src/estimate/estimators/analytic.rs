@@ -120,8 +120,7 @@ impl AnalyticEstimator {
 
     /// Whether recent frames showed that spots differ from the PSF.
     pub fn remembers_spot_error(&self) -> bool {
-        let history = self.search.history.as_ref();
-        history.is_some_and(|history| history.spot_error().is_some())
+        self.search.shown_by_recent_frames().is_some()
     }
 
     /// Whether the loaded window shows anything that may be an emitter.

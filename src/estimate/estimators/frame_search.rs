@@ -23,7 +23,7 @@ use crate::estimate::preprocess::noise_variance::VarianceFunction;
 use crate::estimate::preprocess::outliers::NoiseInspection;
 use crate::estimate::preprocess::screening::PreprocessedFrame;
 use crate::estimate::rules::Rules;
-use crate::optics::Camera;
+use crate::optics::{Camera, SpotError};
 
 /// Share of a frame's work for a first try (by the pencil, or without isolated pixels) that is not the main way.
 const TRY_WORK: f64 = 0.03;
@@ -67,9 +67,9 @@ impl Found {
 /// A frame, and the spaces that it is searched in.
 pub(crate) struct FrameSearch {
     pub spec: &'static EstimatorSpec,
-    /// As configured, or as recent frames showed; `None` where it is found from the frame alone.
-    pub spot_error: Option<f64>,
-    /// What recent frames showed, where none is configured and the sensor is wide enough to show it.
+    /// As configured or calibrated, or as recent frames showed.
+    pub spot_error: SpotError,
+    /// What recent frames showed, where it is not fixed and the sensor is wide enough to show it.
     pub history: Option<SpotErrorHistory>,
     pub ellipse: EllipseHistory,
     pub frame: PreprocessedFrame,
@@ -100,7 +100,7 @@ impl FrameSearch {
             None
         };
         let reweighting = Reweighting::new(camera, rules);
-        let is_sought = camera.spot_error.is_none() && spec.chooses_order() && spec.method != Method::Sequence;
+        let is_sought = !camera.spot_error.is_fixed() && spec.chooses_order() && spec.method != Method::Sequence;
         Self {
             spec,
             spot_error: camera.spot_error,
@@ -156,7 +156,7 @@ impl FrameSearch {
         if let Some(found) = self.find_with_usual_ellipse(budgets) {
             return found;
         }
-        let remembered = self.history.as_ref().and_then(SpotErrorHistory::spot_error);
+        let remembered = self.shown_by_recent_frames();
         let remembered = match remembered.map(|error| self.find_as_remembered(error, budgets)) {
             Some((found, true)) => return found,
             other => other.map(|(found, _)| found),
@@ -236,7 +236,7 @@ impl FrameSearch {
             }
             Method::Pencil { steps } => initialise(&mut search, Nuisances::default(), steps).into_hypothesis(),
             Method::MaximumLikelihood | Method::MaximumPosterior | Method::Sequence => {
-                if self.spot_error.is_some_and(|e| e > 0.0) {
+                if self.spot_error.least() > 0.0 {
                     // The search with the spot error is the only one. It starts from peaks: the pencil takes rings for sources.
                     let Reweighting { space, compressed } = &mut self.reweighting;
                     compressed.load(&self.frame, &space.bases.x, &space.bases.y);
@@ -264,7 +264,7 @@ impl FrameSearch {
     /// Every other frame is searched in full, from another width where that explains it. Not where spots are all core: these show their shape
     /// in the end, if at all.
     fn search_unless_misfit(&mut self, mut initial: Hypothesis, budget: &mut WorkBudget) -> Found {
-        if self.spot_error.is_some() || is_narrow(&self.space.bases) {
+        if self.spot_error.is_fixed() || is_narrow(&self.space.bases) {
             return self.search_with_outliers(initial, budget);
         }
         let kept = (self.frame.clone(), self.compressed.clone());

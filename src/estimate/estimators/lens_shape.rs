@@ -10,8 +10,10 @@ use crate::estimate::model_order::nuisance_selection::{EARLY_ROUNDS, ROTATED_ELL
 use crate::estimate::model_order::refine::refine;
 use crate::estimate::model_order::reweighting::Reweighting;
 use crate::estimate::model_order::spot_error::{
-    Shape, drop_halo, inspect_shape, load_weighted, search_with_spot_error, shown_spot_error, try_spot_error,
+    Shape, drop_halo, inspect_shape, keep_weighted, load_weighted, search_with_spot_error, shown_spot_error,
+    try_spot_error, without_halo_of,
 };
+use crate::optics::SpotError;
 
 /// Share of a frame's work for a try with the ellipse that recent frames showed: spots that overlap are split one after another.
 const USUAL_ELLIPSE_WORK: f64 = 0.4;
@@ -53,7 +55,8 @@ impl FrameSearch {
     /// weights.
     pub fn allow_for_shape(&mut self, found: &mut Found, budgets: &mut Budgets) -> bool {
         if !self.spec.chooses_order() {
-            if let Some(error) = self.spot_error.filter(|e| *e > 0.0) {
+            let error = self.spot_error.least();
+            if error > 0.0 {
                 drop_halo(
                     &self.space.bases,
                     error,
@@ -64,50 +67,62 @@ impl FrameSearch {
             }
             return false;
         }
+        let known = self.spot_error.least();
+        if known > 0.0 {
+            let Reweighting { space, compressed } = &mut self.reweighting;
+            let (frame, budget) = (&self.frame, &mut budgets.reweighting);
+            let start = without_halo_of(&frame.beyond, &found.hypothesis);
+            found.hypothesis = search_with_spot_error(space, compressed, frame, known, start, budget);
+            found.spot_error = known;
+            found.kind = SearchKind::Reweighted;
+        }
+        if self.spot_error.is_fixed() {
+            return false;
+        }
         let compressed = self.compressed_of(found.kind);
         let is_explained = compressed.is_explained_by(&found.hypothesis);
         let excess = compressed.excess(&found.hypothesis);
         let Reweighting { space, compressed } = &mut self.reweighting;
         let (frame, budget) = (&self.frame, &mut budgets.reweighting);
-        let shape = match self.spot_error {
-            Some(0.0) => Shape::AsModelled,
-            Some(error) => Shape::of_spot_error(error, &found.hypothesis, &self.frame.beyond),
-            None => inspect_shape(space, compressed, frame, &found.hypothesis, excess, budget),
-        };
-        match shape {
-            Shape::AsModelled => {}
-            Shape::Simpler(simpler) => {
+        match inspect_shape(space, compressed, frame, &found.hypothesis, excess, budget) {
+            Shape::Simpler(simpler) if known == 0.0 => {
                 found.hypothesis = simpler;
                 return true;
             }
-            Shape::Different(error, bright) => {
+            Shape::Different(error, bright) if error > known => {
                 let next = search_with_spot_error(space, compressed, frame, error, bright, budget);
                 let is_simpler =
                     next.sources.len() < found.hypothesis.sources.len() && compressed.is_explained_by(&next);
-                if !is_explained || is_simpler || self.spot_error.is_some() {
+                if !is_explained || is_simpler {
                     found.hypothesis = next;
                     found.spot_error = error;
+                    return false;
                 }
             }
+            _ => {}
+        }
+        if known > 0.0 {
+            keep_weighted(space, compressed, frame, known, &found.hypothesis.sources);
         }
         false
     }
 
     /// The emitters under the spot error that recent frames showed, and whether this frame shows one around them.
     pub fn find_as_remembered(&mut self, error: f64, budgets: &mut Budgets) -> (Found, bool) {
-        self.spot_error = Some(error);
+        let known = std::mem::replace(&mut self.spot_error, SpotError::Fixed(error));
         let mut found = self.find(budgets);
         self.allow_for_shape(&mut found, budgets);
-        self.spot_error = None;
+        self.spot_error = known;
         found.kind = SearchKind::Reweighted;
         let Reweighting { space, compressed } = &mut self.reweighting;
         let (frame, budget) = (&self.frame, &mut budgets.reweighting);
         let shown = shown_spot_error(space, compressed, frame, &found.hypothesis, false, budget);
-        if shown > 0.0 {
+        let is_shown = shown > known.least();
+        if is_shown {
             self.history.iter_mut().for_each(|history| history.push(shown));
             load_weighted(space, compressed, frame, error, &found.hypothesis.sources);
         }
-        (found, shown > 0.0)
+        (found, is_shown)
     }
 
     /// Takes the emitters under the remembered spot error where more are needed without it.
@@ -138,23 +153,34 @@ impl FrameSearch {
         history.stacked.add(&mut search, &mut candidate);
     }
 
+    /// The spot error that recent frames showed, where it is more than what is known of the lens.
+    pub fn shown_by_recent_frames(&self) -> Option<f64> {
+        let shown = self.history.as_ref()?.spot_error()?;
+        (shown > self.spot_error.least()).then_some(shown)
+    }
+
     /// Remembers the spot error that the frame shows. Where emitters explain the frame and a lens does as well, the frames decide.
     pub fn remember_shape(&mut self, found: &mut Found, budgets: &mut Budgets) {
         let is_explained = self.compressed_of(found.kind).is_explained_by(&found.hypothesis);
         let Some(history) = self.history.as_mut().filter(|_| !found.hypothesis.sources.is_empty()) else {
             return;
         };
-        if found.spot_error > 0.0 || !is_explained {
-            history.push(found.spot_error);
+        let known = self.spot_error.least();
+        if found.spot_error > known || !is_explained {
+            let shown = Some(found.spot_error).filter(|error| *error > known);
+            history.push(shown.unwrap_or_default());
             return;
         }
         let Reweighting { space, compressed } = &mut self.reweighting;
         let (frame, budget) = (&self.frame, &mut budgets.reweighting);
         let lens = try_spot_error(space, compressed, frame, &found.hypothesis, budget);
+        let lens = lens.filter(|(error, _)| *error > known);
         history.push(lens.as_ref().map_or(0.0, |(error, _)| *error));
-        if let (Some(error), Some((_, bright))) = (history.spot_error(), lens) {
+        if let (Some(error), Some((_, bright))) = (history.spot_error().filter(|error| *error > known), lens) {
             found.hypothesis = search_with_spot_error(space, compressed, frame, error, bright, budget);
             found.spot_error = error;
+        } else if known > 0.0 {
+            keep_weighted(space, compressed, frame, known, &found.hypothesis.sources);
         }
     }
 }

@@ -103,7 +103,7 @@ impl WindowedEstimator {
 
     /// Whether spots differ from the PSF in a way that all have in common, and that no window shows alone.
     fn may_share_misfit(&self) -> bool {
-        self.camera.spot_error.is_none() || self.camera.spot_shape.is_none()
+        !self.camera.spot_error.is_fixed() || self.camera.spot_shape.is_none()
     }
 
     /// Whether the frame's light stands apart before a dark background.
@@ -211,10 +211,11 @@ impl Total {
     fn is_explained(&self, camera: &Camera) -> bool {
         let spread = (2.0 * self.freedom).sqrt() + 1.0;
         let has_misfit = self.deviance > self.freedom + MOST_MISFIT * spread;
-        let is_shape_known = camera.spot_error.is_some_and(|e| e > 0.0);
+        let known = camera.spot_error.least();
+        let is_fixed = camera.spot_error.is_fixed() && known > 0.0;
         !has_misfit
-            && (is_shape_known
-                || self.estimate.spot_error == 0.0 && !are_attended(&self.estimate.emitters, camera.spot_sigma_m))
+            && (is_fixed
+                || self.estimate.spot_error <= known && !are_attended(&self.estimate.emitters, camera.spot_sigma_m))
     }
 
     /// The frame's estimate, given the sums over all of its pixels.
@@ -285,9 +286,10 @@ fn are_attended(emitters: &[Emitter], spot_sigma_m: f64) -> bool {
 
 /// The emitters that cast a halo into a window of the sensor, as the window, whose middle is at `offset`, sees them.
 fn beyond(camera: &Camera, emitters: &[Emitter], offset: [f64; 2], window: &Window) -> Vec<PointSource> {
-    let Some(error) = camera.spot_error.filter(|e| *e > 0.0) else {
+    let error = camera.spot_error.least();
+    if error == 0.0 {
         return Vec::new();
-    };
+    }
     let sigma = camera.spot_sigma_m;
     let norm = halo::norm_of_pitches([&camera.x, &camera.y].map(|axis| axis.pitch_m / sigma));
     let ends = [0, 1].map(|k| {

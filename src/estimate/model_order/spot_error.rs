@@ -41,17 +41,14 @@ pub(crate) enum Shape {
     Different(f64, Hypothesis),
 }
 
-impl Shape {
-    /// Of a spot error that is known, where emitters `beyond` the frame cast a halo into it.
-    pub fn of_spot_error(spot_error: f64, hypothesis: &Hypothesis, beyond: &[PointSource]) -> Self {
-        let mut sources = bright_spots(hypothesis, false);
-        sources.retain(|source| !beyond.iter().any(|head| is_faint_beside(source, head)));
-        let start = Hypothesis {
-            sources,
-            converged: false,
-            ..hypothesis.clone()
-        };
-        Self::Different(spot_error, start)
+/// The bright spots of `hypothesis` that are not the halo of emitters `beyond` the frame.
+pub(crate) fn without_halo_of(beyond: &[PointSource], hypothesis: &Hypothesis) -> Hypothesis {
+    let mut sources = bright_spots(hypothesis, false);
+    sources.retain(|source| !beyond.iter().any(|head| is_faint_beside(source, head)));
+    Hypothesis {
+        sources,
+        converged: false,
+        ..hypothesis.clone()
     }
 }
 
@@ -278,6 +275,19 @@ pub(crate) fn load_weighted(
 ) {
     compressed.load(frame, &space.bases.x, &space.bases.y);
     set_weights(space, compressed, frame, spot_error, sources);
+}
+
+/// The same unless the frame has such weights.
+pub(crate) fn keep_weighted(
+    space: &SearchSpace,
+    compressed: &mut CompressedFrame,
+    frame: &PreprocessedFrame,
+    spot_error: f64,
+    sources: &[PointSource],
+) {
+    if !compressed.has_spot_error() {
+        load_weighted(space, compressed, frame, spot_error, sources);
+    }
 }
 
 /// Weights that allow for the halo of `sources`, and the variances that their positions are reported with.

@@ -13,7 +13,7 @@ use super::lens::shapes::AIRY;
 use super::measured::Measured;
 use crate::estimate::{self, Emitter, position_bound};
 use crate::frame::Frame;
-use crate::optics::{self, Camera, add_spot};
+use crate::optics::{self, Camera, SpotError, add_spot};
 
 /// Pixel pitch and width of a spot: 2.1 pixels, as on 64 × 64 pixels of the paper's sensor.
 const PITCH_M: f64 = 0.03 / 64.0;
@@ -99,7 +99,7 @@ fn measure(is_airy: bool, pixels: [usize; 2], count: usize, frames: u64, seed: u
     let mut camera = config.camera().expect("a camera");
     if is_airy {
         camera.spot_shape = spot_shape(&AIRY, &camera, [0.0; 2]);
-        camera.spot_error = Some(SPOT_ERROR);
+        camera.spot_error = SpotError::Fixed(SPOT_ERROR);
     }
     let mut estimator = estimate::build(&estimate::Config::default(), &camera).expect("an estimator");
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
