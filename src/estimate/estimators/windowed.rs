@@ -212,9 +212,9 @@ impl Total {
         let spread = (2.0 * self.freedom).sqrt() + 1.0;
         let has_misfit = self.deviance > self.freedom + MOST_MISFIT * spread;
         let known = camera.spot_error.least();
-        let is_fixed = camera.spot_error.is_fixed() && known > 0.0;
+        let is_shape_known = camera.spot_error.is_fixed() && known > 0.0;
         !has_misfit
-            && (is_fixed
+            && (is_shape_known
                 || self.estimate.spot_error <= known && !are_attended(&self.estimate.emitters, camera.spot_sigma_m))
     }
 
