@@ -185,6 +185,13 @@ pub fn render(calibration: &Calibration, remarks: &[String]) -> String {
             layout.knot_m,
             list(&layout.half_sensor_m)
         );
+        if let Some(spot::Beyond { error, from_m }) = layout.beyond {
+            let _ = write!(
+                out,
+                "# Farther from the centre than from_m the shape is not known: spots may differ from it by this share of their light.\n\
+                 beyond = {{ error = {error:e}, from_m = {from_m:e} }}\n"
+            );
+        }
         for term in &layout.term {
             let [field, x, y] = [&term.field, &term.x, &term.y].map(|values| list(values));
             let _ = write!(out, "[[spot.shape.term]]\nfield = [{field}]\nx = [{x}]\ny = [{y}]\n");
@@ -258,7 +265,13 @@ mod tests {
         let mut change = astigmatism.components.remove(0);
         change.field = spot::FieldPolynomial(vec![0.0, 0.3, -0.1]);
         template.components.push(change);
-        spot::SpotShape::from_template(&template, 1e-3).unwrap()
+        let beyond = spot::Beyond {
+            error: 0.006,
+            from_m: 3e-3,
+        };
+        spot::SpotShape::from_template(&template, 1e-3)
+            .unwrap()
+            .with_beyond(Some(beyond))
     }
 
     fn calibration() -> Calibration {
@@ -313,6 +326,11 @@ mod tests {
                 "knot_m = 5e-4",
                 "knot_m = 0.0",
                 "spot.shape.knot_m: expected a positive finite number, found 0.0",
+            ),
+            (
+                "error = 6e-3",
+                "error = 0.7",
+                "spot.shape.beyond.error: expected 0 to 0.5, the share of a spot's light, found 0.7",
             ),
             ("field = [", "field = [1.0, ", "light that adds up to 1"),
         ] {

@@ -42,15 +42,22 @@ impl Calibration {
     /// The camera with this calibration in place of its data sheet.
     pub fn applied_to(&self, camera: &Camera) -> Result<Camera, CalibrationError> {
         self.check(camera)?;
+        let (spot_shape, spot_error) = match camera.spot_error {
+            SpotError::AtLeast(_) => (
+                self.spot_shape.clone(),
+                SpotError::AtLeast(self.spot_error.unwrap_or_default()),
+            ),
+            fixed @ SpotError::Fixed(_) => {
+                let shape = self.spot_shape.as_deref().cloned();
+                (shape.map(|shape| Arc::new(shape.with_beyond(None))), fixed)
+            }
+        };
         Ok(Camera {
             distortion: self.distortion,
             spot_sigma_m: self.spot_sigma_m,
             spot_growth: self.spot_growth,
-            spot_shape: self.spot_shape.clone(),
-            spot_error: match camera.spot_error {
-                SpotError::AtLeast(_) => SpotError::AtLeast(self.spot_error.unwrap_or_default()),
-                fixed => fixed,
-            },
+            spot_shape,
+            spot_error,
             noise_std_j: self.noise_std_j,
             pixels: self.pixels.clone(),
             ..camera.clone()

@@ -59,6 +59,11 @@ pub fn prior(model: &TemplateModel, is_first: bool) -> Vec<f64> {
 /// Where light near the edge of the support is looked at, share of its radius: inside of where the prior fades.
 const EDGE: [f64; 2] = [0.6, 0.8];
 
+/// How far from the centre the template's light is that of the spots, m.
+pub fn known_radius_m(model: &TemplateModel) -> f64 {
+    EDGE[1] * model.radius_m()
+}
+
 /// The share of a spot's light by which it differs from a template that ends at the edge of its support: the light near the edge, as even
 /// over a spot's width as a spot's own, over the halo's height there. Real tails fall no slower than the halo does beyond.
 pub fn light_left_out(camera: &Camera, model: &TemplateModel) -> f64 {

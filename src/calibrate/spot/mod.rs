@@ -23,6 +23,7 @@ use std::sync::Arc;
 
 use ndarray::Array2;
 
+use crate::optics::spot::Beyond;
 use crate::optics::{Calibration, Camera, PixelMaps, SpotShape};
 use candidates::BETTER;
 pub use coverage::{CELLS, Coverage};
@@ -237,10 +238,15 @@ pub fn learn(
     }
     let peak_snr = statistics::peak_snr(&last);
     let spots = last.sources();
+    let left_out = (constraints::light_left_out(camera, &last.model) / LEFT).min(Camera::LARGEST_SPOT_ERROR);
+    let shape = shape.with_beyond(Some(Beyond {
+        error: left_out,
+        from_m: constraints::known_radius_m(&last.model),
+    }));
     let spot_error = variance
         .spot_error
         .max(1.0 / information)
-        .max(constraints::light_left_out(camera, &last.model) / LEFT)
+        .max(if is_shape_better { 0.0 } else { left_out })
         .min(Camera::LARGEST_SPOT_ERROR);
     let gain_scatter = maps.as_ref().and_then(pixel_maps::gain_scatter);
     let calibration = Calibration {

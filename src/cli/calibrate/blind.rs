@@ -176,8 +176,16 @@ fn report(camera: &Camera, l: &Learned) -> Vec<String> {
         }
     ));
     let error = l.calibration.spot_error.unwrap_or_default();
+    let beyond = l
+        .shape
+        .beyond()
+        .filter(|_| l.is_shape_better)
+        .map_or_else(String::new, |beyond| {
+            let (error, from_mm) = (beyond.error, 1e3 * beyond.from_m);
+            format!("; {error:.2e} farther than {from_mm:.2} mm from its centre, where the shape is not known")
+        });
     lines.push(format!(
-        "spot error {error:.2e}: the share of a spot's light that the shape leaves unexplained"
+        "spot error {error:.2e}: the share of a spot's light that the shape leaves unexplained{beyond}"
     ));
     let gain = l.gain_j.map_or_else(String::new, |g| {
         let counts = camera
@@ -224,6 +232,7 @@ fn object(args: &Args, camera: &Camera, l: &Learned) -> serde_json::Value {
             "wavefront": l.wavefront,
             "sigma_equivalent_m": l.shape.sigma_equivalent_m(),
             "reach_m": l.shape.radius_m(),
+            "beyond": l.shape.beyond(),
             "encircled_energy": radii.iter().map(|r| [*r, l.shape.encircled_energy([0.0; 2], *r)]).collect::<Vec<_>>(),
         },
         "spot_error": l.calibration.spot_error,

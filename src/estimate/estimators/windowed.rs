@@ -290,6 +290,8 @@ fn beyond(camera: &Camera, emitters: &[Emitter], offset: [f64; 2], window: &Wind
     if error == 0.0 {
         return Vec::new();
     }
+    let beyond = camera.spot_shape.as_ref().and_then(|shape| shape.beyond());
+    let beyond = beyond.map_or(0.0, |beyond| beyond.error);
     let sigma = camera.spot_sigma_m;
     let norm = halo::norm_of_pitches([&camera.x, &camera.y].map(|axis| axis.pitch_m / sigma));
     let ends = [0, 1].map(|k| {
@@ -299,7 +301,7 @@ fn beyond(camera: &Camera, emitters: &[Emitter], offset: [f64; 2], window: &Wind
     let source = |e: &Emitter| {
         let distance = [0, 1].map(|k| (e.sensor_m[k].clamp(ends[k][0], ends[k][1]) - e.sensor_m[k]) / sigma);
         let a = e.energy_j / camera.noise_std_j;
-        let highest = error * norm * a * halo::height(distance[0].powi(2) + distance[1].powi(2));
+        let highest = error.max(beyond) * norm * a * halo::height(distance[0].powi(2) + distance[1].powi(2));
         (highest > LEAST_HALO).then(|| PointSource::new([0, 1].map(|k| (e.sensor_m[k] - offset[k]) / sigma), a))
     };
     emitters.iter().filter_map(source).collect()

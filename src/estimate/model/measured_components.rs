@@ -72,6 +72,13 @@ impl MeasuredShape {
         }
     }
 
+    /// The spot error farther out than this, σ.
+    pub fn beyond(&self) -> Option<(f64, f64)> {
+        self.shape
+            .beyond()
+            .map(|beyond| (beyond.error, beyond.from_m / self.sigma_m))
+    }
+
     /// Separable terms.
     pub fn terms(&self) -> usize {
         self.shape.terms()

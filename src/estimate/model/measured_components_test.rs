@@ -2,10 +2,13 @@
 
 use std::sync::Arc;
 
+use crate::estimate::model::bases::Bases;
+use crate::estimate::model::halo::Halo;
+use crate::estimate::model::hypothesis::PointSource;
 use crate::estimate::model::measured_components::{MeasuredComponents, MeasuredShape, OUTSIDE_CORE, Orders};
 use crate::estimate::model::svd_basis::Basis;
 use crate::optics::Config;
-use crate::optics::spot::{Component, Field, FieldPolynomial, SpotShape, Template};
+use crate::optics::spot::{Beyond, Component, Field, FieldPolynomial, SpotShape, Template};
 
 /// A skewed spot of 7 σ, the config's σ, whose tail grows over the field, on 24 × 21 pixels.
 fn lens() -> (MeasuredShape, [Basis; 2]) {
@@ -68,6 +71,36 @@ fn a_patch_that_was_kept_shows_what_a_new_one_does() {
             light
         });
         assert!(kept == new, "{u:?} {displacement:?} {origin_m:?}");
+    }
+}
+
+#[test]
+fn a_spot_error_grows_beyond_what_is_known_of_a_spot() {
+    let mut camera = Config::default().camera().unwrap();
+    let sigma = camera.spot_sigma_m;
+    let field = Field {
+        half_sensor_m: [camera.x.half_width(), camera.y.half_width()],
+    };
+    let gaussian = |x: f64, y: f64| (-0.5 * (x * x + y * y) / (sigma * sigma)).exp();
+    let shape =
+        SpotShape::from_template(&Template::of_density(field, 0.5 * sigma, 6.0 * sigma, gaussian), 1e-6).unwrap();
+    let pixels = [&camera.x, &camera.y].map(|axis| Basis::pixels(axis, sigma));
+    let centre = [0, 1].map(|k| 0.5 * (pixels[k].edges[10] + pixels[k].edges[11]));
+    let beyond = Beyond {
+        error: 0.3,
+        from_m: 1.1 * sigma,
+    };
+    let mut variances = |beyond: Option<Beyond>| {
+        camera.spot_shape = Some(Arc::new(shape.clone().with_beyond(beyond)));
+        let bases = Bases::new(pixels.clone()).with_shape(&camera);
+        Halo::new(&bases, &[PointSource::new(centre, 100.0)], 0.1).variance
+    };
+    let (two, one) = (variances(Some(beyond)), variances(None));
+    let (columns, pitch) = (pixels[0].n, pixels[0].pitch());
+    for (k, (two, one)) in two.iter().zip(&one).enumerate() {
+        let distance = pitch * ((k % columns) as f64 - 10.0).hypot((k / columns) as f64 - 10.0);
+        let expected = if distance < 1.1 { 1.0 } else { 9.0 };
+        assert!((two / one - expected).abs() < 1e-9, "{distance}: {}", two / one);
     }
 }
 

@@ -4,7 +4,7 @@
 use crate::estimate::fit::work_budget::WorkBudget;
 use crate::estimate::model::bases::Bases;
 use crate::estimate::model::compressed_frame::CompressedFrame;
-use crate::estimate::model::halo::{Halo, height, spot_norm};
+use crate::estimate::model::halo::{ErrorByDistance, Halo, height, spot_norm};
 use crate::estimate::model::hypothesis::{Hypothesis, Nuisances, PointSource, Width};
 use crate::estimate::model_order::bright_spots::{CORE, are_pairs_alike, bright_spots, distance2, is_faint_beside};
 use crate::estimate::model_order::candidate::Candidate;
@@ -250,15 +250,16 @@ pub(crate) fn search_with_spot_error(
 
 /// Removes sources that do not exceed the halo of the others, the faintest first.
 pub(crate) fn drop_halo(bases: &Bases, spot_error: f64, penalty: f64, sources: &mut Vec<PointSource>) {
-    let norm = spot_norm(bases);
+    let (norm, error) = (spot_norm(bases), ErrorByDistance::new(bases, spot_error));
     sources.sort_by(|a, b| b.a.total_cmp(&a.a));
     let mut kept: Vec<PointSource> = Vec::with_capacity(sources.len());
     for source in sources.drain(..) {
-        let halo: f64 = kept
-            .iter()
-            .map(|s| (s.a * norm * height(distance2(s.u, source.u))).powi(2))
-            .sum();
-        if (source.a * norm).powi(2) > penalty * (1.0 + spot_error * spot_error * halo) {
+        let part = |s: &PointSource| {
+            let d2 = distance2(s.u, source.u);
+            (error.at(d2) * s.a * norm * height(d2)).powi(2)
+        };
+        let variance: f64 = kept.iter().map(part).sum();
+        if (source.a * norm).powi(2) > penalty * (1.0 + variance) {
             kept.push(source);
         }
     }
@@ -298,15 +299,14 @@ fn set_weights(
     spot_error: f64,
     sources: &[PointSource],
 ) {
-    let halo = Halo::new(&space.bases, &[sources, &frame.beyond].concat());
-    let variance = |square: f64| 1.0 + spot_error * spot_error * square;
-    compressed.set_weights(frame, space.bases.axes(), |k| variance(halo.square[k]));
+    let halo = Halo::new(&space.bases, &[sources, &frame.beyond].concat(), spot_error);
+    compressed.set_weights(frame, space.bases.axes(), |k| 1.0 + halo.variance[k]);
     let nx = space.bases.x.n;
     let mx = compressed.mx;
     let mut position_weights = compressed.weights.clone();
-    for (k, others) in halo.square_of_others.iter().enumerate() {
+    for (k, others) in halo.variance_of_others.iter().enumerate() {
         let w = &mut position_weights[k / nx * mx + k % nx];
-        *w = w.powi(2) * variance(POSITION_SHARE * *others);
+        *w = w.powi(2) * (1.0 + POSITION_SHARE * others);
     }
     compressed.position_weights = position_weights;
 }

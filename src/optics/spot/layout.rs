@@ -4,7 +4,8 @@ use serde::{Deserialize, Serialize};
 
 use super::field::{Field, FieldPolynomial};
 use super::profile::Profile;
-use super::shape::{SpotShape, Term};
+use super::shape::{Beyond, SpotShape, Term};
+use crate::optics::Camera;
 use crate::toml_file::{Key, OutOfRange};
 
 /// A [`SpotShape`] as the file holds it.
@@ -15,6 +16,7 @@ pub struct Layout {
     pub knot_m: f64,
     /// Where u and v are 1, m from the sensor's centre.
     pub half_sensor_m: [f64; 2],
+    pub beyond: Option<Beyond>,
     pub term: Vec<TermLayout>,
 }
 
@@ -44,6 +46,7 @@ impl Layout {
         Self {
             knot_m: shape.terms[0].x.knot_m(),
             half_sensor_m: shape.field.half_sensor_m,
+            beyond: shape.beyond,
             term: terms.collect(),
         }
     }
@@ -53,6 +56,13 @@ impl Layout {
         let knot_m = key.at("knot_m").positive(self.knot_m)?;
         for half in self.half_sensor_m {
             key.at("half_sensor_m").positive(half)?;
+        }
+        if let Some(Beyond { error, from_m }) = self.beyond {
+            let key = key.at("beyond");
+            key.at("from_m").positive(from_m)?;
+            if !(0.0..=Camera::LARGEST_SPOT_ERROR).contains(&error) {
+                return Err(key.at("error").refuse("0 to 0.5, the share of a spot's light", error));
+            }
         }
         let count = self.term.len();
         if !(1..=SpotShape::MOST_TERMS).contains(&count) {
@@ -92,6 +102,7 @@ impl Layout {
         let shape = SpotShape {
             field,
             terms: terms.collect(),
+            beyond: self.beyond,
         };
         for at in [[0.0, 0.0], [1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]] {
             let total = shape.total(std::array::from_fn(|k| at[k] * field.half_sensor_m[k]));

@@ -13,5 +13,5 @@ mod template;
 pub use field::{Field, FieldPolynomial};
 pub use layout::{Layout, TermLayout};
 pub use profile::{KnotPlace, Profile};
-pub use shape::SpotShape;
+pub use shape::{Beyond, SpotShape};
 pub use template::{Component, Template};

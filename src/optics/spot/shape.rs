@@ -1,5 +1,7 @@
 //! The spot's light distribution as a value.
 
+use serde::{Deserialize, Serialize};
+
 use super::field::{Field, FieldPolynomial};
 use super::profile::Profile;
 
@@ -18,6 +20,17 @@ pub struct SpotShape {
     pub(super) field: Field,
     /// At least one, the strongest first.
     pub(super) terms: Vec<Term>,
+    pub(super) beyond: Option<Beyond>,
+}
+
+/// What a shape does not say of a spot: the light far from its centre.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Beyond {
+    /// Share of a spot's light by which it may differ from the shape there.
+    pub error: f64,
+    /// Distance from the centre, m.
+    pub from_m: f64,
 }
 
 /// Gauss–Legendre nodes and weights of order 5 on [−1, 1] (Abramowitz and Stegun, 1964, table 25.4).
@@ -41,6 +54,15 @@ impl SpotShape {
     /// Half the support along each axis, R, m: no light is further from the centre than this.
     pub fn radius_m(&self) -> f64 {
         self.terms[0].x.radius_m()
+    }
+
+    pub fn beyond(&self) -> Option<Beyond> {
+        self.beyond
+    }
+
+    /// The same shape, knowing what it does not say.
+    pub fn with_beyond(self, beyond: Option<Beyond>) -> Self {
+        Self { beyond, ..self }
     }
 
     /// Factor a_k of term `k` along x.

@@ -137,7 +137,11 @@ impl SpotShape {
             return None;
         }
         normalise(&mut terms);
-        Some(Self { field, terms })
+        Some(Self {
+            field,
+            terms,
+            beyond: None,
+        })
     }
 }
 
