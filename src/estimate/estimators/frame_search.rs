@@ -13,7 +13,7 @@ use crate::estimate::model_order::common_misfit::is_narrow;
 use crate::estimate::model_order::ellipse_history::EllipseHistory;
 use crate::estimate::model_order::initialise::{add_residual_peaks, filter_peaks, initial_hypothesis, initialise};
 use crate::estimate::model_order::maximum_likelihood::maximum_likelihood;
-use crate::estimate::model_order::pruning::without_insignificant;
+use crate::estimate::model_order::pruning::drop_insignificant;
 use crate::estimate::model_order::refine::shrink;
 use crate::estimate::model_order::reweighting::Reweighting;
 use crate::estimate::model_order::search::{Search, SearchSpace};
@@ -241,8 +241,9 @@ impl FrameSearch {
                     let Reweighting { space, compressed } = &mut self.reweighting;
                     compressed.load(&self.frame, &space.bases.x, &space.bases.y);
                     let mut search = space.search(compressed, &self.frame, &mut budgets.reweighting);
-                    let initial = initial_hypothesis(&mut search);
-                    return Found::of(without_insignificant(&mut search, initial), SearchKind::Main);
+                    let mut initial = Candidate::from(initial_hypothesis(&mut search));
+                    drop_insignificant(&mut search, &mut initial);
+                    return Found::of(initial.into_hypothesis(), SearchKind::Main);
                 }
                 let mut initial = initial_hypothesis(&mut search);
                 let is_explained = self.compressed.is_explained_by(&initial);

@@ -1,7 +1,7 @@
 //! Removes sources that do not exceed the misfit around them: where gain scatter or a wrong PSF leaves a residual that grows with the
 //! light, a source must be significant against that residual and not only against the noise.
 
-use crate::estimate::model::hypothesis::{Hypothesis, PointSource};
+use crate::estimate::model::hypothesis::PointSource;
 use crate::estimate::model_order::candidate::Candidate;
 use crate::estimate::model_order::search::Search;
 
@@ -10,16 +10,23 @@ const CERTAIN: f64 = 100.0;
 /// Radius of the neighbourhood whose misfit a source must exceed, σ: it holds 86 % of a spot's light.
 const NEIGHBOURHOOD: f64 = 2.0;
 
-/// A fitted hypothesis without the sources that noise alone may be.
-pub(crate) fn without_insignificant(search: &mut Search, hypothesis: Hypothesis) -> Hypothesis {
+/// Removes the sources that noise alone may be, the least significant first: one of a pair may be needed. Takes no step of a fit.
+pub(crate) fn drop_insignificant(search: &mut Search, candidate: &mut Candidate) {
     let threshold = search.criterion.threshold();
-    let mut candidate = Candidate::from(hypothesis);
-    let mut significance = candidate.wald_statistics(&mut search.context).into_iter();
-    let mut hypothesis = candidate.into_hypothesis();
-    hypothesis
-        .sources
-        .retain(|_| significance.next().is_some_and(|s| s > threshold));
-    hypothesis
+    loop {
+        let significance = candidate.wald_statistics(&mut search.context);
+        let by_significance = |i: &usize, j: &usize| {
+            let energy = |k: usize| candidate.sources[k].a;
+            let order = significance[*i].total_cmp(&significance[*j]);
+            order.then(energy(*i).total_cmp(&energy(*j)))
+        };
+        let least = (0..significance.len()).min_by(by_significance);
+        let Some(least) = least.filter(|&k| significance[k] < threshold) else {
+            break;
+        };
+        candidate.sources.remove(least);
+        candidate.converged = false;
+    }
 }
 
 /// Removes spurious sources, the least significant first, until none is left.

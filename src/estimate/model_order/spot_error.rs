@@ -11,6 +11,7 @@ use crate::estimate::model_order::candidate::Candidate;
 use crate::estimate::model_order::common_misfit::{Agreement, MAX_SPOT_ERROR, common_misfit, is_narrow};
 use crate::estimate::model_order::maximum_likelihood::refit_reweighted;
 use crate::estimate::model_order::proposals::split_all;
+use crate::estimate::model_order::pruning::drop_insignificant;
 use crate::estimate::model_order::search::{Search, SearchSpace};
 use crate::estimate::preprocess::screening::PreprocessedFrame;
 
@@ -236,16 +237,23 @@ pub(crate) fn search_with_spot_error(
     }
     set_weights(space, compressed, frame, spot_error, &candidate.sources);
     let mut search = space.search(compressed, frame, budget);
-    let refined = refit_reweighted(&mut search, candidate.clone().into_hypothesis(), ROUNDS);
+    let mut refined = Candidate::from(refit_reweighted(
+        &mut search,
+        candidate.clone().into_hypothesis(),
+        ROUNDS,
+    ));
+    if search.is_exhausted() {
+        // What was born last has had no death tried.
+        drop_insignificant(&mut search, &mut refined);
+        search.converge(&mut refined);
+    }
     // A bright spot is never its own halo's.
     let is_kept = |spot: &PointSource| refined.sources.iter().any(|s| distance2(s.u, spot.u) < CORE * CORE);
-    match bright.iter().all(is_kept) {
-        true => refined,
-        false => {
-            search.converge(&mut candidate);
-            candidate.into_hypothesis()
-        }
+    if bright.iter().all(is_kept) {
+        return refined.into_hypothesis();
     }
+    search.converge(&mut candidate);
+    candidate.into_hypothesis()
 }
 
 /// Removes sources that do not exceed the halo of the others, the faintest first.
