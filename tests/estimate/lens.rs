@@ -340,3 +340,21 @@ fn a_lens_that_has_changed_since_it_was_learned_makes_no_emitters() {
     let trusting = count(SpotError::Fixed(LEARNED));
     assert!(trusting[1].0 > 5 && trusting[2].0 > 5, "{trusting:?}");
 }
+
+#[test]
+fn pairs_alike_through_a_learned_lens_are_two_emitters_each() {
+    let mut estimator = estimator(None, &camera_of(core_on_wide(SIGMA_M), SpotError::AtLeast(1e-4)));
+    let mut rng = ChaCha8Rng::seed_from_u64(32);
+    let pairs = [[-6e-3, 2e-3], [2e-3, 7e-3], [5e-3, -5e-3]];
+    let halves = |[x, y]: [f64; 2]| [[x, y], [x + 1.5e-3, y + 0.3e-3]];
+    for _ in 0..4 {
+        let shift = [0, 1].map(|_| rng.random_range(-3e-4..3e-4));
+        let spots: Vec<_> = pairs
+            .iter()
+            .flat_map(|at| halves([0, 1].map(|k| at[k] + shift[k])))
+            .map(|at| (at, 300.0))
+            .collect();
+        let pixels = render_density(&camera(), &core_on_wide(SIGMA_M), &spots, &mut rng);
+        assert_eq!(estimator.estimate(&frame(pixels)).unwrap().emitters.len(), 6);
+    }
+}

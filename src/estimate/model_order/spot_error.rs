@@ -66,10 +66,11 @@ pub(crate) fn inspect_shape(
     let is_explained = excess < compressed.most_excess();
     let is_narrow = is_narrow(&space.bases);
     let has_width = hypothesis.nuisances.width != Width::Known;
+    let is_elongated = has_width || may_be_elongated(space, hypothesis);
     let (merged, separate) = (bright_spots(hypothesis, true), bright_spots(hypothesis, false));
     let mut alternatives = match is_explained {
         false => vec![merged, separate],
-        true if has_width || are_pairs_alike(hypothesis) => vec![merged],
+        true if is_elongated => vec![merged],
         true if (!is_narrow || separate.len() >= LEAST_SPOTS) && separate.len() < hypothesis.sources.len() => {
             vec![separate]
         }
@@ -105,6 +106,11 @@ pub(crate) fn inspect_shape(
         }
     }
     Shape::AsModelled
+}
+
+/// Whether pairs of sources may be the elongated spots of a lens that nobody has measured.
+fn may_be_elongated(space: &SearchSpace, hypothesis: &Hypothesis) -> bool {
+    space.bases.shape.is_none() && are_pairs_alike(hypothesis)
 }
 
 /// The bright spots of `hypothesis` with another width, or elongated, where that explains the frame. Asked before spots are compared: those of
@@ -154,7 +160,7 @@ pub(crate) fn try_spot_error(
     hypothesis: &Hypothesis,
     budget: &mut WorkBudget,
 ) -> Option<(f64, Hypothesis)> {
-    if bright_spots(hypothesis, false).len() == hypothesis.sources.len() && !are_pairs_alike(hypothesis) {
+    if bright_spots(hypothesis, false).len() == hypothesis.sources.len() && !may_be_elongated(space, hypothesis) {
         return None;
     }
     compressed.load(frame, &space.bases.x, &space.bases.y);
