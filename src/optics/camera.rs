@@ -66,7 +66,7 @@ pub struct Camera {
     pub pixels: Option<Arc<PixelMaps>>,
 }
 
-/// Share of a spot's light by which its shape may differ from the model, anywhere in its halo.
+/// Share of a spot's light by which its shape may differ from the model; where a learned shape ends, its [`Beyond`](super::spot::Beyond) counts.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum SpotError {
     /// As the config says.
