@@ -3,8 +3,9 @@
 //! A pixel's variance is 1 + (spot_error·H)² in units of the noise, with H² = Σ (a·√G·h(d))² over the sources, h(d) = 1/(1 + (d/3σ)²), and G
 //! a spot's sum of squares over the pixels. With √G a misplaced spot-shaped bump of the share `spot_error` of a source's light has a
 //! significance of one at the source itself, whatever the pixel pitch; a share that does not depend on the pixels would average out where
-//! they are many. Farther out than a learned shape is known, the spot error is the shape's own for there. The profile falls with the square of the distance: slower than the halo of a Moffat profile of index 2.5 (d⁻⁵) and the
-//! rings of an Airy disc (d⁻³), and slow enough that a ghost reflection at 10 σ is covered.
+//! they are many. Farther out than a learned shape is known, the spot error is the shape's own for there. The profile falls with the square
+//! of the distance: slower than the halo of a Moffat profile of index 2.5 (d⁻⁵) and the rings of an Airy disc (d⁻³), and slow enough that a
+//! ghost reflection at 10 σ is covered.
 
 use crate::estimate::dense_linalg::dispatch;
 use crate::estimate::model::bases::Bases;

@@ -72,7 +72,7 @@ impl MeasuredShape {
         }
     }
 
-    /// The spot error farther out than this, σ.
+    /// The spot error farther out than is known of the shape, and from where it counts, σ.
     pub fn beyond(&self) -> Option<(f64, f64)> {
         self.shape
             .beyond()
