@@ -86,10 +86,8 @@ pub(crate) fn report(
             emitter.flags |= Flags::OUT_OF_TIME;
         }
     }
-    let mut seen = present.iter().map(|e| window.targets[*e].is_seen());
-    found
-        .emitters
-        .retain(|_| seen.next().unwrap_or(true) || !rules.hide_dark);
+    let mut seen = present.iter().map(|e| window.targets[*e].is_seen(rules));
+    found.emitters.retain(|_| seen.next().unwrap_or(true));
     Estimate {
         emitters: found.emitters,
         estimator: name,

@@ -11,10 +11,11 @@ const DARK: f64 = 14.0;
 /// brings: a deep fade is not the end.
 const NOT_SEEN: f64 = 5.0;
 const OF_A_FRAME: f64 = 4.0;
-/// A newcomer below so many standard deviations of its energy may be noise until a frame shows it again by so many, and is dropped on less
-/// evidence. More keeps noise until it is a track, less drops newcomers who fade.
+/// A newcomer below so many standard deviations of its energy may be noise until later frames bring this evidence, ln, that it is there. Until
+/// then it is dropped on less evidence, and not reported again: noise that is remembered would be followed as a beam. More keeps noise until it
+/// is a track, less drops newcomers who fade.
 const FAINT: f64 = 9.0;
-const AGAIN: f64 = 4.0;
+const CONFIRMED: f64 = 6.5;
 const DARK_NEWCOMER: f64 = 2.5;
 
 /// An emitter that the window follows.
@@ -27,8 +28,8 @@ pub(crate) struct Target {
     /// Mean energy of its frames, and their number up to [`MANY`].
     mean_energy: f64,
     frames: f64,
-    /// Whether it may be noise.
-    is_doubtful: bool,
+    /// Of one that may be noise: ln of the evidence of later frames that it is there over that it is not.
+    doubt: Option<f64>,
     /// ln of the evidence that it has gone dark over that it has not, never below zero.
     darkness: f64,
     pub straying: Straying,
@@ -57,7 +58,7 @@ impl Target {
             died_s: f64::INFINITY,
             mean_energy: 0.0,
             frames: 0.0,
-            is_doubtful: false,
+            doubt: None,
             darkness: 0.0,
             straying: Straying::default(),
             folded: Light::default(),
@@ -71,23 +72,27 @@ impl Target {
 
     /// Whether it has gone dark, or was noise.
     pub fn is_dark(&self, rules: Rules) -> bool {
-        let is_doubtful = self.is_doubtful && rules.doubt_faint_newcomers;
-        self.darkness > if is_doubtful { DARK_NEWCOMER } else { DARK }
+        self.darkness > if self.is_doubted(rules) { DARK_NEWCOMER } else { DARK }
     }
 
-    /// Whether it is still seen: what is gone would be followed as a beam until it is dropped.
-    pub fn is_seen(&self) -> bool {
-        self.darkness < NOT_SEEN + self.frames.max(1.0).ln()
+    fn is_doubted(&self, rules: Rules) -> bool {
+        self.doubt.is_some() && rules.doubt_faint_newcomers
+    }
+
+    /// Whether it is still seen, or seen for the first time: what is gone would be followed as a beam until it is dropped.
+    pub fn is_seen(&self, rules: Rules) -> bool {
+        let is_new = self.frames <= 1.0;
+        let is_gone = self.darkness >= NOT_SEEN + self.frames.max(1.0).ln();
+        !(is_gone && rules.hide_dark) && (is_new || !self.is_doubted(rules))
     }
 
     /// Takes the energy that the frame at `time_s` measured, with its variance, at `weight` of an independent draw of the fading. The evidence
     /// is between no light and light that is exponentially distributed about its mean, which no fading exceeds by much in the dark.
     pub fn weigh(&mut self, time_s: f64, energy: f64, variance: f64, weight: f64) {
         let std = variance.sqrt();
-        self.is_doubtful = match self.frames > 0.0 {
-            false => self.born_s == time_s && energy < FAINT * std,
-            true => self.is_doubtful && energy < AGAIN * std,
-        };
+        if self.frames == 0.0 && self.born_s == time_s && energy < FAINT * std {
+            self.doubt = Some(0.0);
+        }
         if self.frames > 0.0 && self.mean_energy > 0.0 && std.is_finite() {
             let z = energy / std - std / self.mean_energy;
             // e^{z²/2}·Φ(z), by its asymptote where Φ underflows.
@@ -98,6 +103,7 @@ impl Target {
             };
             let alive = ((2.0 * std::f64::consts::PI).sqrt() * std / self.mean_energy * tail).ln();
             self.darkness = (self.darkness + weight * (-alive).min(OF_A_FRAME)).max(0.0);
+            self.doubt = (self.doubt.map(|doubt| doubt + weight * alive)).filter(|sum| *sum < CONFIRMED);
         }
         self.frames = (self.frames + 1.0).min(MANY);
         self.mean_energy += (energy - self.mean_energy) / self.frames;
