@@ -9,9 +9,11 @@ pub(crate) const SPEED_STD_M_S: f64 = 8.0;
 /// Standard deviation of a change of velocity, m/s: a walker who turns round; a car changes its by as much within two seconds.
 pub(crate) const MANOEUVRE_M_S: f64 = 3.0;
 
-/// Adds to `knowledge` that these emitters may have changed their velocity about `since_s` seconds ago. `unit` is 1 m/s in σ/s.
-pub(crate) fn open(knowledge: &mut JointInformation, who: &[usize], since_s: f64, unit: f64) {
+/// Adds to `knowledge` that these emitters may have changed their velocity about `since_s` seconds ago. `unit` is 1 m/s in σ/s. Returns what
+/// this takes off −2 ln L.
+pub(crate) fn open(knowledge: &mut JointInformation, who: &[usize], since_s: f64, unit: f64) -> f64 {
     let speed = (MANOEUVRE_M_S * unit).powi(2);
+    let mut explained = 0.0;
     for &e in who {
         let at: Vec<usize> = (0..STATE).map(|k| STATE * e + k).collect();
         let noise = DMatrix::from_fn(STATE, STATE, |r, c| {
@@ -24,8 +26,9 @@ pub(crate) fn open(knowledge: &mut JointInformation, who: &[usize], since_s: f64
             // A fifth of the position's is its own: when the manoeuvre was is not known.
             if r == c { 1.2 * shared + 1e-12 } else { shared }
         });
-        knowledge.add_noise(&at, &noise);
+        explained += knowledge.add_noise(&at, &noise);
     }
+    explained
 }
 
 /// Covariance of a state, σ and s, `lag_s` after a time `dt` in which its acceleration had this density, σ²/s³ (Bar-Shalom, Li and Kirubarajan,

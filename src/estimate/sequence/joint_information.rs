@@ -134,24 +134,26 @@ impl JointInformation {
         }
     }
 
-    /// Adds process noise of the given covariance to `indices`: (Λ⁻¹ + GQGᵀ)⁻¹ by Woodbury's identity.
-    pub fn add_noise(&mut self, indices: &[usize], noise: &DMatrix<f64>) {
+    /// Adds process noise of the given covariance to `indices`: (Λ⁻¹ + GQGᵀ)⁻¹ by Woodbury's identity. Returns what this takes off −2 ln L at `at`.
+    pub fn add_noise(&mut self, indices: &[usize], noise: &DMatrix<f64>) -> f64 {
         let n = self.at.len();
         let columns = DMatrix::from_fn(n, indices.len(), |r, c| self.information[(r, indices[c])]);
         let inner = DMatrix::from_fn(indices.len(), indices.len(), |r, c| {
             self.information[(indices[r], indices[c])]
         });
         let Some(precision) = noise.clone().try_inverse() else {
-            return;
+            return 0.0;
         };
         let Some(inverse) = (precision + inner).try_inverse() else {
-            return;
+            return 0.0;
         };
         let own = DVector::from_fn(indices.len(), |k, _| self.gradient[indices[k]]);
+        let explained = (&inverse * &own).dot(&own);
         let weights = &columns * inverse;
         self.gradient -= &weights * own;
         self.information -= &weights * columns.transpose();
         self.symmetrise();
+        explained
     }
 
     fn symmetrise(&mut self) {
@@ -212,5 +214,24 @@ mod tests {
         assert!((&known.information * &covariance - DMatrix::identity(4, 4)).amax() < 1e-9);
         assert!((&covariance - covariance.transpose()).amax() < 1e-15);
         assert!(of(-DMatrix::identity(4, 4)).covariance().is_none());
+    }
+
+    #[test]
+    fn noise_takes_off_what_the_best_disturbance_explains() {
+        let mut known = JointInformation {
+            at: DVector::zeros(4),
+            gradient: DVector::from_column_slice(&[3.0, -1.0, 0.5, 2.0]),
+            information: DMatrix::from_fn(4, 4, |r, c| if r == c { 4.0 } else { 1.0 }),
+        };
+        let before = known.clone();
+        let explained = known.add_noise(&[1, 3], &DMatrix::from_diagonal_element(2, 2, 0.5));
+        let cost =
+            |a: f64, b: f64| before.cost(&DVector::from_column_slice(&[0.0, -a, 0.0, -b])) + (a * a + b * b) / 0.5;
+        let steps = || (-3000..3000).map(|k| f64::from(k) * 1e-3);
+        let least = steps()
+            .flat_map(|a| steps().step_by(10).map(move |b| (a, b)))
+            .map(|(a, b)| cost(a, b))
+            .fold(0.0, f64::min);
+        assert!((explained + least).abs() < 1e-3, "{explained} {least}");
     }
 }

@@ -18,25 +18,33 @@ const LEAST_GAIN: f64 = 1.0;
 enum Proposal {
     /// The same emitters, fitted to the end: what the others are compared with.
     Same,
-    /// The same, where these have changed their velocity in the middle of the window.
-    Turn(Vec<usize>),
     Birth([f64; 2]),
+    /// In place of a newcomer who would be better than the same emitters: those beside them have turned.
+    Turn(Newcomer),
     Death(usize),
     /// What the principal components of all frames show.
     Restart,
 }
 
+/// A window with a newcomer, its score, and who stands beside them.
+struct Newcomer {
+    window: Box<Window>,
+    score: f64,
+    beside: Vec<usize>,
+}
+
 /// A proposal being fitted.
 struct Trial {
+    proposal: Proposal,
     window: Window,
     steps: usize,
     /// What frames have cost that were folded for a turn.
-    folded: Option<f64>,
+    folded: f64,
 }
 
 impl Trial {
     fn score(&self, search: &WindowSearch) -> f64 {
-        search.score(&self.window) + self.folded.unwrap_or(0.0)
+        search.score(&self.window) + self.folded
     }
 }
 
@@ -52,10 +60,8 @@ pub(crate) enum Revised {
 /// A search in progress.
 pub(crate) struct Revision {
     base: Window,
-    /// Of the fitted base, or of the same emitters where some have turned.
+    /// Of the fitted base.
     score: f64,
-    is_fitted: bool,
-    turned: Option<Window>,
     proposals: VecDeque<Proposal>,
     trial: Option<Trial>,
 }
@@ -66,9 +72,6 @@ impl Revision {
     pub fn begin(window: &Window, search: &WindowSearch, births: Vec<[f64; 2]>) -> Option<Self> {
         let mut proposals = VecDeque::from([Proposal::Same]);
         let rules = search.engine.rules;
-        if !births.is_empty() && rules.turns_before_newcomers {
-            proposals.push_back(Proposal::Turn(window.beside(&births, BESIDE)));
-        }
         proposals.extend(births.into_iter().map(Proposal::Birth));
         let is_ambiguous = is_ambiguous(window);
         if is_ambiguous && rules.principal_components {
@@ -83,8 +86,6 @@ impl Revision {
         (proposals.len() > 1).then(|| Self {
             base: window.clone(),
             score: f64::INFINITY,
-            is_fitted: false,
-            turned: None,
             proposals,
             trial: None,
         })
@@ -106,15 +107,12 @@ impl Revision {
         while !search.engine.budget.is_exhausted() {
             let Some(mut trial) = self.trial.take() else {
                 let Some(proposal) = self.proposals.pop_front() else {
-                    return self
-                        .turned
-                        .take()
-                        .map_or(Revised::Finished, |turned| Revised::Better(Box::new(turned)));
+                    return Revised::Finished;
                 };
                 self.trial = self.start(search, proposal);
                 continue;
             };
-            let highest = self.score - LEAST_GAIN - trial.score(search) + trial.window.cost;
+            let highest = self.highest(&trial.proposal) - trial.score(search) + trial.window.cost;
             let progress = trial.window.fit_below(search.engine, &mut trial.steps, highest);
             if progress == Progress::Unfinished && trial.steps > 0 {
                 self.trial = Some(trial);
@@ -127,40 +125,64 @@ impl Revision {
         Revised::Unfinished
     }
 
+    /// The score below which a proposal is the better explanation.
+    fn highest(&self, proposal: &Proposal) -> f64 {
+        match proposal {
+            Proposal::Turn(newcomer) => newcomer.score - TURN_PENALTY,
+            _ => self.score - LEAST_GAIN,
+        }
+    }
+
     fn start(&self, search: &mut WindowSearch, proposal: Proposal) -> Option<Trial> {
         let born_s = self.base.snapshots.first().map_or(self.base.time_s, |s| s.time_s);
         let mut window = self.base.clone();
         let mut steps = TRIAL_STEPS;
-        let mut folded = None;
-        match proposal {
+        let mut folded = 0.0;
+        match &proposal {
             Proposal::Same => {}
-            Proposal::Turn(who) => {
-                folded = Some(search.turn(&mut window, &who)?);
-            }
-            Proposal::Birth(at) => window.insert(Target::born(born_s), at, [0.0; 2]),
-            Proposal::Death(e) => window.remove(e),
+            Proposal::Birth(at) => window.insert(Target::born(born_s), *at, [0.0; 2]),
+            Proposal::Turn(newcomer) => (window, folded) = search.turned(&window, &newcomer.beside),
+            Proposal::Death(e) => window.remove(*e),
             Proposal::Restart => {
                 window = search.restarted(&window)?;
                 steps = CONVERGE_STEPS;
             }
         }
         window.damping = 0.0;
-        Some(Trial { window, steps, folded })
+        Some(Trial {
+            proposal,
+            window,
+            steps,
+            folded,
+        })
     }
 
-    /// Compares a fitted trial. Returns it where it is better.
+    /// Compares a fitted trial. Returns the better window, where there is one.
     fn conclude(&mut self, search: &mut WindowSearch, trial: Trial) -> Option<Window> {
         let score = trial.score(search);
-        let Trial { window, folded, .. } = trial;
-        if !self.is_fitted {
-            (self.is_fitted, self.score, self.base) = (true, score, window);
-            return None;
+        let is_better = score < self.highest(&trial.proposal);
+        let Trial { proposal, window, .. } = trial;
+        match proposal {
+            Proposal::Same => {
+                (self.score, self.base) = (score, window);
+                None
+            }
+            Proposal::Birth(_) if is_better && search.engine.rules.turns_before_newcomers => {
+                let mut beside = window.beside(&[window.place(self.base.len())], BESIDE);
+                beside.retain(|e| *e < self.base.len());
+                if beside.is_empty() {
+                    return Some(window);
+                }
+                self.proposals.push_front(Proposal::Turn(Newcomer {
+                    window: Box::new(window),
+                    score,
+                    beside,
+                }));
+                None
+            }
+            Proposal::Turn(newcomer) if !is_better => Some(*newcomer.window),
+            Proposal::Turn(_) => (score + SURPRISE < self.score).then_some(window),
+            _ => is_better.then_some(window),
         }
-        if folded.is_some() {
-            self.turned = (score + SURPRISE < self.score).then_some(window);
-            self.score = self.score.min(score + TURN_PENALTY);
-            return None;
-        }
-        (score < self.score - LEAST_GAIN).then_some(window)
     }
 }

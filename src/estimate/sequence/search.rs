@@ -29,6 +29,8 @@ const AMBIGUOUS: f64 = 4.0;
 /// Distance, σ, within which who bends their way may be taken for a newcomer: farther, too many of melted scenes lose their velocities,
 /// nearer, those who cross are missed.
 pub(crate) const BESIDE: f64 = 1.5;
+/// Who stands beside a newcomer may have turned in so many frames instead.
+pub(crate) const LATELY: f64 = 8.0;
 /// Penalty of a change of velocity that explains what a newcomer would: walkers turn every some hundred frames.
 pub(crate) const TURN_PENALTY: f64 = 6.0;
 /// Rounds of births and deaths.
@@ -190,20 +192,30 @@ impl WindowSearch<'_, '_, '_> {
         weakest
     }
 
-    /// Lets these targets change their velocity in the middle of the window. Returns what this takes off the score with the frames before;
-    /// `None` where there are none.
-    pub fn turn(&self, window: &mut Window, who: &[usize]) -> Option<f64> {
-        let half = window.snapshots.len() / 2;
-        if half == 0 {
-            return None;
-        }
-        let since_s = window.time_s - window.snapshots[half].time_s;
+    /// The fitted window with these targets free to have changed their velocity when that explains most: before its frames, or in their middle and,
+    /// where they are few, lately. With it, what this takes off the score with the frames before.
+    pub fn turned(&self, window: &Window, who: &[usize]) -> (Window, f64) {
+        let first_s = window.snapshots.first().map_or(window.time_s, |s| s.time_s);
+        let span_s = window.time_s - first_s;
+        let spacing_s = span_s / window.snapshots.len().saturating_sub(1).max(1) as f64;
+        let middle_s = (0.5 * span_s).max(0.5 * LATELY * spacing_s);
+        let [before, amid] = [span_s + spacing_s, middle_s].map(|since_s| self.turned_since(window, who, since_s));
+        let (window, folded, _) = if before.2 > amid.2 { before } else { amid };
+        (window, folded)
+    }
+
+    /// [`Self::turned`] at a time, and with it how much that explains as far as the window is linear.
+    fn turned_since(&self, window: &Window, who: &[usize], since_s: f64) -> (Window, f64, f64) {
+        let mut window = window.clone();
+        let before_s = window.time_s - since_s;
+        let older = window.snapshots.iter().take_while(|s| s.time_s < before_s).count();
         let penalties = |window: &Window| self.penalties(window).iter().sum::<f64>();
-        let before = penalties(window);
-        let folded = window.fold(half) + before - penalties(window);
-        open(&mut window.prior, who, since_s, self.speed_unit);
+        let before = penalties(&window);
+        let folded = window.fold(older) + before - penalties(&window);
+        let explained = open(&mut window.prior, who, since_s, self.speed_unit);
         who.iter().for_each(|&e| window.targets[e].straying.turn());
-        Some(folded)
+        let gain = explained + window.decrease();
+        (window, folded - explained, gain)
     }
 
     /// Grows and shrinks until nothing improves.

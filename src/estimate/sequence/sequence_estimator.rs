@@ -21,7 +21,7 @@ use crate::estimate::sequence::outlook::Outlook;
 use crate::estimate::sequence::report::report;
 use crate::estimate::sequence::residual_map::ResidualSum;
 use crate::estimate::sequence::revision_schedule::{RevisionSchedule, YOUNG};
-use crate::estimate::sequence::search::{BESIDE, TURN_PENALTY, WINDOW_STEPS, WindowSearch};
+use crate::estimate::sequence::search::{BESIDE, LATELY, TURN_PENALTY, WINDOW_STEPS, WindowSearch};
 use crate::estimate::sequence::snapshot::Snapshot;
 use crate::estimate::sequence::straying::SURPRISE;
 use crate::estimate::sequence::target::Target;
@@ -33,8 +33,6 @@ use crate::optics::{Camera, Smear};
 
 /// Steps of a fit to a new frame.
 const FRAME_STEPS: usize = 12;
-/// Who stands beside a newcomer may have turned in so many frames instead.
-const LATELY: f64 = 8.0;
 /// Work of a search that has to end with its frame, in frames' searches: where what is remembered explains nothing.
 const SEARCH_WORK: f64 = 0.5;
 

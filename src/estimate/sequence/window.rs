@@ -162,7 +162,7 @@ impl Window {
                 let dt = next_s - snapshot.time_s;
                 if density > 0.0 && dt > 0.0 {
                     let at: Vec<usize> = (STATE * e..STATE * (e + 1)).collect();
-                    prior.add_noise(&at, &accelerated(density, dt, self.time_s - next_s));
+                    cost -= prior.add_noise(&at, &accelerated(density, dt, self.time_s - next_s));
                 }
             }
         }

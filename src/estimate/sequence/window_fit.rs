@@ -172,6 +172,13 @@ impl Window {
         self.step();
     }
 
+    /// What the best step takes off −2 ln L, as the snapshots are linearised.
+    pub fn decrease(&self) -> f64 {
+        let total = self.sum(&self.state, self.snapshots.iter().map(|s| &s.local));
+        let factor = total.factor(LAMBDA_FLOOR);
+        factor.map_or(0.0, |factor| factor.solve(&total.gradient).dot(&total.gradient))
+    }
+
     /// Adds up the prior and the snapshots as they are linearised, and takes a Gauss–Newton step.
     pub fn step(&mut self) {
         let mut total = self.sum(&self.state, self.snapshots.iter().map(|s| &s.local));
