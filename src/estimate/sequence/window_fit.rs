@@ -73,6 +73,7 @@ impl Window {
             progress = Progress::Converged;
         }
         let span = self.snapshots.first().map_or(0.0, |s| (self.time_s - s.time_s).abs());
+        let mut was_rejected = false;
         while progress == Progress::Unfinished && *steps > 0 && !engine.budget.is_exhausted() {
             *steps -= 1;
             let Some(factor) = total.factor(lambda) else {
@@ -83,14 +84,25 @@ impl Window {
                 continue;
             };
             let mut step = factor.solve(&total.gradient);
-            let predicted = step.dot(&total.gradient);
-            if predicted < NEGLIGIBLE_DECREASE && lambda <= LAMBDA_START {
-                progress = Progress::Converged;
-                break;
-            }
-            if lambda <= LAMBDA_START && cost - ABORT_FACTOR * predicted > highest {
-                progress = Progress::Hopeless;
-                break;
+            let mut predicted = step.dot(&total.gradient);
+            let ends = |predicted: f64| {
+                if predicted < NEGLIGIBLE_DECREASE {
+                    Some(Progress::Converged)
+                } else {
+                    (cost - ABORT_FACTOR * predicted > highest).then_some(Progress::Hopeless)
+                }
+            };
+            if lambda <= LAMBDA_START && ends(predicted).is_some() {
+                // Damping holds back what is known little beside the rest, as where all emitters are together by a moving platform's pose.
+                if let Some(factor) = total.factor(LAMBDA_FLOOR).filter(|_| !was_rejected) {
+                    lambda = LAMBDA_FLOOR;
+                    step = factor.solve(&total.gradient);
+                    predicted = step.dot(&total.gradient);
+                }
+                if let Some(end) = ends(predicted) {
+                    progress = end;
+                    break;
+                }
             }
             shorten(&mut step, span);
             let next = &self.state + &step;
@@ -101,7 +113,9 @@ impl Window {
                 std::mem::swap(&mut locals, &mut trial);
                 total = self.sum(&self.state, &locals);
                 lambda = (0.15 * lambda).max(LAMBDA_FLOOR);
+                was_rejected = false;
             } else {
+                was_rejected = true;
                 lambda *= 4.0;
                 if lambda > LAMBDA_CEILING {
                     progress = Progress::Converged;
