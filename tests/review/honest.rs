@@ -100,6 +100,37 @@ fn a_crowd_that_bends_its_ways_raises_nothing_with_frames_together() {
     }
 }
 
+/// Six who roam below a platform that sways and climbs, whose autopilot is off by 3 mrad, a degree and a metre, 30 ms late.
+const FLIGHT: &str = r#"
+[platform]
+sway = { amplitude_deg = [3, 3], period_s = [8, 9] }
+velocity_m_s = [0, 0, 1]
+[platform.telemetry]
+attitude_sigma_rad = 0.026
+position_sigma_m = 1.0
+attitude_noise_rad = 5e-4
+position_noise_m = 0.02
+attitude_bias_rad = [0.003, -0.002, 0.02]
+position_bias_m = [0.8, -0.6, 0.5]
+delay_s = 0.03
+"#;
+
+/// Faint newcomers that were noise, and who bends their way: both were taken for strangers with these seeds.
+#[test]
+fn a_flight_over_roaming_users_raises_nothing_with_frames_together() {
+    let homes = [[-50, -45], [0, -55], [50, -40], [-45, 45], [5, 50], [50, 40]];
+    let users = homes.iter().enumerate().map(|(k, home_m)| {
+        format!("[[user]]\nname = \"u-{k}\"\nmotion.roam = {{ home_m = {home_m:?}, spread_m = 3, time_s = 15 }}\n")
+    });
+    let scene = FLIGHT.to_owned() + &users.collect::<String>();
+    for seed in [6, 19] {
+        let mut story = Story::only(seed, &scene);
+        story.config.estimator.name = Some("sequence".to_owned());
+        story.seconds = 60.0;
+        review(&story).expect(&[]);
+    }
+}
+
 #[test]
 fn claims_late_and_lost_raise_nothing() {
     for seed in 0..3 {

@@ -138,12 +138,24 @@ mod tests {
     }
 
     #[test]
+    fn a_faint_newcomer_is_seen_at_once_and_again_when_frames_confirm_it() {
+        let is_seen = |energies: &[f64]| target(energies).is_seen(Rules::default());
+        assert!(is_seen(&[7.0]) && !is_seen(&[7.0, 2.0]));
+        assert!(is_seen(&[7.0, 4.5]), "one frame shows it for certain");
+        assert!(
+            !is_seen(&[7.0, 3.0]) && is_seen(&[7.0, 3.0, 3.0, 3.0]),
+            "several together do"
+        );
+        assert!(is_seen(&[70.0, 2.0]), "noise is not that bright");
+    }
+
+    #[test]
     fn a_deep_fade_hides_nobody_and_who_has_gone_is_dropped() {
         let mut seen = vec![100.0; 50];
         let after = |dark: usize, seen: &mut Vec<f64>| {
             seen.resize(50 + dark, 0.0);
             let target = target(seen);
-            (target.is_seen(), target.is_dark(Rules::default()))
+            (target.is_seen(Rules::default()), target.is_dark(Rules::default()))
         };
         assert_eq!(after(2, &mut seen), (true, false));
         assert_eq!(after(3, &mut seen), (false, false));
