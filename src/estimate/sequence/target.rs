@@ -29,7 +29,7 @@ pub(crate) struct Target {
     mean_energy: f64,
     frames: f64,
     /// Of one that may be noise: ln of the evidence of later frames that it is there over that it is not.
-    doubt: Option<f64>,
+    confirmation: Option<f64>,
     /// ln of the evidence that it has gone dark over that it has not, never below zero.
     darkness: f64,
     pub straying: Straying,
@@ -58,7 +58,7 @@ impl Target {
             died_s: f64::INFINITY,
             mean_energy: 0.0,
             frames: 0.0,
-            doubt: None,
+            confirmation: None,
             darkness: 0.0,
             straying: Straying::default(),
             folded: Light::default(),
@@ -76,7 +76,7 @@ impl Target {
     }
 
     fn is_doubted(&self, rules: Rules) -> bool {
-        self.doubt.is_some() && rules.doubt_faint_newcomers
+        self.confirmation.is_some() && rules.doubt_faint_newcomers
     }
 
     /// Whether it is still seen, or seen for the first time: what is gone would be followed as a beam until it is dropped.
@@ -91,7 +91,7 @@ impl Target {
     pub fn weigh(&mut self, time_s: f64, energy: f64, variance: f64, weight: f64) {
         let std = variance.sqrt();
         if self.frames == 0.0 && self.born_s == time_s && energy < FAINT * std {
-            self.doubt = Some(0.0);
+            self.confirmation = Some(0.0);
         }
         if self.frames > 0.0 && self.mean_energy > 0.0 && std.is_finite() {
             let z = energy / std - std / self.mean_energy;
@@ -103,7 +103,8 @@ impl Target {
             };
             let alive = ((2.0 * std::f64::consts::PI).sqrt() * std / self.mean_energy * tail).ln();
             self.darkness = (self.darkness + weight * (-alive).min(OF_A_FRAME)).max(0.0);
-            self.doubt = (self.doubt.map(|doubt| doubt + weight * alive)).filter(|sum| *sum < CONFIRMED);
+            let confirmation = self.confirmation.map(|sum| sum + weight * alive);
+            self.confirmation = confirmation.filter(|sum| *sum < CONFIRMED);
         }
         self.frames = (self.frames + 1.0).min(MANY);
         self.mean_energy += (energy - self.mean_energy) / self.frames;
