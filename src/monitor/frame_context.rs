@@ -73,7 +73,7 @@ pub(super) struct FrameContext {
     pub pose: PoseConsensus,
     /// The pose error that lasts.
     pub bias: PoseBias,
-    /// How that and the rest of the displacement change.
+    /// How the displacement that users share changes.
     pub wander: PoseWander,
     /// The error of this frame's pose that its beams share, but for a steady course.
     pub pose_error: Option<Vector6<f64>>,
@@ -281,19 +281,16 @@ impl FrameContext {
         }
     }
 
-    /// Takes what this frame's beams and claims say of the pose error that lasts, `dt` seconds after the last frame.
+    /// Takes what this frame's beams and claims say of the pose error that lasts and of how it changes, `dt` seconds after the last
+    /// frame.
     pub fn update_bias(&mut self, dt: f64, period_s: f64) {
         if let Some(sight) = &self.view.sight {
             let residuals = residuals(&self.claims, &self.tracker, &self.view);
             self.bias.update(&residuals, sight.cov(), dt, period_s);
+            let is_fresh = self.pose_age_s < FRESH_S;
+            let shared = self.bias.shared_offset(&residuals).filter(|_| is_fresh);
+            self.wander.update(shared, dt, period_s);
         }
-    }
-
-    /// Follows the displacement in the middle of the view, where the platform moves, enough users agree and the pose is not old.
-    pub fn update_wander(&mut self, dt: f64) {
-        let is_known = self.view.sight.is_some() && self.pose.support().0 > 0 && self.pose_age_s < FRESH_S;
-        let middle = self.view.middle_and_edges_m().first().copied().filter(|_| is_known);
-        self.wander.update(middle.map(|p| self.displacement_at(p)), dt);
     }
 
     /// How far the lasting pose error displaces a beam at `p`, m; nowhere for a fixed platform.

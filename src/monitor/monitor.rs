@@ -230,7 +230,6 @@ impl Monitor {
             witness.claimed += frame.bias_at(witness.claimed);
         }
         frame.pose.update(&beams, &witnesses, dt, period_s);
-        frame.update_wander(dt);
         let displacements: Vec<_> = (frame.claims.iter().map(|c| frame.displacement_at(c.position))).collect();
         for (claim, displacement) in frame.claims.iter_mut().zip(displacements) {
             claim.position += displacement;

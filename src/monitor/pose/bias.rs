@@ -4,6 +4,7 @@
 use nalgebra::{Matrix2, Matrix2x6, Matrix6, Vector2, Vector6};
 
 use crate::monitor::stats::gaussian::mahalanobis2;
+use crate::monitor::stats::robust::{median_vector, variance_of_median};
 
 /// Time over which claims are averaged, s. Longer is more exact, shorter follows a heading or a place that wanders. Not measured.
 const SMOOTHING_S: f64 = 10.0;
@@ -11,6 +12,8 @@ const SMOOTHING_S: f64 = 10.0;
 const HALF_WEIGHT: f64 = 2.0;
 /// Distance beyond which a user does not count, standard deviations.
 const OUTSIDE: f64 = 5.0;
+/// Users that say together how the pose is off, at least: with fewer one of them would.
+const MIN_SHARING: usize = 3;
 /// Variances below which no pose is taken to be known, rad² and m²: keeps the prior regular.
 const LEAST: [f64; 2] = [1e-12, 1e-8];
 
@@ -28,6 +31,14 @@ pub struct Residual {
     pub offset: Vector2<f64>,
     pub variance: f64,
     pub by_pose: Matrix2x6<f64>,
+}
+
+/// How far beams are from their claims together, m.
+#[derive(Clone, Copy, Debug)]
+pub struct SharedOffset {
+    pub offset: Vector2<f64>,
+    /// Per axis, m².
+    pub variance: f64,
 }
 
 impl PoseBias {
@@ -68,6 +79,18 @@ impl PoseBias {
             self.vector += r.by_pose.transpose() * r.offset * weight;
         }
         self.solve(&prior_information, &prior);
+    }
+
+    /// What residuals share: of what the lasting error leaves of each the median, which liars fewer than a half do not choose, and what
+    /// that error makes where the users are. None with fewer than three.
+    pub fn shared_offset(&self, residuals: &[Residual]) -> Option<SharedOffset> {
+        let n = residuals.len();
+        let mean = |sum: Vector2<f64>| sum / n as f64;
+        (n >= MIN_SHARING).then(|| SharedOffset {
+            offset: median_vector(residuals.iter().map(|r| r.offset - r.by_pose * self.error))
+                + mean(residuals.iter().map(|r| r.by_pose * self.error).sum()),
+            variance: variance_of_median(residuals.iter().map(|r| r.variance).sum::<f64>() / n as f64, n),
+        })
     }
 
     /// Squared distance of a claim from its beam, standard deviations.

@@ -5,8 +5,8 @@ use nalgebra::Vector2;
 use super::displacement::Displacement;
 use super::search::{Pair, agreeing, search, search_turned, turn_of};
 use super::witness::Witness;
-use crate::monitor::stats::claim_consistency::COMMON_SHARE;
-use crate::monitor::stats::robust::median_vector;
+use crate::monitor::stats::claim_consistency::share_after_averaging;
+use crate::monitor::stats::robust::{median_vector, variance_of_median};
 
 /// Share of the users in view that must agree: with fewer than a third of them lying no false displacement finds its quorum.
 const QUORUM: f64 = 2.0 / 3.0;
@@ -88,11 +88,9 @@ impl PoseConsensus {
         }
         self.agreeing = pairs.len();
         self.average(&pairs, dt, is_new);
-        // The median's variance is π/2 times the mean's; an exponential mean over τ averages 2τ worth of claims.
         let mean_variance = witnesses.iter().map(|w| w.variance).sum::<f64>() / witnesses.len() as f64;
-        let claims = (2.0 * self.averaged_s.min(SMOOTHING_S) / period_s.max(0.01)).max(1.0);
-        let kept = COMMON_SHARE + (1.0 - COMMON_SHARE) / claims;
-        self.variance = std::f64::consts::FRAC_PI_2 * mean_variance / pairs.len() as f64 * kept;
+        self.variance = variance_of_median(mean_variance, pairs.len())
+            * share_after_averaging(self.averaged_s.min(SMOOTHING_S), period_s);
         self.decide_turn(&pairs);
     }
 

@@ -1,7 +1,7 @@
 //! `pose_inconsistent`: all users are displaced alike, by more than is corrected in silence, or by an error that changes faster than an
 //! honest one.
 
-use nalgebra::Vector2;
+use nalgebra::{Matrix2, Vector2};
 use serde_json::json;
 
 use crate::monitor::alert::{AlertKind, Severity};
@@ -37,7 +37,8 @@ pub fn evaluate(frame: &FrameContext) -> Vec<Finding> {
     let is_open = frame.alerts.is_open(&CAUSE);
     // A dragged position is held against where it was, not against the error that the poses' source states.
     let change = frame.wander.change();
-    let is_dragged = neg_log_p_outside(change, &frame.displacement_cov(place), limit) > threshold;
+    let change_cov = Matrix2::identity() * frame.wander.variance();
+    let is_dragged = neg_log_p_outside(change, &change_cov, limit) > threshold;
     let is_present = neg_log_p > threshold || is_dragged || (is_open && worst.norm() > ENDS_BELOW * limit);
     if !is_present {
         return vec![Finding::Absent(CAUSE)];
@@ -98,6 +99,7 @@ fn worst_displacement(frame: &FrameContext) -> (Vector2<f64>, Vector2<f64>) {
 mod tests {
     use super::*;
     use crate::monitor::fixture::{Scene, absent, present};
+    use crate::monitor::pose::bias::SharedOffset;
     use crate::monitor::pose::consensus::PoseConsensus;
     use crate::monitor::pose::wander::PoseWander;
     use crate::monitor::pose::witness::Witness;
@@ -152,7 +154,11 @@ mod tests {
         let drag = |scene: &mut Scene, speed: f64| {
             for k in 0..600 {
                 let seconds = (f64::from(k) * 0.1 - 50.0).max(0.0);
-                scene.wander.update(Some(Vector2::new(speed * seconds, 0.0)), 0.1);
+                let shared = SharedOffset {
+                    offset: Vector2::new(speed * seconds, 0.0),
+                    variance: 0.03,
+                };
+                scene.wander.update(Some(shared), 0.1, 1.0);
             }
             evaluate(scene.context())
         };

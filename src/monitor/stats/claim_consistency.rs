@@ -15,6 +15,13 @@ pub const WINDOWS: [usize; 6] = [1, 2, 4, 8, 16, 32];
 /// docs/verdicts.md, whose claims have half of their variance wandering over a minute, raise nothing with it.
 pub const COMMON_SHARE: f64 = 0.25;
 
+/// Share of a claim's variance that is left in an exponential mean over `memory_s`, which averages twice that time, of one claim every
+/// `period_s`.
+pub fn share_after_averaging(memory_s: f64, period_s: f64) -> f64 {
+    let claims = (2.0 * memory_s / period_s.max(0.01)).max(1.0);
+    COMMON_SHARE + (1.0 - COMMON_SHARE) / claims
+}
+
 /// One claim against where its beam was at the claim's own time.
 #[derive(Clone, Copy, Debug)]
 struct Residual {

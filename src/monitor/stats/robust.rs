@@ -1,5 +1,7 @@
 //! Order statistics: medians and quantiles, none of which a minority of liars can move far.
 
+use std::f64::consts::FRAC_PI_2;
+
 use nalgebra::Vector2;
 
 /// The median; of an even number of values the mean of the two in the middle. `None` of none.
@@ -25,6 +27,11 @@ pub fn ninth_decile(values: impl Iterator<Item = f64>) -> Option<f64> {
 pub fn median_vector(values: impl Iterator<Item = Vector2<f64>> + Clone) -> Vector2<f64> {
     let axis = |k: usize| median(values.clone().map(|v| v[k])).unwrap_or(0.0);
     Vector2::new(axis(0), axis(1))
+}
+
+/// Variance of the median of `count` Gaussian values: π/2 times that of their mean.
+pub fn variance_of_median(variance: f64, count: usize) -> f64 {
+    FRAC_PI_2 * variance / count as f64
 }
 
 /// What displacements have in common: their component-wise upper median where there are more than `others`, else nothing.
