@@ -1,5 +1,7 @@
 //! What is known of all emitters' positions and velocities together: a quadratic log likelihood in information form.
 
+use faer::linalg::solvers::{DenseSolveCore as _, Llt};
+use faer::{MatRef, Side};
 use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
 
 /// Numbers of an emitter's state: position (x, y) in σ and velocity in σ/s.
@@ -40,17 +42,15 @@ impl JointInformation {
 
     /// Adds what a frame `dt` seconds later says of the positions of some emitters: its gradient at `at` and its information.
     pub fn absorb(&mut self, emitters: &[usize], dt: f64, gradient: &DVector<f64>, information: &DMatrix<f64>) {
-        for (i, &e) in emitters.iter().enumerate() {
-            for k in 0..2 {
-                let row = STATE * e + k;
-                self.gradient[row] += gradient[2 * i + k];
-                self.gradient[row + 2] += dt * gradient[2 * i + k];
-            }
-            for (j, &f) in emitters.iter().enumerate() {
-                for k in 0..2 {
-                    for l in 0..2 {
+        for (j, &f) in emitters.iter().enumerate() {
+            for l in 0..2 {
+                let c = STATE * f + l;
+                self.gradient[c] += gradient[2 * j + l];
+                self.gradient[c + 2] += dt * gradient[2 * j + l];
+                for (i, &e) in emitters.iter().enumerate() {
+                    for k in 0..2 {
                         let v = information[(2 * i + k, 2 * j + l)];
-                        let (r, c) = (STATE * e + k, STATE * f + l);
+                        let r = STATE * e + k;
                         self.information[(r, c)] += v;
                         self.information[(r + 2, c)] += dt * v;
                         self.information[(r, c + 2)] += dt * v;
@@ -102,7 +102,7 @@ impl JointInformation {
         }
         self.at = DVector::from_fn(kept.len(), |k, _| self.at[kept[k]]);
         (self.information, self.gradient) = (information, gradient);
-        self.symmetrise();
+        self.information.fill_lower_triangle_with_upper_triangle();
     }
 
     /// The same knowledge `dt` seconds later, every emitter having gone straight on: Λ' = F⁻ᵀΛF⁻¹.
@@ -151,47 +151,32 @@ impl JointInformation {
         let explained = (&inverse * &own).dot(&own);
         let weights = &columns * inverse;
         self.gradient -= &weights * own;
-        self.information -= &weights * columns.transpose();
-        self.symmetrise();
+        self.information.gemm(-1.0, &weights, &columns.transpose(), 1.0);
+        self.information.fill_lower_triangle_with_upper_triangle();
         explained
     }
 
-    fn symmetrise(&mut self) {
-        let transposed = self.information.transpose();
-        self.information += transposed;
-        self.information *= 0.5;
-    }
-
-    /// Λ⁻¹, where it is regular. The factor's own inverse takes longer: it does not know what is triangular and what symmetric.
+    /// Λ⁻¹, where it is regular.
     pub fn covariance(&self) -> Option<DMatrix<f64>> {
-        let factor = self.factor(RIDGE)?.unpack();
-        let n = factor.nrows();
-        let mut root = DMatrix::identity(n, n);
-        for k in 0..n {
-            let left = n - k;
-            factor
-                .view((k, k), (left, left))
-                .solve_lower_triangular_mut(&mut root.view_mut((k, k), (left, 1)));
-        }
-        let mut covariance = DMatrix::zeros(n, n);
-        for c in 0..n {
-            let below = root.view((c, c), (n - c, 1));
-            for r in 0..=c {
-                let product = root.view((c, r), (n - c, 1)).dot(&below);
-                (covariance[(r, c)], covariance[(c, r)]) = (product, product);
-            }
-        }
-        Some(covariance)
+        let n = self.at.len();
+        let damped = self.damped(RIDGE);
+        let factor = Llt::new(MatRef::from_column_major_slice(damped.as_slice(), n, n), Side::Lower).ok()?;
+        let inverse = factor.inverse();
+        Some(DMatrix::from_fn(n, n, |r, c| inverse[(r, c)]))
     }
 
     /// The Cholesky factor of Λ with its diagonal raised by `relative`.
     pub fn factor(&self, relative: f64) -> Option<Cholesky<f64, Dyn>> {
+        Cholesky::new(self.damped(relative))
+    }
+
+    fn damped(&self, relative: f64) -> DMatrix<f64> {
         let mut damped = self.information.clone();
         for k in 0..damped.nrows() {
             let d = damped[(k, k)];
             damped[(k, k)] = d + relative * d.abs() + 1e-300;
         }
-        Cholesky::new(damped)
+        damped
     }
 }
 

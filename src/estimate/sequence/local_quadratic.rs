@@ -108,13 +108,17 @@ impl LocalQuadratic {
         let free: Vec<usize> = all.iter().copied().filter(|&k| is_free[k]).collect();
         let mut information = DMatrix::from_fn(2 * n, 2 * n, |r, c| entry(position(r), position(c)));
         let mut energy_variances = vec![f64::INFINITY; n];
-        if let Some(factor) = factor(&free) {
-            let cross = DMatrix::from_fn(free.len(), 2 * n, |r, c| entry(energy(free[r]), position(c)));
-            information -= cross.transpose() * factor.solve(&cross);
+        let known_free = factor(&free);
+        if let Some(factor) = &known_free {
+            let mut cross = DMatrix::from_fn(free.len(), 2 * n, |r, c| entry(energy(free[r]), position(c)));
+            factor.l_dirty().solve_lower_triangular_mut(&mut cross);
+            information -= cross.transpose() * cross;
         }
-        if let Some(factor) = factor(&all) {
-            let inverse = factor.inverse();
-            energy_variances = (0..n).map(|k| inverse[(k, k)]).collect();
+        let known = if free.len() == linear { known_free } else { factor(&all) };
+        if let Some(factor) = known {
+            let mut root = DMatrix::identity(linear, linear);
+            factor.l_dirty().solve_lower_triangular_mut(&mut root);
+            energy_variances = (0..n).map(|k| root.column(k).norm_squared()).collect();
         }
         let is_lit = is_free[..n].to_vec();
         Self {

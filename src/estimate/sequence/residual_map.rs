@@ -133,6 +133,12 @@ fn divide_by_outside(filter: &MatchedFilter, spots: &[UnitSpot], sum: &mut [f64]
     let n = spots.len();
     let along = |k: usize| -> Vec<Vec<f64>> { spots.iter().map(|s| filter.respond_along(k, &s.profiles[k])).collect() };
     let [x, y] = [along(0), along(1)];
+    let mut gram = DMatrix::from_diagonal_element(n, n, 1.0 + 1e-12);
+    for c in 0..n {
+        for r in 0..c {
+            (gram[(r, c)], gram[(c, r)]) = [spots[r].overlap(&spots[c]); 2].into();
+        }
+    }
     let (mut near, mut factor) = (Vec::new(), Vec::new());
     let mut overlaps = vec![0.0; n];
     let mut squares = vec![0.0; filter.width()];
@@ -141,7 +147,7 @@ fn divide_by_outside(filter: &MatchedFilter, spots: &[UnitSpot], sum: &mut [f64]
         let nearest: Vec<usize> = (0..n).filter(is_near).collect();
         if nearest != near {
             near = nearest;
-            let Some(next) = factor_of(near.iter().map(|k| &spots[*k])) else {
+            let Some(next) = factor_of(&gram, &near) else {
                 sum.fill(0.0);
                 return;
             };
@@ -169,14 +175,9 @@ fn divide_by_outside(filter: &MatchedFilter, spots: &[UnitSpot], sum: &mut [f64]
     }
 }
 
-/// The rows of the Cholesky factor of the overlaps of spots: what is left of the diagonal, and one over that.
-fn factor_of<'a>(spots: impl Iterator<Item = &'a UnitSpot>) -> Option<Vec<(Vec<f64>, f64)>> {
-    let spots: Vec<&UnitSpot> = spots.collect();
-    let gram = DMatrix::from_fn(spots.len(), spots.len(), |i, j| {
-        let ridge = if i == j { 1.0 + 1e-12 } else { 1.0 };
-        ridge * spots[i].overlap(spots[j])
-    });
-    let factor = gram.cholesky()?.l();
+/// The rows of the Cholesky factor of the overlaps of these spots: what is left of the diagonal, and one over that.
+fn factor_of(gram: &DMatrix<f64>, spots: &[usize]) -> Option<Vec<(Vec<f64>, f64)>> {
+    let factor = gram.select_rows(spots).select_columns(spots).cholesky()?.l();
     let rows = factor.row_iter().enumerate();
     Some(
         rows.map(|(r, row)| (row.columns(0, r).iter().copied().collect(), 1.0 / row[r]))

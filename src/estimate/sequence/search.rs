@@ -101,9 +101,8 @@ impl WindowSearch<'_, '_, '_> {
             for (_, at) in peaks.into_iter().take(PEAKS) {
                 let mut next = window.clone();
                 next.insert(Target::born(born_s), at, [0.0; 2]);
-                next.fit(self.engine, TRIAL_STEPS);
                 let bar = best.as_ref().map_or(before - 1e-6, |b| self.score(b));
-                if self.score(&next) < bar {
+                if self.is_below(bar, &mut next) {
                     best = Some(next);
                 }
             }
@@ -123,9 +122,8 @@ impl WindowSearch<'_, '_, '_> {
             for e in self.doubtful(window) {
                 let mut next = window.clone();
                 next.remove(e);
-                next.fit(self.engine, TRIAL_STEPS);
                 let bar = best.as_ref().map_or(before, |b| self.score(b));
-                if self.score(&next) < bar {
+                if self.is_below(bar, &mut next) {
                     best = Some(next);
                 }
             }
@@ -134,6 +132,14 @@ impl WindowSearch<'_, '_, '_> {
             has_shrunk = true;
         }
         has_shrunk
+    }
+
+    /// Fits a window, as long as its score may come below `bar`. Whether it does.
+    fn is_below(&mut self, bar: f64, window: &mut Window) -> bool {
+        window.damping = 0.0;
+        let highest = bar - self.score(window) + window.cost;
+        window.fit_below(self.engine, &mut { TRIAL_STEPS }, highest);
+        self.score(window) < bar
     }
 
     /// Targets whose light is little against its errors, the weakest first.
