@@ -24,6 +24,11 @@ const CELLS: [(Noise, f64); 6] = [
     (Noise::Energy, 8.0),
     (Noise::Paper, 8.0),
 ];
+/// Emitters of the cells that hold many, and the strength of their fading.
+const MANY: [usize; 2] = [20, 40];
+const STD_OF_MANY: f64 = 0.29;
+/// A walk of these for so many of any other cell.
+const OF_MANY: u64 = 4;
 /// Times as many walks of the paper's scene as of any other cell.
 const OF_PAPER: u64 = 5;
 /// Largest error over the bound, smallest share of numbers right, and largest error in the paper's scene, m².
@@ -31,6 +36,9 @@ const MOST_OVER_BOUND: f64 = 1.2;
 const RIGHT: f64 = 0.99;
 const PAPER_RIGHT: f64 = 0.95;
 const PAPER_M2: f64 = 1.0;
+
+const HEADER: &str = "| cell | rate, Hz | std of energy | frames | bound (median), m² | `sequence` over bound | `ml` over bound | number \
+                      right: `sequence` | `ml` | median, µs | 99th, µs |\n|---|---|---|---|---|---|---|---|---|---|---|\n";
 
 /// What came of an estimator's answers after so many frames.
 #[derive(Default)]
@@ -83,17 +91,17 @@ struct Row {
 
 /// So many walks of each cell, frame rate and strength of the fading.
 pub fn frames_together(walks: u64, seed: u64, estimator: &estimate::Config) -> Measured {
-    let mut text = "Squared error over the bound of all frames so far (1 is at the bound), median over resolvable emitters, a missed one \
-                    counting as ∞; number right: of the walks where all emitters are resolvable.\n\n\
-                    | cell | rate, Hz | std of energy | frames | bound (median), m² | `sequence` over bound | `ml` over bound | number right: \
-                    `sequence` | `ml` | median, µs | 99th, µs |\n|---|---|---|---|---|---|---|---|---|---|---|\n"
-        .to_owned();
+    let mut text = format!(
+        "Squared error over the bound of all frames so far (1 is at the bound), median over resolvable emitters, a missed one counting as \
+         ∞; number right: of the walks where all emitters are resolvable.\n\n{HEADER}"
+    );
     let (mut cells, mut at_bound, mut clear, mut right) = (0, 0, 0, 0);
     for (noise, sigma_mm) in CELLS {
         let cell = Cell::new(noise, sigma_mm, 64);
         for rate_hz in RATES_HZ {
             for relative_std in RELATIVE_STDS {
                 let walk = Walk {
+                    emitters: None,
                     frames: AFTER[AFTER.len() - 1],
                     rate_hz,
                     speed_m_s: 1.0,
@@ -113,12 +121,13 @@ pub fn frames_together(walks: u64, seed: u64, estimator: &estimate::Config) -> M
             }
         }
     }
+    let many = many(walks.div_ceil(OF_MANY), seed, estimator.rules);
     let (paper, paper_holds) = paper(OF_PAPER * walks, seed, estimator.rules);
     let share = right as f64 / clear.max(1) as f64;
     write!(
         text,
         "\n{at_bound} of {cells} rows with resolvable emitters within {MOST_OVER_BOUND} of the bound; number right in {right} of {clear} \
-         answers where all are resolvable\n\n{paper}"
+         answers where all are resolvable\n\n{many}\n{paper}"
     )
     .expect("text takes all");
     Measured {
@@ -127,9 +136,30 @@ pub fn frames_together(walks: u64, seed: u64, estimator: &estimate::Config) -> M
     }
 }
 
+/// Many emitters at 10 Hz.
+fn many(walks: u64, seed: u64, rules: Rules) -> String {
+    let mut text = HEADER.to_owned();
+    for emitters in MANY {
+        let cell = Cell::new(Noise::Energy, 1.0, 64).holding(emitters);
+        let walk = Walk {
+            emitters: Some(emitters),
+            frames: AFTER[AFTER.len() - 1],
+            rate_hz: 10.0,
+            speed_m_s: 1.0,
+            relative_std: STD_OF_MANY,
+        };
+        for (frames, row) in AFTER.into_iter().zip(measure(&cell, &walk, &AFTER, walks, seed, rules)) {
+            let setting = format!("{} | 10 | {STD_OF_MANY} | {frames}", cell.name());
+            writeln!(text, "| {setting} | {} |", row.cells()).expect("text takes all");
+        }
+    }
+    text
+}
+
 /// The paper's scene to the letter: σ_eff 8 mm, N₀ 10⁻¹², users who stand still, strong fading.
 fn paper(walks: u64, seed: u64, rules: Rules) -> (String, bool) {
     let walk = Walk {
+        emitters: None,
         frames: 100,
         rate_hz: 10.0,
         speed_m_s: 0.0,
@@ -242,6 +272,7 @@ mod tests {
     #[test]
     fn frames_together_are_nearer_than_the_newest_alone() {
         let walk = Walk {
+            emitters: None,
             frames: 10,
             rate_hz: 10.0,
             speed_m_s: 1.0,

@@ -115,6 +115,7 @@ fn exposed(camera: &Camera, exposure_s: f64, is_read_noise: bool) -> Camera {
 fn expose(camera: &Camera, exposure_s: f64, rng: &mut ChaCha8Rng) -> Snapshots {
     let longest_s = OBSERVED_S[OBSERVED_S.len() - 1];
     let fading = Walk {
+        emitters: None,
         frames: (longest_s / COHERENCE_S).round() as usize,
         rate_hz: 1.0 / COHERENCE_S,
         speed_m_s: 0.0,

@@ -18,6 +18,8 @@ const INNER: f64 = 0.88;
 /// How emitters move and fade from frame to frame.
 #[derive(Clone, Copy, Debug)]
 pub(in crate::study) struct Walk {
+    /// Five to nine without.
+    pub emitters: Option<usize>,
     pub frames: usize,
     pub rate_hz: f64,
     /// Largest speed, m/s; 0 for users who stand still.
@@ -26,7 +28,7 @@ pub(in crate::study) struct Walk {
     pub relative_std: f64,
 }
 
-/// The truth of frames one after another: five to nine emitters that walk straight on, with energies of their own in each frame.
+/// The truth of frames one after another: emitters that walk straight on, with energies of their own in each frame.
 pub(in crate::study) struct Snapshots {
     pub starts_m: Vec<[f64; 2]>,
     pub velocities_m_s: Vec<[f64; 2]>,
@@ -39,7 +41,7 @@ impl Snapshots {
     pub fn draw(camera: &Camera, walk: &Walk, rng: &mut ChaCha8Rng) -> Self {
         let is_moving = walk.speed_m_s > 0.0;
         let half = AREA_HALF_M * if is_moving { INNER } else { 1.0 };
-        let n = rng.random_range(5..=9);
+        let n = walk.emitters.unwrap_or_else(|| rng.random_range(5..=9));
         let starts_m: Vec<[f64; 2]> = (0..n)
             .map(|_| std::array::from_fn(|_| rng.random_range(-half..half)))
             .collect();
@@ -186,6 +188,7 @@ mod tests {
     fn drawn(speed_m_s: f64) -> (Camera, Snapshots) {
         let camera = Cell::new(Noise::Energy, 4.0, 64).camera().unwrap();
         let walk = Walk {
+            emitters: None,
             frames: 40,
             rate_hz: 10.0,
             speed_m_s,
