@@ -56,6 +56,18 @@ fn exposures_in_turns_raise_nothing_and_energies_are_those_of_the_long_ones() {
     }
 }
 
+/// One draw of the fading to an exposure: some are seen a hundred times as well as others, whose noise was taken for what all beams have in
+/// common, and so for a second beam in these spots.
+#[test]
+fn light_that_fades_to_next_to_nothing_raises_nothing() {
+    for (seed, seconds) in [(1005, 12.0), (1002, 24.0), (32, 30.0)] {
+        let mut story = Story::with(seed, "");
+        story.change(|scene| scene.link.coherence_time_s = scene.link.integration_time_s);
+        story.seconds = seconds;
+        review(&story).expect(&[]);
+    }
+}
+
 /// Their beams melt into one spot for some seconds. Who is who afterwards is known by how they walked.
 #[test]
 fn users_that_cross_raise_nothing_and_keep_their_tracks() {

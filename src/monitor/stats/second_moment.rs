@@ -147,19 +147,21 @@ impl SecondMomentTest {
         });
     }
 
-    /// The most significant window, as it is against the other beams or by its rise against its own past.
+    /// The most significant window, as it is against the other beams or by its rise against its own past; with or without what the others
+    /// show, whichever says less: that may be their noise.
     pub fn most_significant(&self, common: &CommonMode) -> Widening {
         let mut most = Widening::default();
         let lens = Matrix3::identity() * LENS_SCATTER.powi(2);
         for (window, common) in self.windows.iter().zip(&common.0) {
             let Some(window) = window else { break };
-            let level = Some((window.level.0 - common.level.0, window.level.1 + common.level.1 + lens));
-            let rise = window
-                .rise
-                .map(|(rise, cov)| (rise - common.rise.0, cov + common.rise.1));
-            for (off, cov) in level.into_iter().chain(rise) {
-                let Some(inverse) = cov.try_inverse() else { continue };
-                let found = widening(off, inverse);
+            let level = Some(((window.level.0, window.level.1 + lens), common.level));
+            let rise = window.rise.map(|rise| (rise, common.rise));
+            for ((own, cov), (shared, shared_cov)) in level.into_iter().chain(rise) {
+                let of = |off, cov: Matrix3<f64>| cov.try_inverse().map(|inverse| widening(off, inverse));
+                let (Some(less), Some(whole)) = (of(own - shared, cov + shared_cov), of(own, cov)) else {
+                    continue;
+                };
+                let found = if less.neg_log_p < whole.neg_log_p { less } else { whole };
                 if found.neg_log_p > most.neg_log_p {
                     most = found;
                 }
@@ -277,6 +279,18 @@ mod tests {
         assert_eq!(middle.x, 1.0);
         let expected = 1.4826f64.powi(2) * std::f64::consts::FRAC_PI_2 / 3.0;
         assert!((cov[(0, 0)] - expected).abs() < 1e-12 && cov[(1, 1)] == 0.0);
+    }
+
+    /// Three others that are narrower by chance, and agree.
+    #[test]
+    fn what_others_show_adds_nothing() {
+        let test = pushed(&frames(600, [0.0; 3], 7));
+        let narrow = CommonWindow {
+            level: (Vector3::new(-0.5, 0.0, -0.5), Matrix3::zeros()),
+            rise: (Vector3::new(-0.5, 0.0, -0.5), Matrix3::zeros()),
+        };
+        let common = CommonMode([narrow; WINDOWS.len()]);
+        assert!(test.most_significant(&common).neg_log_p <= neg_log_p(&test));
     }
 
     #[test]

@@ -64,10 +64,14 @@ pub struct StepEvidence {
 }
 
 impl Step {
-    /// Less what all beams have in common. The distance from the disc of the turns is no more than from its own true point, whose
-    /// square is χ² of two degrees.
+    /// With or without what all beams have in common, whichever says less: that may be the noise of others.
     fn evidence(&self, common: Vector2<f64>) -> StepEvidence {
-        let aside = self.aside - common;
+        let [less, whole] = [common, Vector2::zeros()].map(|common| self.evidence_of(self.aside - common));
+        if less.neg_log_p < whole.neg_log_p { less } else { whole }
+    }
+
+    /// The distance from the disc of the turns is no more than from its own true point, whose square is χ² of two degrees.
+    fn evidence_of(&self, aside: Vector2<f64>) -> StepEvidence {
         let nearest = -aside.dot(&self.turn) / self.turn.norm_squared().max(f64::MIN_POSITIVE);
         let length_m = (aside + self.turn * nearest.clamp(-1.0, 1.0)).norm();
         let beyond = (length_m - self.way).max(0.0);
@@ -227,8 +231,10 @@ mod tests {
         assert!((step.aside - Vector2::new(0.0, 1.0)).norm() < 1e-9, "{step:?}");
         assert_eq!(step.since, at(0.3));
         assert!(tried[1].is_none(), "five after need eight frames");
-        // A step that all beams make is none.
+        // A step that all beams make is none, and what others make adds nothing to this one.
         assert!(step.evidence(Vector2::new(0.0, 1.0)).neg_log_p < 1e-20);
+        let alone = step.evidence(Vector2::zeros()).neg_log_p;
+        assert_eq!(step.evidence(Vector2::new(0.0, -3.0)).neg_log_p, alone);
     }
 
     #[test]
