@@ -34,8 +34,28 @@ const SHADOW_COMES_S: f64 = 60.0;
 /// Share of strangers as strong as the users who must be alerted within a second.
 const GOAL: f64 = 0.998;
 
+/// How fast the light fades.
+#[derive(Clone, Copy)]
+enum Fading {
+    /// Ten draws to an exposure: energies vary by 0.29 of their mean.
+    Averaged,
+    /// One draw: by 0.93.
+    Slow,
+}
+
 /// The four users and whom `toml` names, for so long; what was raised, by seed.
 fn told(
+    stories: u64,
+    seed: u64,
+    estimator: &estimate::Config,
+    seconds: f64,
+    toml: impl Fn(u64) -> String + Sync,
+) -> Vec<(u64, Raised)> {
+    told_with(Fading::Averaged, stories, seed, estimator, seconds, toml)
+}
+
+fn told_with(
+    fading: Fading,
     stories: u64,
     seed: u64,
     estimator: &estimate::Config,
@@ -45,6 +65,9 @@ fn told(
     let seeds = (seed..seed + stories).into_par_iter();
     let tell = |k| {
         let mut story = PixelStory::with(k, &toml(k));
+        if let Fading::Slow = fading {
+            story.change(|scene| scene.link.coherence_time_s = scene.link.integration_time_s);
+        }
         story.seconds = seconds;
         story.config.estimator = estimator.clone();
         (k, review(&story).raised())
@@ -54,16 +77,21 @@ fn told(
 
 /// Users of whom two roam near each other and one drives raise nothing.
 pub fn honest_users(stories: u64, seed: u64, estimator: &estimate::Config) -> Measured {
-    peace(stories, seed, estimator, BUSY)
+    peace(Fading::Averaged, stories, seed, estimator, BUSY)
+}
+
+/// The four users alone raise nothing, however their light fades.
+pub fn honest_fading(stories: u64, seed: u64, estimator: &estimate::Config) -> Measured {
+    peace(Fading::Slow, stories, seed, estimator, "")
 }
 
 /// Users who stand so near each other that a frame hardly ever tells them all apart raise nothing.
 pub fn honest_crowd(stories: u64, seed: u64, estimator: &estimate::Config) -> Measured {
-    peace(stories, seed, estimator, CROWD)
+    peace(Fading::Averaged, stories, seed, estimator, CROWD)
 }
 
-fn peace(stories: u64, seed: u64, estimator: &estimate::Config, toml: &str) -> Measured {
-    let mut raised = told(stories, seed, estimator, HONEST_S, |_| toml.to_owned());
+fn peace(fading: Fading, stories: u64, seed: u64, estimator: &estimate::Config, toml: &str) -> Measured {
+    let mut raised = told_with(fading, stories, seed, estimator, HONEST_S, |_| toml.to_owned());
     raised.retain(|(_, raised)| !raised.is_empty());
     let frames = stories as f64 * HONEST_S * RATE_HZ;
     Measured {
@@ -185,12 +213,21 @@ pub fn strangers_in_crowd(stories: u64, seed: u64, estimator: &estimate::Config)
 /// A stranger who comes on beside a user and stays, by distance and by power as a share of the user's: how many are alerted within
 /// 20 s, and the median and longest delay. From how far all are found is a requirement; so is that nothing else is raised.
 pub fn shadows(stories: u64, seed: u64, estimator: &estimate::Config) -> Measured {
+    shadows_with(Fading::Averaged, stories, seed, estimator)
+}
+
+/// The same where energies vary by 0.93 of their mean.
+pub fn shadows_fading(stories: u64, seed: u64, estimator: &estimate::Config) -> Measured {
+    shadows_with(Fading::Slow, stories, seed, estimator)
+}
+
+fn shadows_with(fading: Fading, stories: u64, seed: u64, estimator: &estimate::Config) -> Measured {
     let mut text = "| power | m from the user | found | median s | longest s | something else first |\n".to_owned();
     text += "|---|---|---|---|---|---|\n";
     let mut holds = true;
     for (power_w, found_from_m) in [(1.0, 0.0), (0.5, 2.0), (0.25, 3.0), (0.1, f64::INFINITY)] {
         for beside_m in [0.0, 0.5, 1.0, 2.0, 3.0, 4.0, 6.0] {
-            let raised = told(stories, seed, estimator, SHADOW_COMES_S + 20.0, |k| {
+            let raised = told_with(fading, stories, seed, estimator, SHADOW_COMES_S + 20.0, |k| {
                 let angle = 2.4 * k as f64;
                 let offset_m = [beside_m * angle.cos(), beside_m * angle.sin()];
                 intruder(SHADOW_COMES_S, power_w, &beside("u-2", offset_m))
