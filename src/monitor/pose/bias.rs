@@ -165,6 +165,19 @@ mod tests {
     }
 
     #[test]
+    fn a_liar_hardly_moves_what_users_share_and_two_users_share_nothing() {
+        let residual = |k: usize| Residual {
+            offset: Vector2::new(if k == 0 { 50.0 } else { 1.0 + 0.1 * k as f64 }, 0.0),
+            variance: 0.09,
+            by_pose: Matrix2x6::zeros(),
+        };
+        let of = |users: usize| PoseBias::default().shared_offset(&(0..users).map(residual).collect::<Vec<_>>());
+        assert!(of(2).is_none());
+        // The median of 1.1 to 1.5 and of 50.
+        assert!((of(6).expect("enough").offset.x - 1.35).abs() < 1e-12);
+    }
+
+    #[test]
     fn one_user_corrects_their_own_place_and_liars_few() {
         let error = Vector6::new(0.003, -0.004, 0.0, 1.2, -0.7, 0.0);
         assert!(left(&found(1, 0, &error), &error) < 1.0);
