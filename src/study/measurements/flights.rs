@@ -176,6 +176,7 @@ pub fn flights(stories: u64, seed: u64, estimator: &estimate::Config) -> Measure
     );
     let mut holds = true;
     let mut others = Vec::new();
+    let mut found_s = Vec::new();
     for kind in KINDS {
         let seeds = || (seed..seed + stories).into_par_iter();
         let honest: Vec<_> = seeds()
@@ -212,6 +213,10 @@ pub fn flights(stories: u64, seed: u64, estimator: &estimate::Config) -> Measure
             .collect();
         let seen = within(&strangers, UnclaimedEmitter, COMES_S, STRANGER_LIMIT_S);
         let told = within(&dragged, PoseInconsistent, DRAGGED_S, DRAG_LIMIT_S);
+        let delays = dragged
+            .iter()
+            .map(|(_, raised)| delay_s(raised, PoseInconsistent, DRAGGED_S));
+        found_s.extend(delays.filter(|delay| delay.is_finite()));
         writeln!(
             text,
             "| {} | {} | {:.2} | {:.2} | {seen} | {told} |",
@@ -233,7 +238,13 @@ pub fn flights(stories: u64, seed: u64, estimator: &estimate::Config) -> Measure
             others.push(format!("{}:\n{}", kind.name, exceptions(&named)));
         }
     }
-    text.push('\n');
+    let slowest = found_s.iter().copied().fold(f64::NAN, f64::max);
+    let median = median(found_s);
+    writeln!(
+        text,
+        "\nDrags are found after {median:.1} s in the median, the slowest after {slowest:.1} s.\n"
+    )
+    .expect("text takes all");
     text.push_str(&others.concat());
     Measured { text, holds }
 }
