@@ -50,7 +50,9 @@ fn an_eavesdropper_that_dazzles_is_an_alert_that_says_so() {
 /// Nearer than the fit can tell two beams apart: the user's spot is brighter than it ever was, and restless.
 #[test]
 fn an_eavesdropper_within_a_metre_of_a_user_is_one_alert() {
-    for (seed, beside) in [(0, "[0, 0]"), (1, "[0.3, 0]"), (2, "[-0.5, 0.5]"), (3, "[0, 1]")] {
+    let places = [(0, "[0, 0]"), (1, "[0.3, 0]"), (2, "[-0.5, 0.5]"), (3, "[0, 1]")];
+    let mut raised_at: Vec<f64> = Vec::new();
+    for (seed, beside) in places {
         let mut story = Story::with(
             seed,
             &format!(
@@ -60,12 +62,16 @@ fn an_eavesdropper_within_a_metre_of_a_user_is_one_alert() {
         );
         story.seconds = 50.0;
         let told = review(&story);
-        // 29 % scintillation a frame: four seconds of it leave 5 %, against a rise by two and an honest one by 1.35.
-        told.expect(&[(UnclaimedEmitter, None, 31.0, 35.0)]);
+        // 29 % scintillation a frame: four seconds of it leave 5 %, against a rise by two and an honest one by 1.35. Of sixty
+        // strangers in `study shadow` the slowest is alerted after 7.8 s.
+        told.expect(&[(UnclaimedEmitter, None, 31.0, 38.0)]);
+        raised_at.push(told.raised()[0].2);
         assert_eq!(told.events[0].alert.evidence["shares_the_spot_of"], "u-2");
         let cleared = told.cleared();
         assert!(cleared.len() == 1 && (40.5..46.0).contains(&cleared[0]), "{cleared:?}");
     }
+    raised_at.sort_by(f64::total_cmp);
+    assert!(raised_at[2] < 35.0, "{raised_at:?}");
 }
 
 #[test]

@@ -132,7 +132,7 @@ impl Memory {
                 spot.test.brightness.push(w.track.last_hit, ln_energy, learn);
             }
             if let Some(jump) = jump {
-                spot.test.jitter.push(jump.less(common_jump), learn);
+                spot.test.jitter.push(jump, common_jump, learn);
             }
             spot.test.steps.push(&steps, &common_steps, learn);
         }

@@ -52,16 +52,6 @@ pub struct Jitter {
     past_frames: u32,
 }
 
-impl SecondDifference {
-    /// Less what all beams have in common.
-    pub fn less(self, common: Vector2<f64>) -> Self {
-        Self {
-            by: self.by - common,
-            ..self
-        }
-    }
-}
-
 impl Jitter {
     /// The second difference of the newest three positions, where they are from frames in a row.
     pub fn second_difference(
@@ -90,10 +80,12 @@ impl Jitter {
         self.last.clear();
     }
 
-    /// Takes a second difference. With `learn` the one that it pushes out of the newest is added to the past.
-    pub fn push(&mut self, difference: SecondDifference, learn: bool) {
+    /// Takes a second difference, with or without what all beams have in `common`, whichever is less: that may be the noise of
+    /// others. With `learn` the one that it pushes out of the newest is added to the past.
+    pub fn push(&mut self, difference: SecondDifference, common: Vector2<f64>, learn: bool) {
         let SecondDifference { since, by, cov } = difference;
-        let size = (0.5 * mahalanobis2(by, cov)).min(MAX_FRAME);
+        let [less, whole] = [common, Vector2::zeros()].map(|common| 0.5 * mahalanobis2(by - common, cov));
+        let size = less.min(whole).min(MAX_FRAME);
         if let Some((_, old)) = self.recent.push((since, size))
             && learn
         {
@@ -155,7 +147,7 @@ mod tests {
         for k in 0..frames {
             let place = Vector2::new(x(k), 0.0);
             if let Some(d) = jitter.second_difference(at(k), place, Matrix2::identity() * 0.0025) {
-                jitter.push(d, true);
+                jitter.push(d, Vector2::zeros(), true);
             }
         }
         jitter
@@ -201,6 +193,24 @@ mod tests {
         let found = torn.test(20, Some(1.0)).unwrap();
         assert_eq!(found.ratio, 2.0);
         assert!((found.neg_log_p - INDEPENDENT * 20.0 * (1.0 - 2f64.ln())).abs() < 1e-12);
+    }
+
+    #[test]
+    fn what_others_have_in_common_never_adds() {
+        let smallest = |common: f64| {
+            let mut jitter = Jitter::default();
+            for (k, x) in [0.0, 0.0, 0.5].into_iter().enumerate() {
+                let place = Vector2::new(x, 0.0);
+                if let Some(d) = jitter.second_difference(at(k as i64), place, Matrix2::identity() * 0.0025) {
+                    jitter.push(d, Vector2::new(common, 0.0), true);
+                }
+            }
+            jitter.recent.mean_of_newest(1)
+        };
+        let whole = smallest(0.0);
+        assert!(whole > 1.0);
+        assert!(smallest(0.5) < 1e-12);
+        assert_eq!((smallest(-1.0), smallest(2.0)), (whole, whole));
     }
 
     #[test]
