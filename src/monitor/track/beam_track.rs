@@ -6,7 +6,7 @@ use jiff::Timestamp;
 use nalgebra::Vector2;
 
 use super::detection::Detection;
-use super::kalman::KalmanFilter;
+use super::manoeuvring::ManoeuvringFilter;
 use crate::claims::seconds;
 use crate::monitor::stats::gaussian::largest_eigenvalue;
 
@@ -37,7 +37,7 @@ const DETECTION_PROBABILITY: f64 = 0.9;
 #[derive(Clone, Debug)]
 pub struct Track {
     pub id: u64,
-    pub filter: KalmanFilter,
+    pub filter: ManoeuvringFilter,
     pub since: Timestamp,
     pub last_hit: Timestamp,
     pub detection: Detection,
@@ -62,7 +62,7 @@ impl Track {
     pub fn start(id: u64, time: Timestamp, detection: &Detection) -> Self {
         Self {
             id,
-            filter: KalmanFilter::start(detection.position, detection.cov),
+            filter: ManoeuvringFilter::start(detection.position, detection.cov),
             since: time,
             last_hit: time,
             confirmed: false,

@@ -1,23 +1,19 @@
 //! A constant-velocity Kalman filter of one beam on the ground.
 
+use std::f64::consts::TAU;
+
 use nalgebra::{Matrix2, Matrix2x4, Matrix4, Vector2, Vector4};
 
 use crate::monitor::stats::gaussian::mahalanobis2;
 
-/// Spectral density of the acceleration, m²/s³. Larger follows turns and averages less; a walker may turn round within a second
-/// or two. Checked by `follows_a_walker_and_a_turn`.
-const ACCELERATION: f64 = 1.5;
 /// Standard deviation of an unknown velocity, m/s, and so of one after a manoeuvre. Larger widens the gate of a new track.
 const SPEED_STD: f64 = 8.0;
-/// Time, s, within which an adopted velocity may have changed by the acceleration. Longer widens the gate after a missed frame.
-const ADOPTED_S: f64 = 1.0;
-/// Squared Mahalanobis innovation past which the beam has manoeuvred: χ² of two degrees exceeds it once in 3,000. Smaller loses
-/// the velocity to noise, larger follows a jump later.
-const MANOEUVRE: f64 = 16.0;
+/// Variance of an adopted velocity, m²/s². Larger widens the gate after a missed frame.
+const ADOPTED_VARIANCE: f64 = 1.5;
 
 /// State (x, y, vx, vy) in m and m/s, white-noise acceleration (Bar-Shalom, Li and Kirubarajan, 2001, eqs. 6.2.2-10 to
 /// 6.2.2-13).
-#[derive(Clone, Debug)]
+#[derive(Clone, Copy, Debug)]
 pub struct KalmanFilter {
     state: Vector4<f64>,
     cov: Matrix4<f64>,
@@ -36,19 +32,26 @@ impl KalmanFilter {
         }
     }
 
-    /// Predicts the state `dt` seconds later.
-    pub fn predict(&mut self, dt: f64) {
+    /// The mean and covariance of a mixture of filters, each with its probability.
+    pub fn mixture(parts: impl Iterator<Item = (f64, Self)> + Clone) -> Self {
+        let state: Vector4<f64> = parts.clone().map(|(p, part)| part.state * p).sum();
+        let about = |part: &Self| {
+            let off = part.state - state;
+            part.cov + off * off.transpose()
+        };
+        let cov = parts.map(|(p, part)| about(&part) * p).sum();
+        Self { state, cov }
+    }
+
+    /// Predicts the state `dt` seconds later, for a spectral density of the acceleration in m²/s³.
+    pub fn predict(&mut self, dt: f64, density: f64) {
         let mut f = Matrix4::identity();
         f[(0, 2)] = dt;
         f[(1, 3)] = dt;
         self.state = f * self.state;
         let moved = f * self.cov * f.transpose();
         self.cov = 0.5 * (moved + moved.transpose());
-        let (p, c, v) = (
-            ACCELERATION * dt.powi(3) / 3.0,
-            ACCELERATION * dt.powi(2) / 2.0,
-            ACCELERATION * dt,
-        );
+        let (p, c, v) = (density * dt.powi(3) / 3.0, density * dt.powi(2) / 2.0, density * dt);
         for k in 0..2 {
             self.cov[(k, k)] += p;
             self.cov[(k, k + 2)] += c;
@@ -67,20 +70,26 @@ impl KalmanFilter {
         }
     }
 
-    /// Takes a measured position, m, of covariance `r`, m². One far outside the prediction opens the filter first, so that it
-    /// follows.
-    pub fn update(&mut self, z: Vector2<f64>, r: Matrix2<f64>) {
-        let innovation = z - self.position();
-        if mahalanobis2(innovation, self.position_cov() + r) > MANOEUVRE {
-            let spread = innovation.norm_squared();
-            for k in 0..2 {
-                self.cov[(k, k)] += spread;
-                self.cov[(k + 2, k + 2)] = SPEED_STD * SPEED_STD;
-            }
+    /// Squared Mahalanobis distance of a measured position, m, of covariance `r`, m², from the expected.
+    pub fn surprise(&self, z: Vector2<f64>, r: Matrix2<f64>) -> f64 {
+        mahalanobis2(z - self.position(), self.position_cov() + r)
+    }
+
+    /// The beam is somewhere about `z`, m, its velocity unknown.
+    pub fn open(&mut self, z: Vector2<f64>) {
+        let spread = (z - self.position()).norm_squared();
+        for k in 0..2 {
+            self.cov[(k, k)] += spread;
+            self.cov[(k + 2, k + 2)] = SPEED_STD * SPEED_STD;
         }
+    }
+
+    /// Takes a measured position, m, of covariance `r`, m²; gives the logarithm of its probability density, 1/m².
+    pub fn update(&mut self, z: Vector2<f64>, r: Matrix2<f64>) -> f64 {
+        let innovation = z - self.position();
         let s = self.position_cov() + r;
         let Some(inverse) = s.try_inverse() else {
-            return;
+            return 0.0;
         };
         let h = Matrix2x4::new(1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0);
         let gain = self.cov * h.transpose() * inverse;
@@ -89,6 +98,7 @@ impl KalmanFilter {
         let left = Matrix4::identity() - gain * h;
         let joseph = left * self.cov * left.transpose() + gain * r * gain.transpose();
         self.cov = 0.5 * (joseph + joseph.transpose());
+        -0.5 * (innovation.dot(&(inverse * innovation)) + s.determinant().ln()) - TAU.ln()
     }
 
     /// Takes over a position, m, of covariance `r`, m², and a velocity, m/s, that hold all that was measured until now.
@@ -96,7 +106,7 @@ impl KalmanFilter {
         *self = Self::start(z, r);
         for k in 0..2 {
             self.state[k + 2] = velocity[k];
-            self.cov[(k + 2, k + 2)] = ACCELERATION * ADOPTED_S;
+            self.cov[(k + 2, k + 2)] = ADOPTED_VARIANCE;
         }
     }
 
@@ -128,49 +138,33 @@ mod tests {
     #[test]
     fn one_prediction_and_one_update_by_hand() {
         let mut filter = KalmanFilter::start(Vector2::zeros(), Matrix2::identity());
-        filter.predict(1.0);
+        filter.predict(1.0, 1.5);
         // 1 + 8²·1² + 1.5/3, before the speed is bounded to 8 m/s again.
         let variance = 1.0 + 64.0 + 0.5;
         assert!((filter.position_cov()[(0, 0)] - variance).abs() < 1e-12);
-        filter.update(Vector2::new(3.0, 0.0), Matrix2::identity());
+        let z = Vector2::new(3.0, 0.0);
+        assert!((filter.surprise(z, Matrix2::identity()) - 9.0 / (variance + 1.0)).abs() < 1e-12);
+        let ln_density = filter.update(z, Matrix2::identity());
         assert!((filter.position().x - 3.0 * variance / (variance + 1.0)).abs() < 1e-12);
         assert!((filter.position_cov()[(0, 0)] - variance / (variance + 1.0)).abs() < 1e-9);
+        let expected = -0.5 * 9.0 / (variance + 1.0) - (TAU * (variance + 1.0)).ln();
+        assert!((ln_density - expected).abs() < 1e-12);
     }
 
     #[test]
-    fn follows_a_walker_and_a_turn() {
-        let r = Matrix2::identity() * 0.01;
-        let mut filter = KalmanFilter::start(Vector2::zeros(), r);
-        let mut truth = Vector2::zeros();
-        for k in 1..100 {
-            let velocity = if k < 50 { 1.5 } else { -1.5 };
-            truth.x += velocity * 0.1;
-            filter.predict(0.1);
-            filter.update(truth, r);
-            let error = (filter.position() - truth).norm();
-            assert!(error < 0.15, "frame {k}: {error}");
-        }
-        assert!((filter.velocity().x + 1.5).abs() < 0.1, "{}", filter.state);
-    }
-
-    #[test]
-    fn a_jump_is_followed_at_once() {
-        let r = Matrix2::identity() * 0.01;
-        let mut filter = KalmanFilter::start(Vector2::zeros(), r);
-        for _ in 0..50 {
-            filter.predict(0.1);
-            filter.update(Vector2::zeros(), r);
-        }
-        filter.predict(0.1);
-        filter.update(Vector2::new(40.0, 0.0), r);
-        assert!((filter.position().x - 40.0).abs() < 0.01);
+    fn a_mixture_is_as_wide_as_its_parts_are_apart() {
+        let at = |x: f64| KalmanFilter::start(Vector2::new(x, 0.0), Matrix2::identity());
+        let both = KalmanFilter::mixture([(0.25, at(0.0)), (0.75, at(4.0))].into_iter());
+        assert_eq!(both.position(), Vector2::new(3.0, 0.0));
+        // 1 + 0.25·9 + 0.75·1.
+        assert_eq!(both.position_cov(), Matrix2::new(4.0, 0.0, 0.0, 1.0));
     }
 
     #[test]
     fn a_long_gap_grows_no_faster_than_the_speed_bound() {
         let mut filter = KalmanFilter::start(Vector2::zeros(), Matrix2::identity());
         for _ in 0..100 {
-            filter.predict(1.0);
+            filter.predict(1.0, 1.5);
         }
         assert!(filter.position_cov()[(0, 0)].sqrt() < 100.0 * SPEED_STD);
     }
