@@ -112,6 +112,14 @@ impl Sight {
         self.meet(Vector3::from(place_m) - self.lens_m)
     }
 
+    /// The ground where this sees what `other`, of another pose, sees on the ground at a place, east and north, m.
+    pub fn ground_seen_by(&self, other: &Self, place_m: [f64; 2]) -> Option<GroundPoint> {
+        let [x, y] = place_m;
+        let z_m = other.ground_below(place_m)?.z_m;
+        let ray = other.to_world.transpose() * (Vector3::new(x, y, z_m) - other.lens_m);
+        self.meet(self.to_world * ray)
+    }
+
     /// The sensor position, m, of a place in the world; `None` behind the camera.
     pub fn sensor(&self, camera: &Camera, place_m: [f64; 3]) -> Option<[f64; 2]> {
         let seen = self.to_world.transpose() * (Vector3::from(place_m) - self.lens_m);

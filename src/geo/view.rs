@@ -1,6 +1,6 @@
 //! What the camera sees of the world in one frame: from a fixed, level platform by the camera's own map, else by a sight.
 
-use nalgebra::{Matrix2, Matrix2x6, Vector2};
+use nalgebra::{Matrix2, Matrix2x6, Vector2, Vector6};
 
 use super::sight::Sight;
 use crate::optics::Camera;
@@ -160,6 +160,27 @@ impl View {
         point.map_or(Matrix2x6::zeros(), |point| point.by_pose)
     }
 
+    /// Where a beam from a place on the ground, m, appears to come from because the pose is off by `error` (as
+    /// [`Sight::corrected`] has it); there itself for a fixed platform.
+    pub fn displaced(&self, p: Vector2<f64>, error: &Vector6<f64>) -> Vector2<f64> {
+        let Some(sight) = &self.sight else {
+            return p;
+        };
+        let truth = sight.corrected(&-error, *sight.cov());
+        let seen = sight.ground_seen_by(&truth, p.into());
+        seen.map_or(p, |point| point.horizontal_m())
+    }
+
+    /// The place on the ground, m, of a beam that appears to come from `seen` because the pose is off by `error`.
+    pub fn undisplaced(&self, seen: Vector2<f64>, error: &Vector6<f64>) -> Vector2<f64> {
+        let Some(sight) = &self.sight else {
+            return seen;
+        };
+        let truth = sight.corrected(&-error, *sight.cov());
+        let place = truth.ground_seen_by(sight, seen.into());
+        place.map_or(seen, |point| point.horizontal_m())
+    }
+
     /// Covariance that the pose's error makes of a place on the ground, m²; zero for a fixed platform.
     pub fn pose_cov(&self, p: Vector2<f64>) -> Matrix2<f64> {
         self.sight.as_ref().map_or(Matrix2::zeros(), |sight| {
@@ -177,6 +198,33 @@ mod tests {
     use super::*;
     use crate::optics;
     use crate::pose::{Mount, Pose};
+
+    #[test]
+    fn an_error_of_the_pose_displaces_what_it_makes_of_a_spot() {
+        let camera = optics::Config::default().camera().unwrap();
+        let pose = Pose {
+            attitude: UnitQuaternion::from_euler_angles(0.1, -0.08, 1.2),
+            ..Pose::level(Timestamp::UNIX_EPOCH, [30.0, -20.0, camera.altitude_m])
+        };
+        let sight = Sight::new(&pose, &Mount::default());
+        let error = Vector6::new(0.01, -0.02, 0.1, 2.0, -1.0, 3.0);
+        let truth = sight.corrected(&-error, *sight.cov());
+        let view = View {
+            camera: camera.clone(),
+            sight: Some(sight.clone()),
+        };
+        for spot in [[0.0, 0.0], [5e-3, -3e-3], [-8e-3, 6e-3]] {
+            let [place, seen] = [&truth, &sight].map(|s| s.ground(&camera, spot).unwrap().horizontal_m());
+            assert!((view.displaced(place, &error) - seen).norm() < 1e-9);
+            assert!((view.undisplaced(seen, &error) - place).norm() < 1e-9);
+            // A tenth of a radian is no small heading error.
+            let linear = view.by_pose(place) * error;
+            assert!((place + linear - seen).norm() > 0.1);
+        }
+        let level = View::level(&camera);
+        let p = Vector2::new(3.0, 4.0);
+        assert_eq!((level.displaced(p, &error), level.undisplaced(p, &error)), (p, p));
+    }
 
     #[test]
     fn the_outline_is_the_view_s_corners_and_ends_where_the_sky_begins() {

@@ -285,7 +285,7 @@ impl FrameContext {
     /// frame.
     pub fn update_bias(&mut self, dt: f64, period_s: f64) {
         if let Some(sight) = &self.view.sight {
-            let residuals = residuals(&self.claims, &self.tracker, &self.view);
+            let residuals = residuals(&self.claims, &self.tracker, &self.view, self.bias.error());
             self.bias.update(&residuals, sight.cov(), dt, period_s);
             let is_fresh = self.pose_age_s < FRESH_S;
             let shared = self.bias.shared_offset(&residuals).filter(|_| is_fresh);
@@ -295,27 +295,17 @@ impl FrameContext {
 
     /// How far the lasting pose error displaces a beam at `p`, m; nowhere for a fixed platform.
     pub fn bias_at(&self, p: Vector2<f64>) -> Vector2<f64> {
-        match &self.view.sight {
-            None => Vector2::zeros(),
-            Some(_) => self.view.by_pose(p) * self.bias.error(),
-        }
+        self.view.displaced(p, self.bias.error()) - p
     }
 
     /// How far all pose error that is known displaces a beam at `p`, m.
     pub fn displacement_at(&self, p: Vector2<f64>) -> Vector2<f64> {
-        match &self.view.sight {
-            None => self.pose.displacement().at(p),
-            Some(_) => self.bias_at(p) + self.pose.displacement().at(p),
-        }
+        self.bias_at(p) + self.pose.displacement().at(p)
     }
 
     /// A track's place in the world, m: without the lasting pose error where the platform moves.
     pub fn position(&self, track: &Track) -> Vector2<f64> {
-        let here = track.filter.position();
-        match &self.view.sight {
-            None => here,
-            Some(_) => here - self.bias_at(here),
-        }
+        self.view.undisplaced(track.filter.position(), self.bias.error())
     }
 
     fn bias_cov(&self, p: Vector2<f64>) -> Matrix2<f64> {
@@ -367,7 +357,7 @@ impl FrameContext {
 
     /// A place that the sensor shows, our own pose error taken out, m.
     pub fn unmoved(&self, seen: Vector2<f64>) -> [f64; 2] {
-        (seen - self.displacement_at(seen)).into()
+        (self.view.undisplaced(seen, self.bias.error()) - self.pose.displacement().at(seen)).into()
     }
 
     /// Standard deviation of where a track is, what is systematic included, m.

@@ -1,6 +1,6 @@
 //! The claims that our own pose is estimated from: where each user's beam may be now.
 
-use nalgebra::Vector2;
+use nalgebra::{Vector2, Vector6};
 
 use super::bias::Residual;
 use crate::geo::View;
@@ -57,17 +57,22 @@ pub fn witnesses(claims: &[ActiveClaim], tracker: &Tracker) -> Vec<Witness> {
     heard.into_iter().map(|a| Witness::of(a, moved(a))).collect()
 }
 
-/// The claims whose own beam is followed and stands alone, each with how far the beam is from it.
-pub fn residuals(claims: &[ActiveClaim], tracker: &Tracker, view: &View) -> Vec<Residual> {
+/// The claims whose own beam is followed and stands alone, each with how far the beam is from it, linearised at a lasting `error` of
+/// the pose.
+pub fn residuals(claims: &[ActiveClaim], tracker: &Tracker, view: &View, error: &Vector6<f64>) -> Vec<Residual> {
     let residual = |a: &ActiveClaim| {
         let track = tracker.get(a.before.current()?)?;
         let is_clear = track.hit && track.confirmed && track.unresolved_from.is_none() && !a.ended;
         let here = track.filter.position();
         let claimed = a.claimed + (here - track.at(a.made)?);
-        is_clear.then(|| Residual {
-            offset: here - claimed,
-            variance: a.variance + 0.5 * track.filter.position_cov().trace(),
-            by_pose: view.by_pose(claimed),
+        is_clear.then(|| {
+            let expected = view.displaced(claimed, error);
+            let by_pose = view.by_pose(expected);
+            Residual {
+                offset: here - expected + by_pose * error,
+                variance: a.variance + 0.5 * track.filter.position_cov().trace(),
+                by_pose,
+            }
         })
     };
     claims.iter().filter_map(residual).collect()

@@ -123,7 +123,7 @@ fn evaluate_light(
     memory.observed.push(Observed {
         id: id.clone(),
         ln_energy: spot.and_then(WatchedSpot::ln_energy),
-        place: world(frame, track.filter.position()),
+        place: frame.world(track).into(),
         suspected_since,
     });
     // What cannot be tested in this frame says nothing.
@@ -145,11 +145,6 @@ fn evaluate_light(
         cause,
         content(frame, state, track, &evidence, threshold, severity),
     ))
-}
-
-/// A place on the ground without our own pose error.
-fn world(frame: &FrameContext, seen: Vector2<f64>) -> Vector2<f64> {
-    seen - frame.displacement_at(seen)
 }
 
 /// −ln p of where the light is, against its radius and against its learned place.
