@@ -21,6 +21,8 @@ const LEAST: [f64; 2] = [1e-12, 1e-8];
 #[derive(Clone, Debug, Default)]
 pub struct PoseBias {
     information: Matrix6<f64>,
+    /// The same with the squares of the weights: how much the weighted sums scatter.
+    scatter: Matrix6<f64>,
     vector: Vector6<f64>,
     error: Vector6<f64>,
     cov: Matrix6<f64>,
@@ -60,6 +62,7 @@ impl PoseBias {
         };
         let keep = (-dt / SMOOTHING_S).exp();
         self.information *= keep;
+        self.scatter *= keep * keep;
         self.vector *= keep;
         self.solve(&prior_information, &prior);
         let share = (dt / period_s.max(0.01)).min(1.0);
@@ -74,9 +77,11 @@ impl PoseBias {
             if !(d2 < OUTSIDE * OUTSIDE) {
                 continue;
             }
-            let weight = share / (r.variance * (1.0 + d2 / (HALF_WEIGHT * HALF_WEIGHT)));
-            self.information += r.by_pose.transpose() * r.by_pose * weight;
-            self.vector += r.by_pose.transpose() * r.offset * weight;
+            let weight = 1.0 / (1.0 + d2 / (HALF_WEIGHT * HALF_WEIGHT));
+            let information = r.by_pose.transpose() * r.by_pose * (share / r.variance);
+            self.information += information * weight;
+            self.scatter += information * weight * weight;
+            self.vector += r.by_pose.transpose() * r.offset * (share / r.variance * weight);
         }
         self.solve(&prior_information, &prior);
     }
@@ -100,15 +105,20 @@ impl PoseBias {
     }
 
     fn solve(&mut self, prior_information: &Matrix6<f64>, prior: &Matrix6<f64>) {
-        let posterior = (prior_information + self.information).cholesky().map(|c| c.inverse());
-        self.cov = posterior.unwrap_or(*prior);
-        self.error = self.cov * self.vector;
+        // The variance of a weighted mean (Huber, 1967): newer claims and nearer ones weigh more than others.
+        let weighted = (prior_information + self.information).cholesky().map(|c| c.inverse());
+        let inverse = weighted.unwrap_or(*prior);
+        self.cov = inverse * (prior_information + self.scatter) * inverse;
+        self.error = inverse * self.vector;
     }
 }
 
 #[cfg(test)]
 mod tests {
     use jiff::Timestamp;
+    use rand::SeedableRng;
+    use rand_chacha::ChaCha8Rng;
+    use rand_distr::{Distribution, StandardNormal};
 
     use super::*;
     use crate::geo::Sight;
@@ -153,6 +163,42 @@ mod tests {
         let sight = Sight::new(&pose, &Mount::default());
         let at = |[x, y]: [f64; 2]| sight.apparent([x, y, 0.0]).expect("below").by_pose * (error - bias.error());
         USERS.into_iter().map(|p| at(p).norm()).fold(0.0, f64::max)
+    }
+
+    #[test]
+    fn the_covariance_is_what_claims_scatter_by() {
+        let pose = Pose::level(Timestamp::UNIX_EPOCH, [5.0, -8.0, 300.0]);
+        let sight = Sight::new(&pose, &Mount::default());
+        let by_pose = USERS.map(|[x, y]| sight.apparent([x, y, 0.0]).expect("below").by_pose);
+        let prior = PoseSigmas {
+            attitude_rad: 0.02,
+            position_m: 1.0,
+        };
+        let mut rng = ChaCha8Rng::seed_from_u64(1);
+        let mut normal = |std: f64| {
+            let z: f64 = StandardNormal.sample(&mut rng);
+            std * z
+        };
+        let mut mean = 0.0;
+        const RUNS: usize = 200;
+        for _ in 0..RUNS {
+            let [turn, shift] = [0.02, 1.0].map(|std| [0; 3].map(|_| normal(std)));
+            let error = Vector6::from_iterator(turn.into_iter().chain(shift));
+            let mut bias = PoseBias::default();
+            for _ in 0..60 {
+                let residuals = by_pose.map(|by_pose| Residual {
+                    offset: by_pose * error + Vector2::new(normal(0.3), normal(0.3)),
+                    variance: 0.09,
+                    by_pose,
+                });
+                (0..10).for_each(|_| bias.update(&residuals, &prior.cov(), 0.1, 1.0));
+            }
+            for h in by_pose {
+                let off = h * (error - bias.error());
+                mean += mahalanobis2(off, h * bias.cov() * h.transpose()) / (2 * by_pose.len() * RUNS) as f64;
+            }
+        }
+        assert!((0.85..1.25).contains(&mean), "{mean}");
     }
 
     #[test]
