@@ -171,6 +171,7 @@ impl Pipeline {
                 sight,
                 age_s: pose.age_s,
                 is_lost: *is_lost,
+                delay_s: self.platform.delay_s(),
             },
             Placement::Unknown { waited_s, is_lost } => Look::Unknown {
                 waited_s: *waited_s,

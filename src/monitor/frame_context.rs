@@ -183,6 +183,9 @@ impl FrameContext {
             Look::From { age_s, is_lost, .. } => (true, is_lost.then_some(age_s)),
             Look::Unknown { waited_s, is_lost } => (false, is_lost.then_some(waited_s)),
         };
+        if let Look::From { delay_s, .. } = look {
+            self.course.take_delay(delay_s);
+        }
         self.pose_error = None;
         self.view.sight = match look {
             Look::From { sight, .. } => Some(sight.clone()),
@@ -310,7 +313,7 @@ impl FrameContext {
 
     fn bias_cov(&self, p: Vector2<f64>) -> Matrix2<f64> {
         let by_pose = self.view.by_pose(p);
-        by_pose * self.bias.cov() * by_pose.transpose()
+        by_pose * (self.bias.cov() + self.course.cov()) * by_pose.transpose()
     }
 
     /// Covariance of a track's position in the world, m²: its own and our pose's.

@@ -32,6 +32,8 @@ pub enum Look<'a> {
         age_s: f64,
         /// The pose is older than is tolerated.
         is_lost: bool,
+        /// Pose stamps minus frame stamps, s, by which it was taken.
+        delay_s: f64,
     },
     /// Not known: no pose has come yet, for `waited_s` seconds.
     Unknown { waited_s: f64, is_lost: bool },
