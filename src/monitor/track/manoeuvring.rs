@@ -63,11 +63,14 @@ impl ManoeuvringFilter {
         }
         let ln_densities = self.modes.each_mut().map(|mode| mode.update(z, r));
         let most = ln_densities.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-        for (p, ln_density) in self.probabilities.iter_mut().zip(ln_densities) {
-            *p *= (ln_density - most).exp();
+        // One that overflows tells nothing.
+        if most.is_finite() {
+            for (p, ln_density) in self.probabilities.iter_mut().zip(ln_densities) {
+                *p *= (ln_density - most).exp();
+            }
+            let total: f64 = self.probabilities.iter().sum();
+            self.probabilities = self.probabilities.map(|p| p / total);
         }
-        let total: f64 = self.probabilities.iter().sum();
-        self.probabilities = self.probabilities.map(|p| p / total);
         self.mix();
     }
 
