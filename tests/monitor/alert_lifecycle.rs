@@ -27,7 +27,7 @@ fn a_shadow_within_a_users_spot_is_still_the_same_alert() {
     story.seconds = 75.0;
     story.restarts_at = Some(45.0);
     let told = tell(&story);
-    told.expect(&[(UnclaimedEmitter, None, 30.5, 36.0)]);
+    told.expect(&[(UnclaimedEmitter, None, 30.5, 38.0)]);
     let cleared = told.cleared();
     assert!(
         cleared.len() == 1 && (60.5..66.0).contains(&cleared[0].2),

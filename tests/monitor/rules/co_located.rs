@@ -8,6 +8,7 @@ use crate::stories::{Actor, Expect, Story, crowd, tell};
 /// Equal beams 30 cm apart, after half a minute of one.
 #[test]
 fn a_stranger_within_a_users_spot_is_alerted_and_cleared_when_gone() {
+    let mut raised_at: Vec<f64> = Vec::new();
     for seed in SEEDS {
         let mut actors = crowd();
         let victim = |t: f64| [15.0 * (0.06 * t + 1.0).sin(), -50.0 + 15.0 * (0.05 * t + 2.0).cos()];
@@ -18,7 +19,9 @@ fn a_stranger_within_a_users_spot_is_alerted_and_cleared_when_gone() {
         let mut story = Story::new(seed, actors);
         story.seconds = 60.0;
         let told = tell(&story);
-        told.expect(&[(UnclaimedEmitter, None, 30.5, 36.0)]);
+        // Of sixty strangers in `study shadow` the slowest is alerted after 7.8 s.
+        told.expect(&[(UnclaimedEmitter, None, 30.5, 38.0)]);
+        raised_at.push(told.raised()[0].2);
         let alert = &told.events[0].alert;
         assert_eq!(alert.evidence["shares_the_spot_of"], "u-1");
         let cleared = told.cleared();
@@ -27,6 +30,8 @@ fn a_stranger_within_a_users_spot_is_alerted_and_cleared_when_gone() {
             "{cleared:?}"
         );
     }
+    raised_at.sort_by(f64::total_cmp);
+    assert!(raised_at[raised_at.len() / 2] < 36.0, "{raised_at:?}");
 }
 
 /// A user whose light grows by a quarter for good is pointed better, and no two.
