@@ -11,10 +11,10 @@ use crate::optics::Camera;
 /// Standard deviations of a speed along an axis, m/s, that emitters of a scene may have: all stand still, walk, cycle, drive.
 const SPEEDS_M_S: [f64; 4] = [0.01, 0.7, 2.5, SPEED_STD_M_S];
 /// Relative rounding of a difference of covariances.
-const ROUNDING: f64 = 1e-6;
+const ROUNDING: f64 = 1e-8;
 /// Share of a change's variance that must be left beside what all change alike for the change to tell anything: with up to three emitters, six
 /// numbers, the six of a pose explain all of it.
-const LEAST_TOLD: f64 = 1e-3;
+const LEAST_TOLD: f64 = 1e-6;
 /// A hypothesis of less weight is left out.
 const LEAST_WEIGHT: f64 = 1e-3;
 
@@ -146,7 +146,7 @@ pub(crate) fn surprised(known: &JointInformation, fresh: &mut Window, elapsed: f
 }
 
 /// Takes what the columns of `shared` span out of `change` and its covariance `cov`: what is left where that much is common to all.
-fn take_out(shared: &DMatrix<f64>, cov: &mut DMatrix<f64>, change: &mut DVector<f64>) {
+pub(crate) fn take_out(shared: &DMatrix<f64>, cov: &mut DMatrix<f64>, change: &mut DVector<f64>) {
     let Some(factor) = cov.clone().cholesky() else { return };
     let weighted = factor.solve(shared);
     let mut information = shared.tr_mul(&weighted);
