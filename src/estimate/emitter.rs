@@ -68,9 +68,13 @@ pub struct Emitter {
     pub cov_m2: [[f64; 2]; 2],
     /// Collected energy over the whole spot (also the part that falls off the sensor).
     pub energy_j: f64,
-    /// Velocity along x and y, where the estimator follows emitters over frames.
+    /// Velocity along x and y, in the world where the platform moves, where the estimator follows emitters over frames.
     #[serde(flatten, skip_serializing_if = "Option::is_none")]
     pub velocity: Option<Velocity>,
+    /// Of a moving platform's, the error covariance in the world that this emitter shares with the frames before and with no other
+    /// emitter.
+    #[serde(skip)]
+    pub lasting_cov_m2: Option<[[f64; 2]; 2]>,
     /// Standard deviation of `energy_j`.
     #[serde(skip)]
     pub energy_std_j: f64,

@@ -35,6 +35,7 @@ fn watch(axes: LocalAxes, [x_m, y_m]: [f64; 2]) -> (Report, Alert) {
         energy_std_j: 1e-5,
         sensor_m: camera.to_sensor([x_m, y_m]),
         velocity: None,
+        lasting_cov_m2: None,
         second_moment: SecondMomentScore::default(),
         flags: Flags::empty(),
     };

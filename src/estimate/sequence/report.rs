@@ -1,8 +1,8 @@
 //! What is reported of a window: its emitters at the newest frame's time, with the posterior of all frames.
 
-use nalgebra::DMatrix;
+use nalgebra::{DMatrix, DVector};
 
-use crate::estimate::emitter::{Estimate, Flags};
+use crate::estimate::emitter::{Estimate, Flags, Velocity};
 use crate::estimate::estimators::analytic::AnalyticEstimator;
 use crate::estimate::fit::context::FitContext;
 use crate::estimate::fit::work_budget::WorkBudget;
@@ -10,8 +10,7 @@ use crate::estimate::model::hypothesis::Nuisances;
 use crate::estimate::rules::Rules;
 use crate::estimate::sequence::joint_information::STATE;
 use crate::estimate::sequence::local_quadratic::{Engine, hypothesis};
-use crate::estimate::sequence::motion::{Posterior, posterior, velocity_on_ground};
-
+use crate::estimate::sequence::motion::{Posterior, posterior, take_out, velocity_on_ground};
 use crate::estimate::sequence::window::Window;
 use crate::estimate::uncertainty::localise::localise;
 use crate::optics::Camera;
@@ -31,7 +30,7 @@ pub(crate) fn report(
     let n = present.len();
     let is_still = window.snapshots.last().is_none_or(|s| s.outlook.is_none());
     let posterior = posterior(&window.total, 1.0 / window.unit_m, rules.weigh_speeds);
-    let mut cov = None;
+    let (mut cov, mut lasting_cov) = (None, None);
     let mut budget = WorkBudget::new(is_over);
     let (space, compressed, frame) = single.loaded();
     let mut positions = window.positions(&space.bases);
@@ -53,6 +52,11 @@ pub(crate) fn report(
             workspace: &mut space.workspace,
         };
         let places = window.places(state, window.time_s);
+        if let Some(outlook) = &newest.outlook {
+            let mut lasting = own.clone();
+            take_out(&outlook.shared(&places), &mut lasting, &mut DVector::zeros(2 * n));
+            lasting_cov = Some(lasting * window.unit_m.powi(2));
+        }
         let (at, own) = newest.on_sensor(&mut engine, window.energies, places, own);
         (positions, cov) = (at, Some(own));
     }
@@ -77,11 +81,18 @@ pub(crate) fn report(
     );
     for (e, emitter) in found.emitters.iter_mut().enumerate() {
         emitter.energy_j = emitter.energy_j.max(0.0);
-        // The monitor filters the positions of a moving platform: what it takes over with a velocity it does not.
-        if let Some(Posterior { state, .. }) = posterior.as_ref().filter(|_| is_still) {
-            let velocity = [2, 3].map(|k| state[STATE * present[e] + k] * sigma);
-            emitter.velocity = Some(velocity_on_ground(camera, emitter.sensor_m, velocity));
+        if let Some(Posterior { state, .. }) = &posterior {
+            let velocity = [2, 3].map(|k| state[STATE * present[e] + k]);
+            emitter.velocity = Some(if is_still {
+                velocity_on_ground(camera, emitter.sensor_m, velocity.map(|v| v * sigma))
+            } else {
+                let [vx_m_s, vy_m_s] = velocity.map(|v| v * window.unit_m);
+                Velocity { vx_m_s, vy_m_s }
+            });
         }
+        emitter.lasting_cov_m2 = lasting_cov
+            .as_ref()
+            .map(|cov: &DMatrix<f64>| [0, 1].map(|r| [0, 1].map(|c| cov[(2 * e + r, 2 * e + c)])));
         if is_over() {
             emitter.flags |= Flags::OUT_OF_TIME;
         }

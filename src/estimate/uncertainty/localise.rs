@@ -183,6 +183,7 @@ pub(crate) fn localise(
                 cov_m2: camera.cov_to_ground(sensor_m, own.map(|r| r.map(|c| c * scale))),
                 energy_j: source.a * noise_j,
                 velocity: None,
+                lasting_cov_m2: None,
                 // Two square roots: the product of the variances may overflow.
                 energy_std_j: energy_variance.max(0.0).sqrt() * inflation.sqrt() * noise_j,
                 sensor_m,

@@ -31,6 +31,7 @@ impl Watch {
     fn beams(energies: [f64; 4]) -> Vec<Detection> {
         let of = |([x, y], energy_j): ([f64; 2], f64)| Detection {
             velocity: None,
+            lasting_cov_m2: None,
             energy_j,
             ..detection(x, y)
         };

@@ -5,7 +5,7 @@ use std::collections::VecDeque;
 use jiff::Timestamp;
 use nalgebra::Vector2;
 
-use super::detection::Detection;
+use super::detection::{Detection, Earlier};
 use super::manoeuvring::ManoeuvringFilter;
 use crate::claims::seconds;
 use crate::monitor::stats::gaussian::largest_eigenvalue;
@@ -106,10 +106,11 @@ impl Track {
         } else {
             detection.cov
         };
-        match detection.velocity {
-            // Filtering a posterior again would count the same light twice.
-            Some(velocity) => self.filter.adopt(detection.position, cov, velocity),
-            None => self.filter.update(detection.position, cov),
+        // Filtering a posterior again would count the same light twice.
+        match detection.earlier {
+            Earlier::Nothing => self.filter.update(detection.position, cov),
+            Earlier::All { velocity } => self.filter.adopt(detection.position, cov, velocity),
+            Earlier::Own { cov: own } => self.filter.update_beside(detection.position, cov, own),
         }
         self.last_hit = time;
         self.hit = true;

@@ -15,6 +15,20 @@ const MAX_INFLATION: f64 = 100.0;
 /// Distance, in σ of the spot, within which two spots overlap by a tenth.
 pub const OVERLAP: f64 = 3.0;
 
+/// What earlier frames have given of a detection, where the estimator follows emitters over frames.
+#[derive(Clone, Copy, Debug)]
+pub enum Earlier {
+    Nothing,
+    /// All: position and covariance are the posterior of all frames, and so is the velocity, m/s.
+    All {
+        velocity: Vector2<f64>,
+    },
+    /// The error of covariance `cov`, m², that is its own: the pose's is the frame's.
+    Own {
+        cov: Matrix2<f64>,
+    },
+}
+
 /// An emitter of one frame on the ground.
 #[derive(Clone, Debug)]
 pub struct Detection {
@@ -24,8 +38,7 @@ pub struct Detection {
     pub cov: Matrix2<f64>,
     /// ∂position/∂pose; zero for a fixed platform.
     pub by_pose: Matrix2x6<f64>,
-    /// Velocity, m/s, where the estimator follows emitters over frames: position and covariance are then a posterior of all of them.
-    pub velocity: Option<Vector2<f64>>,
+    pub earlier: Earlier,
     pub energy_j: f64,
     pub flags: Flags,
     pub moments: MomentScore,
@@ -74,12 +87,21 @@ impl Detection {
         let most = a.sqrt() * c.sqrt();
         let b = b.clamp(-most, most);
         let cov = Matrix2::new(a, b, b, c) * inflation + Matrix2::identity() * POSITION_FLOOR_M.powi(2);
+        let earlier = match (e.lasting_cov_m2, e.velocity) {
+            (Some([x, y]), _) => Earlier::Own {
+                cov: Matrix2::from_rows(&[x.into(), y.into()]) * inflation,
+            },
+            (None, Some(v)) => Earlier::All {
+                velocity: Vector2::new(v.vx_m_s, v.vy_m_s),
+            },
+            (None, None) => Earlier::Nothing,
+        };
         Some(Self {
             position: placed.position_m,
             z_m: placed.z_m,
             cov,
             by_pose: placed.by_pose,
-            velocity: e.velocity.map(|v| Vector2::new(v.vx_m_s, v.vy_m_s)),
+            earlier,
             energy_j: e.energy_j,
             flags: e.flags,
             moments: MomentScore::of(&e.second_moment, inflation),
@@ -189,7 +211,7 @@ pub mod fixture {
             z_m: 0.0,
             cov: Matrix2::identity() * 0.01,
             by_pose: Matrix2x6::zeros(),
-            velocity: None,
+            earlier: Earlier::Nothing,
             energy_j: 1.0,
             flags: Flags::empty(),
             moments: MomentScore::default(),
@@ -220,6 +242,7 @@ mod tests {
             energy_std_j: 1e-6,
             sensor_m: [0.0, 0.0],
             velocity: None,
+            lasting_cov_m2: None,
             second_moment: estimate::SecondMomentScore::default(),
             flags: Flags::empty(),
         }

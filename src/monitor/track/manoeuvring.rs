@@ -22,6 +22,8 @@ pub struct ManoeuvringFilter {
     modes: [KalmanFilter; MODES],
     probabilities: [f64; MODES],
     mixture: KalmanFilter,
+    /// Covariance of what no measurement averages out, m².
+    lasting: Matrix2<f64>,
 }
 
 impl ManoeuvringFilter {
@@ -32,6 +34,7 @@ impl ManoeuvringFilter {
             modes: [filter; MODES],
             probabilities: usual(),
             mixture: filter,
+            lasting: Matrix2::zeros(),
         }
     }
 
@@ -74,9 +77,17 @@ impl ManoeuvringFilter {
         self.mix();
     }
 
+    /// Takes a measured position, m, whose error is one of covariance `r`, m², beside one of covariance `lasting` that it shares with
+    /// those before.
+    pub fn update_beside(&mut self, z: Vector2<f64>, r: Matrix2<f64>, lasting: Matrix2<f64>) {
+        self.lasting = lasting;
+        self.update(z, r);
+    }
+
     /// Takes over a position, m, of covariance `r`, m², and a velocity, m/s, that hold all that was measured until now.
     pub fn adopt(&mut self, z: Vector2<f64>, r: Matrix2<f64>, velocity: Vector2<f64>) {
         self.modes.iter_mut().for_each(|mode| mode.adopt(z, r, velocity));
+        self.lasting = Matrix2::zeros();
         self.mix();
     }
 
@@ -95,7 +106,7 @@ impl ManoeuvringFilter {
     }
 
     pub fn position_cov(&self) -> Matrix2<f64> {
-        self.mixture.position_cov()
+        self.mixture.position_cov() + self.lasting
     }
 
     fn mix(&mut self) {
@@ -145,6 +156,18 @@ mod tests {
         }
         assert!((0.6..1.1).contains(&normalised), "{normalised}");
         assert!(squared < 0.7 * turning_squared, "{squared} {turning_squared}");
+    }
+
+    #[test]
+    fn an_error_that_lasts_is_not_averaged_out() {
+        let r = Matrix2::identity() * 0.01;
+        let mut filter = ManoeuvringFilter::start(Vector2::zeros(), r);
+        for _ in 0..100 {
+            filter.predict(0.1);
+            filter.update_beside(Vector2::zeros(), r, 4.0 * r);
+        }
+        let variance = filter.position_cov()[(0, 0)];
+        assert!((0.04..0.05).contains(&variance), "{variance}");
     }
 
     #[test]

@@ -143,6 +143,7 @@ fn emitter(camera: &Camera, frame: u64, [x_m, y_m]: [f64; 2], cov_m2: [[f64; 2];
         energy_std_j: 1e-5,
         sensor_m: camera.to_sensor([x_m, y_m]),
         velocity: None,
+        lasting_cov_m2: None,
         second_moment: SecondMomentScore::default(),
         flags: Flags::empty(),
     }

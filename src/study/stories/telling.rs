@@ -149,6 +149,7 @@ fn detect(story: &Story, t: f64, rng: &mut ChaCha8Rng) -> Vec<Emitter> {
                 energy_std_j: 1e-5,
                 sensor_m: camera.to_sensor([x_m, y_m]),
                 velocity: None,
+                lasting_cov_m2: None,
                 second_moment: score(&blob, story, &camera, &mut shapes),
                 flags: Flags::empty(),
             }
