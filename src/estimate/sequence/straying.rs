@@ -21,10 +21,11 @@ const STRAIGHT: f64 = 5.0;
 /// How long courses count as straight, s: of who goes straight on, and of who accelerates all the time.
 const LONGEST_S: f64 = 40.0;
 const SHORTEST_S: f64 = 0.3;
-/// How fast the ln of that follows what a frame has shown, and the mean square over its expectation at which it stays. Faster, or staying at
-/// less, takes chance for restlessness; slower, or staying at more, leaves who roams to the turns.
-const RATE: f64 = 0.02;
-const STAYS: f64 = 1.3;
+/// How fast the ln of that follows what a frame has shown, the mean square over its expectation at which it stays, and most that a frame counts.
+/// Faster takes chance for restlessness, slower leaves who begins to roam to the turns.
+const RATE: f64 = 0.01;
+const STAYS: f64 = 1.12;
+const MOST_OF_A_FRAME: f64 = 5.0;
 
 /// Changes added up over a memory: the older, the less they count.
 #[derive(Clone, Copy, Debug, Default)]
@@ -77,7 +78,7 @@ impl Straying {
         for (sum, frames) in self.sums.iter_mut().zip(MEMORIES) {
             sum.add(change, 1.0 - 1.0 / frames);
         }
-        let shown = 0.5 * self.sums[1].z2().min(SURPRISE);
+        let shown = (0.5 * self.sums[1].z2()).min(MOST_OF_A_FRAME);
         let most = (LONGEST_S / SHORTEST_S).ln();
         self.restlessness = (self.restlessness + RATE * (shown - STAYS)).clamp(0.0, most);
         self.sums.iter().any(|sum| sum.z2() > SURPRISE)
