@@ -199,7 +199,7 @@ fn who_roams_is_followed_where_poses_tell_little() {
     };
     let together = median(flight().errors("sequence", 60, 240));
     let alone = median(flight().errors("ml", 60, 240));
-    assert!(together < 0.085 * alone, "{together} against {alone} m²");
+    assert!(together < 0.2 * alone, "{together} against {alone} m²");
 }
 
 #[test]
