@@ -3,8 +3,8 @@
 use super::*;
 use crate::monitor::fixture::{Scene, absent, present};
 use crate::monitor::track::association::Association;
+use crate::monitor::track::detection::Detection;
 use crate::monitor::track::detection::fixture::detection;
-use crate::monitor::track::detection::{Detection, Earlier};
 
 const USERS: [[f64; 2]; 4] = [[0.0, 0.0], [80.0, 0.0], [0.0, 80.0], [-80.0, 0.0]];
 
@@ -30,7 +30,6 @@ impl Watch {
 
     fn beams(energies: [f64; 4]) -> Vec<Detection> {
         let of = |([x, y], energy_j): ([f64; 2], f64)| Detection {
-            earlier: Earlier::Nothing,
             energy_j,
             ..detection(x, y)
         };
