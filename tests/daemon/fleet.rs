@@ -10,6 +10,7 @@ use serde_json::{Value, json};
 
 use crate::journals::agree;
 use crate::nats::{Server, hub, station, station_with};
+use crate::port::free_port;
 use crate::process::{Daemon, alerts};
 
 #[test]
@@ -186,7 +187,7 @@ fn the_hub_shows_where_the_platforms_are() {
     let Some(server) = Server::start(dir.path(), None) else {
         return;
     };
-    let autopilot = UdpSocket::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+    let autopilot = free_port();
     let platform =
         format!("positions_hz = 4.0\n[platform]\nkind = \"mavlink\"\nendpoint = \"udpin:127.0.0.1:{autopilot}\"\n");
     let hub = hub(dir.path(), server.port);

@@ -1,7 +1,6 @@
 //! A server on board of an access point that is a leaf node of the fleet's, and MQTT clients: the shipped configs with their options on.
 
 use std::ffi::OsString;
-use std::net::TcpListener;
 use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
@@ -13,13 +12,10 @@ use crate::fleet_measured::scene;
 use crate::fleet_permissions::{self, Key};
 use crate::journals::agree;
 use crate::nats::{Server, station_of};
+use crate::port::free_port;
 use crate::process::alerts;
 
 const CA: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/data/tls/ca.pem");
-
-fn free_port() -> u16 {
-    TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port()
-}
 
 /// A line that begins with # and no space is an option that is off.
 fn options_on(text: &str) -> String {

@@ -11,6 +11,7 @@ mod journals;
 mod nats;
 mod over_http;
 mod places;
+mod port;
 mod process;
 mod reload;
 mod siege;

@@ -1,11 +1,12 @@
 //! A real NATS server, and stations and a hub that use it.
 
 use std::ffi::OsString;
-use std::net::{TcpListener, TcpStream};
+use std::net::TcpStream;
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
+use crate::port::free_port;
 use crate::process::Daemon;
 
 /// A NATS server with JetStream; killed when dropped.
@@ -33,7 +34,7 @@ impl Server {
 
     /// With other arguments, which are given the port.
     pub fn start_with(port: Option<u16>, arguments: impl FnOnce(u16) -> Vec<OsString>) -> Option<Self> {
-        let port = port.unwrap_or_else(|| TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port());
+        let port = port.unwrap_or_else(free_port);
         let child = Command::new("nats-server")
             .args(arguments(port))
             .stderr(Stdio::null())

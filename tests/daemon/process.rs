@@ -10,6 +10,8 @@ use std::time::{Duration, Instant};
 
 use serde_json::Value;
 
+use crate::port::free_port;
+
 /// A running `oapwatch run` on a free port; killed when dropped.
 pub struct Daemon {
     child: Child,
@@ -25,7 +27,7 @@ impl Daemon {
 
     /// As another command than `run`.
     pub fn start_as(dir: &Path, command: &str, config: &str) -> Self {
-        let port = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+        let port = free_port();
         let file = dir.join("oapwatch.toml");
         std::fs::write(&file, config).unwrap();
         // Figures are to be of the program as it is shipped, whatever the test was built as.
@@ -130,8 +132,13 @@ impl Daemon {
     /// Waits for the end; gives the exit code and the log.
     pub fn end(mut self) -> (Option<i32>, Vec<String>) {
         let code = self.child.wait().unwrap().code();
+        (code, self.take_log())
+    }
+
+    /// Of a process that has ended.
+    fn take_log(&mut self) -> Vec<String> {
         let log = std::mem::replace(&mut self.log, std::thread::spawn(Vec::new));
-        (code, log.join().unwrap())
+        log.join().unwrap_or_default()
     }
 }
 
@@ -139,6 +146,11 @@ impl Drop for Daemon {
     fn drop(&mut self) {
         let _ = self.child.kill();
         let _ = self.child.wait();
+        if std::thread::panicking() {
+            let log = self.take_log();
+            let last = &log[log.len().saturating_sub(20)..];
+            eprintln!("the log of {}, its end:\n{}", self.url, last.join("\n"));
+        }
     }
 }
 

@@ -10,6 +10,7 @@ use std::time::Duration;
 
 use serde_json::Value;
 
+use super::port::free_port;
 use super::process::{Daemon, alerts};
 
 fn bytes(hex: &str) -> Vec<u8> {
@@ -21,7 +22,7 @@ fn bytes(hex: &str) -> Vec<u8> {
 #[test]
 fn an_autopilot_s_poses_are_used_shown_and_missed() {
     let dir = tempfile::tempdir().unwrap();
-    let port = UdpSocket::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+    let port = free_port();
     let platform = format!("[platform]\nkind = \"mavlink\"\nendpoint = \"udpin:127.0.0.1:{port}\"\n");
     let config = format!("{platform}[record]\nfolder = \"recordings\"\n");
     let daemon = Daemon::start(dir.path(), &config);

@@ -1,7 +1,6 @@
 //! `[[export]]` against the systems themselves: Debian's rsyslog and Alertmanager. `make setup-test` installs them; where one is
 //! missing its test is skipped, but not where CI is set.
 
-use std::net::TcpListener;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::Duration;
@@ -11,6 +10,7 @@ use oapwatch::notify::Clock;
 use serde_json::Value;
 
 use super::exports::endpoint;
+use super::port::free_port;
 use super::sender::{Daemon, event, on_disk, until};
 
 /// A program that ends with the test.
@@ -42,12 +42,6 @@ pub fn run(program: &Path, arguments: &[&str]) -> Running {
         .stderr(Stdio::null())
         .spawn();
     Running(child.expect("the program starts"))
-}
-
-/// A port that was free a moment ago.
-pub fn free_port() -> u16 {
-    let listener = TcpListener::bind("127.0.0.1:0").expect("a free port");
-    listener.local_addr().expect("its address").port()
 }
 
 async fn until_listening(port: u16) {

@@ -5,6 +5,8 @@ mod config;
 mod counterparts;
 mod disk;
 mod exports;
+#[path = "../daemon/port.rs"]
+mod port;
 mod positions;
 mod receiver;
 mod sapient;

@@ -14,8 +14,9 @@ use serde_json::json;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpStream, UdpSocket};
 
-use super::counterparts::{free_port, installed, run};
+use super::counterparts::{installed, run};
 use super::exports::{context, load};
+use super::port::free_port;
 use super::sender::{Daemon, event, on_disk, start, until};
 
 /// A verified user at (100, 200) m with standard deviations of 2 and 1 m, and a stranger at (-50, 0) m.

@@ -1,13 +1,15 @@
 //! The page in a real browser on the real daemon: an eavesdropper appears, is acknowledged, is gone; the daemon restarts.
 
 mod browser;
+#[path = "../daemon/port.rs"]
+mod port;
 
-use std::net::TcpListener;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
 use browser::Browser;
+use port::free_port;
 
 /// The built-in scene's eavesdropper comes after five seconds and stays for eight, every half minute.
 const PATIENCE: Duration = Duration::from_secs(45);
@@ -45,10 +47,7 @@ async fn until(browser: &mut Browser, what: &str, condition: &str) {
 #[tokio::test]
 async fn an_eavesdropper_comes_is_acknowledged_and_goes_and_a_restart_is_survived() {
     let dir = tempfile::tempdir().expect("a folder");
-    let port = TcpListener::bind("127.0.0.1:0")
-        .and_then(|l| l.local_addr())
-        .expect("a free port")
-        .port();
+    let port = free_port();
     let config = dir.path().join("oapwatch.toml");
     let text = format!(
         "[api]\nlisten = \"127.0.0.1:{port}\"\n[journal]\npath = \"journal.db\"\n[record]\nfolder = \"recordings\"\n"
@@ -192,10 +191,7 @@ async fn an_eavesdropper_comes_is_acknowledged_and_goes_and_a_restart_is_survive
 #[tokio::test]
 async fn a_picture_lies_below_a_platform_that_moves() {
     let dir = tempfile::tempdir().expect("a folder");
-    let port = TcpListener::bind("127.0.0.1:0")
-        .and_then(|l| l.local_addr())
-        .expect("a free port")
-        .port();
+    let port = free_port();
     let mut png = png::Encoder::new(
         std::fs::File::create(dir.path().join("yard.png")).expect("a file"),
         2,

@@ -1,10 +1,14 @@
 //! The running daemon held to its own description: schemathesis makes requests from /openapi.json, right and wrong ones, and
 //! fails on a server error, an answer that is not described, or wrong input that is taken. `make setup-test` installs it.
 
-use std::net::TcpListener;
+#[path = "../daemon/port.rs"]
+mod port;
+
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
+
+use port::free_port;
 
 struct Daemon(Child);
 
@@ -29,11 +33,7 @@ fn every_answer_is_as_described() {
         return;
     }
     let dir = tempfile::tempdir().expect("a folder");
-    let free = || {
-        let listener = TcpListener::bind("127.0.0.1:0").expect("a free port");
-        listener.local_addr().expect("its address").port()
-    };
-    let (port, nobody) = (free(), free());
+    let (port, nobody) = (free_port(), free_port());
     let secret = dir.path().join("secret");
     std::fs::write(&secret, "whsec_MDEyMzQ1Njc4OWFiY2RlZjAxMjM0NTY3ODlhYmNkZWY=\n").expect("the secret is written");
     let config = dir.path().join("oapwatch.toml");
