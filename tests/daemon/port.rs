@@ -10,8 +10,8 @@ const COUNT: u16 = 22_000;
 /// A port that nobody listens on; none is given twice.
 pub fn free_port() -> u16 {
     static TRIED: AtomicU16 = AtomicU16::new(0);
-    // Test programs that run beside each other begin at different ones.
-    let begin = std::process::id() as u16 % COUNT;
+    // Test programs that run beside each other begin far apart.
+    let begin = (std::process::id() as u16).wrapping_mul(199) % COUNT;
     loop {
         let tried = TRIED.fetch_add(1, Ordering::Relaxed);
         assert!(tried < COUNT, "no port is free");
