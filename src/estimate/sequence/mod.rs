@@ -14,6 +14,7 @@ mod outlook;
 mod report;
 mod reprojection;
 mod residual_map;
+mod restlessness;
 mod revision;
 mod revision_schedule;
 mod search;

@@ -133,13 +133,21 @@ pub(crate) fn surprised(known: &JointInformation, fresh: &mut Window, elapsed: f
         let Some(std) = block(&errors).cholesky().map(|c| c.l()) else {
             return false;
         };
-        let now = block(&now);
-        let left = std.solve_lower_triangular(&now).map(|left| left.transpose());
-        let change = std.solve_lower_triangular(&Vector2::new(change[2 * i], change[2 * i + 1]));
-        let (Some(change), Some(left)) = (change, left) else {
+        let own = block(&now);
+        let left = std.solve_lower_triangular(&own).map(|left| left.transpose());
+        let normalised = std.solve_lower_triangular(&Vector2::new(change[2 * i], change[2 * i + 1]));
+        let (Some(normalised), Some(left)) = (normalised, left) else {
             return false;
         };
-        fresh.targets[e].straying.add(change, left, 0.5 * now.trace(), reach)
+        // What the frame adds to what was known.
+        let alone = [0, 1].map(|k| {
+            let at = 2 * i + k;
+            let weight = (own[(k, k)] + errors[(at, at)]) / errors[(at, at)];
+            (before[place(at)] + weight * change[at], weight * own[(k, k)])
+        });
+        let straying = &mut fresh.targets[e].straying;
+        straying.see(alone.map(|a| a.0), alone.map(|a| a.1), fresh.time_s, unit);
+        straying.add(normalised, left, 0.5 * own.trace(), reach)
     };
     let shown = present.iter().enumerate().filter(|(i, e)| is_surprised(*i, **e));
     shown.map(|(_, e)| *e).collect()

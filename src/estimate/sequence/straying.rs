@@ -2,6 +2,8 @@
 
 use nalgebra::{Matrix2, Vector2};
 
+use crate::estimate::sequence::restlessness::Restlessness;
+
 /// Frames over which changes of an emitter's position are added up: the newest alone shows a corner, more of them a bend.
 const MEMORIES: [f64; 3] = [1.0, 8.0, 32.0];
 /// Squared standard deviations of such a sum from which an emitter has turned: by chance once in 270,000 frames, and what it costs is
@@ -21,11 +23,6 @@ const STRAIGHT: f64 = 5.0;
 /// How long courses count as straight, s: of who goes straight on, and of who accelerates all the time.
 const LONGEST_S: f64 = 40.0;
 const SHORTEST_S: f64 = 0.3;
-/// How fast the ln of that follows what a frame has shown, the mean square over its expectation at which it stays, and most that a frame counts.
-/// Faster takes chance for restlessness, slower leaves who begins to roam to the turns.
-const RATE: f64 = 0.01;
-const STAYS: f64 = 1.12;
-const MOST_OF_A_FRAME: f64 = 5.0;
 
 /// Changes added up over a memory: the older, the less they count.
 #[derive(Clone, Copy, Debug, Default)]
@@ -63,8 +60,9 @@ pub(crate) struct Straying {
     reach: f64,
     /// Variance of the position along an axis, σ².
     variance: f64,
-    /// ln of [`LONGEST_S`] over how long the course is straight.
-    restlessness: f64,
+    restlessness: Restlessness,
+    /// Spectral density of the acceleration, σ²/s³.
+    density: f64,
     /// Whether frames do not tell its course.
     is_hidden: bool,
 }
@@ -78,10 +76,14 @@ impl Straying {
         for (sum, frames) in self.sums.iter_mut().zip(MEMORIES) {
             sum.add(change, 1.0 - 1.0 / frames);
         }
-        let shown = (0.5 * self.sums[1].z2()).min(MOST_OF_A_FRAME);
-        let most = (LONGEST_S / SHORTEST_S).ln();
-        self.restlessness = (self.restlessness + RATE * (shown - STAYS)).clamp(0.0, most);
         self.sums.iter().any(|sum| sum.z2() > SURPRISE)
+    }
+
+    /// Takes where the frame at `time_s` alone shows it, σ, with the variance of each coordinate, σ². `unit` is 1 m in σ.
+    pub fn see(&mut self, place: [f64; 2], variance: [f64; 2], time_s: f64, unit: f64) {
+        let (place_m, variance_m2) = (place.map(|v| v / unit), variance.map(|v| v / (unit * unit)));
+        self.restlessness.see(place_m, variance_m2, time_s);
+        self.density = self.restlessness.density_m2_s3() * unit * unit;
     }
 
     /// The frame does not tell its course, which then does not count as straight.
@@ -93,11 +95,12 @@ impl Straying {
     pub fn turn(&mut self) {
         self.sums = Default::default();
         self.shown += 1.0;
+        self.restlessness.turn();
     }
 
     /// What it has shown of accelerations so far is forgotten.
     pub fn go_straight(&mut self) {
-        self.restlessness = 0.0;
+        (self.restlessness, self.density) = Default::default();
     }
 
     /// How long the course counts as straight, s.
@@ -111,7 +114,12 @@ impl Straying {
     }
 
     fn unbent_s(&self) -> f64 {
-        LONGEST_S * (-self.restlessness).exp()
+        if self.density == 0.0 {
+            return LONGEST_S;
+        }
+        (STRAIGHT * self.variance / self.density)
+            .cbrt()
+            .clamp(SHORTEST_S, LONGEST_S)
     }
 
     /// The second moment of how far the fitted position is behind, σ², over whether the emitter has left its course, by the memory that tells
@@ -203,26 +211,6 @@ mod tests {
             stands < 0.05 * unknown && roams > 5.0 * unknown,
             "{stands} {unknown} {roams}"
         );
-    }
-
-    #[test]
-    fn who_roams_is_restless_and_who_goes_straight_on_is_not() {
-        let mut rng = ChaCha8Rng::seed_from_u64(3);
-        let mut straight_s = |bias: f64, variance: fn(u32) -> f64| {
-            let mut straying = Straying::default();
-            let mut sum = 0.0;
-            for k in 0..1000 {
-                let noise = Vector2::from_fn(|_, _| StandardNormal.sample(&mut rng));
-                straying.add(noise + Vector2::new(bias, 0.0), Matrix2::identity(), variance(k), 1.0);
-                sum += straying.straight_s();
-            }
-            sum / 1000.0
-        };
-        let (straight, roams) = (straight_s(0.0, |_| 1.0), straight_s(1.5, |_| 1.0));
-        assert!(straight > 10.0 && roams < 2.0, "{straight} {roams}");
-        // Chance while a place is hardly known is no acceleration once it is known well.
-        let becomes_known = straight_s(0.0, |k| f64::from(k + 1).powi(-3));
-        assert!(becomes_known > 10.0, "{becomes_known}");
     }
 
     #[test]
