@@ -15,7 +15,7 @@ pub fn free_port() -> u16 {
     loop {
         let tried = TRIED.fetch_add(1, Ordering::Relaxed);
         assert!(tried < COUNT, "no port is free");
-        let port = FIRST + begin.wrapping_add(tried) % COUNT;
+        let port = FIRST + (begin + tried) % COUNT;
         if TcpListener::bind(("127.0.0.1", port)).is_ok() && UdpSocket::bind(("127.0.0.1", port)).is_ok() {
             return port;
         }
