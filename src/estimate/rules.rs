@@ -117,8 +117,6 @@ rules! {
     principal_components,
     /// Emitters are born where the residuals of all frames together peak.
     summed_residuals,
-    /// The covariance holds what may be left of a turn.
-    allow_for_turns,
     /// The accelerations of who roams are learned, and the window ends where courses are not straight.
     follow_accelerations,
     /// Velocities count as those of people who stand, walk, cycle or drive.

@@ -3,7 +3,7 @@
 use nalgebra::{DMatrix, DVector, Matrix2, Vector2};
 
 use crate::estimate::emitter::Velocity;
-use crate::estimate::sequence::course::{MANOEUVRE_M_S, SPEED_STD_M_S};
+use crate::estimate::sequence::course::SPEED_STD_M_S;
 use crate::estimate::sequence::joint_information::{JointInformation, STATE};
 use crate::estimate::sequence::window::Window;
 use crate::optics::Camera;
@@ -96,11 +96,10 @@ pub(crate) fn velocity_on_ground(camera: &Camera, sensor_m: [f64; 2], velocity: 
     }
 }
 
-/// The targets of the fitted newest frame, `elapsed` seconds after what was `known` before, that it or the frames before show elsewhere than
+/// The targets of the fitted newest frame that it or the frames before show elsewhere than
 /// straight on. The covariance of a change of position is what the covariance falls by (Kalman, 1960), and successive changes are independent.
 /// What all change alike is the pose's. `unit` is 1 m/s in σ/s.
-pub(crate) fn surprised(known: &JointInformation, fresh: &mut Window, elapsed: f64, unit: f64) -> Vec<usize> {
-    let reach = MANOEUVRE_M_S * elapsed * unit;
+pub(crate) fn surprised(known: &JointInformation, fresh: &mut Window, unit: f64) -> Vec<usize> {
     let of = |knowledge: &JointInformation| {
         let covariance = knowledge.covariance()?;
         Some((&knowledge.at + &covariance * &knowledge.gradient, covariance))
@@ -134,9 +133,7 @@ pub(crate) fn surprised(known: &JointInformation, fresh: &mut Window, elapsed: f
             return false;
         };
         let own = block(&now);
-        let left = std.solve_lower_triangular(&own).map(|left| left.transpose());
-        let normalised = std.solve_lower_triangular(&Vector2::new(change[2 * i], change[2 * i + 1]));
-        let (Some(normalised), Some(left)) = (normalised, left) else {
+        let Some(normalised) = std.solve_lower_triangular(&Vector2::new(change[2 * i], change[2 * i + 1])) else {
             return false;
         };
         // What the frame adds to what was known.
@@ -147,7 +144,7 @@ pub(crate) fn surprised(known: &JointInformation, fresh: &mut Window, elapsed: f
         });
         let straying = &mut fresh.targets[e].straying;
         straying.see(alone.map(|a| a.0), alone.map(|a| a.1), fresh.time_s, unit);
-        straying.add(normalised, left, 0.5 * own.trace(), reach)
+        straying.add(normalised, 0.5 * own.trace())
     };
     let shown = present.iter().enumerate().filter(|(i, e)| is_surprised(*i, **e));
     shown.map(|(_, e)| *e).collect()

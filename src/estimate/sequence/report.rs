@@ -36,15 +36,7 @@ pub(crate) fn report(
     let mut positions = window.positions(&space.bases);
     if let (Some(Posterior { state, covariance }), Some(newest)) = (&posterior, window.snapshots.last()) {
         let place = |k: usize| STATE * present[k / 2] + k % 2;
-        let mut own = DMatrix::from_fn(2 * n, 2 * n, |r, c| covariance[(place(r), place(c))]);
-        for (i, &e) in present.iter().enumerate().filter(|_| rules.allow_for_turns) {
-            let lag = window.targets[e].straying.lag();
-            for k in 0..2 {
-                for l in 0..2 {
-                    own[(2 * i + k, 2 * i + l)] += lag[(k, l)];
-                }
-            }
-        }
+        let own = DMatrix::from_fn(2 * n, 2 * n, |r, c| covariance[(place(r), place(c))]);
         let mut engine = Engine {
             bases: &space.bases,
             rules,

@@ -148,7 +148,7 @@ impl SequenceEstimator {
             let known = self.window.total.clone();
             let fresh = self.fresh(known.clone(), time_s);
             let mut fresh = self.fit(fresh, &mut budget);
-            let turned = surprised(&known, &mut fresh, elapsed, 1.0 / self.window.unit_m);
+            let turned = surprised(&known, &mut fresh, 1.0 / self.window.unit_m);
             if turned.is_empty()
                 && let Some(grown) = self.explain(fresh.clone(), scale, &mut budget)
             {
