@@ -4,18 +4,17 @@ use std::f64::consts::PI;
 
 use super::Camera;
 
-/// The motion of spots during an exposure: each goes evenly along a straight line, by a displacement linear in its place.
-#[derive(Clone, Copy, Debug, PartialEq)]
+/// The motion of spots during an exposure: each goes evenly along a straight line, by the displacement that a plane has before a moving camera,
+/// d(p) = d₀ + B·p + p·(c·p) (Longuet-Higgins and Prazdny, 1980).
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Smear {
     /// Displacement from the beginning to the end at the sensor's centre, m.
     pub at_centre_m: [f64; 2],
-    /// ∂displacement/∂place.
+    /// B, ∂displacement/∂place there.
     pub by_place: [[f64; 2]; 2],
+    /// c, 1/m.
+    pub by_square_per_m: [f64; 2],
 }
-
-/// Standard deviation of a smear, in the spot's σ, from which on it is known to an estimator. Smaller ones widen the spot by less than
-/// 2 %; lower costs a fit four to nine times as much in more frames.
-pub const LEAST_SMEAR: f64 = 0.2;
 
 /// Most displaced spots of a sum: a fit costs as the square. So many add up to a smear of 7 σ within 4·10⁻⁷ of the peak.
 const MOST_NODES: usize = 12;
@@ -23,14 +22,22 @@ const MOST_NODES: usize = 12;
 impl Smear {
     /// Displacement, m, of a spot that is at `place_m` in the middle of the exposure.
     pub fn displacement_m(&self, place_m: [f64; 2]) -> [f64; 2] {
-        displacement(self.at_centre_m, self.by_place, place_m)
+        displacement(self.at_centre_m, self.by_place, self.by_square_per_m, place_m)
     }
 
     /// The same motion as a window of the sensor sees it, whose middle is at `place_m`.
     pub fn seen_from(&self, place_m: [f64; 2]) -> Self {
+        let c = self.by_square_per_m;
+        let along = c[0] * place_m[0] + c[1] * place_m[1];
+        let mut by_place = self.by_place;
+        for (k, row) in by_place.iter_mut().enumerate() {
+            row[k] += along;
+            row.iter_mut().zip(c).for_each(|(b, c)| *b += place_m[k] * c);
+        }
         Self {
             at_centre_m: self.displacement_m(place_m),
-            ..*self
+            by_place,
+            by_square_per_m: c,
         }
     }
 
@@ -45,11 +52,6 @@ impl Smear {
         lengths.into_iter().fold(0.0, f64::max)
     }
 
-    /// Whether the standard deviation of the smear, its length over √12, reaches [`LEAST_SMEAR`] anywhere on the sensor.
-    pub fn matters(&self, camera: &Camera) -> bool {
-        self.longest_m(camera) / 12f64.sqrt() >= LEAST_SMEAR * camera.spot_sigma_m
-    }
-
     /// The same smear as a sum of displaced spots, off by at most `tolerance` of the spot's peak anywhere.
     pub fn displaced(&self, camera: &Camera, tolerance: f64) -> DisplacedSpots {
         let sigma = camera.spot_sigma_m;
@@ -57,6 +59,7 @@ impl Smear {
         DisplacedSpots {
             at_centre: self.at_centre_m.map(|d| d / sigma),
             by_place: self.by_place,
+            by_square: self.by_square_per_m.map(|c| c * sigma),
             length,
             nodes: gauss_legendre(nodes_within(length, tolerance)),
         }
@@ -83,6 +86,7 @@ fn nodes_within(length: f64, tolerance: f64) -> usize {
 pub struct DisplacedSpots {
     at_centre: [f64; 2],
     by_place: [[f64; 2]; 2],
+    by_square: [f64; 2],
     /// The longest displacement.
     length: f64,
     /// Parts of the displacement, −½ to ½, and shares of the light.
@@ -98,16 +102,31 @@ impl DisplacedSpots {
         }
     }
 
+    /// How much the longest displacement changes a spot's shape, over the spot's norm: L²/24 times its second derivative along the motion, less
+    /// what has the spot's own shape.
+    pub fn change_of_shape(&self) -> f64 {
+        self.length * self.length / (24.0 * 2f64.sqrt())
+    }
+
     /// Displacement during the exposure, σ, of a spot at `u`, σ.
     #[inline]
     pub fn displacement(&self, u: [f64; 2]) -> [f64; 2] {
-        displacement(self.at_centre, self.by_place, u)
+        displacement(self.at_centre, self.by_place, self.by_square, u)
     }
 }
 
 #[inline]
-fn displacement(at_centre: [f64; 2], [[a, b], [c, d]]: [[f64; 2]; 2], [x, y]: [f64; 2]) -> [f64; 2] {
-    [at_centre[0] + a * x + b * y, at_centre[1] + c * x + d * y]
+fn displacement(
+    at_centre: [f64; 2],
+    [[a, b], [c, d]]: [[f64; 2]; 2],
+    by_square: [f64; 2],
+    [x, y]: [f64; 2],
+) -> [f64; 2] {
+    let along = by_square[0] * x + by_square[1] * y;
+    [
+        at_centre[0] + (a + along) * x + b * y,
+        at_centre[1] + c * x + (d + along) * y,
+    ]
 }
 
 /// Nodes on −½ to ½ and weights that add up to 1: the zeros of the Legendre polynomial by Newton's method (Abramowitz and Stegun, 1964,
@@ -166,7 +185,7 @@ mod tests {
         ] {
             let smear = Smear {
                 at_centre_m: [length * sigma, 0.0],
-                by_place: [[0.0; 2]; 2],
+                ..Smear::default()
             };
             let displaced = smear.displaced(&camera, tolerance);
             let density = |x: f64, c: f64| pixel_fraction(x - 1e-3, x + 1e-3, c, 1.0);
@@ -185,19 +204,48 @@ mod tests {
     }
 
     #[test]
-    fn the_longest_displacement_is_at_a_corner_and_small_ones_do_not_matter() {
+    fn the_longest_displacement_is_at_a_corner() {
         let camera = crate::optics::Config::default().camera().unwrap();
-        let sigma = camera.spot_sigma_m;
         let turning = Smear {
-            at_centre_m: [0.0, 0.0],
             by_place: [[0.0, -0.1], [0.1, 0.0]],
+            ..Smear::default()
         };
         let corner = camera.x.half_width().hypot(camera.y.half_width());
         assert!((turning.longest_m(&camera) - 0.1 * corner).abs() < 1e-12);
-        let along = |s: f64| Smear {
-            at_centre_m: [s * sigma * 12f64.sqrt(), 0.0],
-            by_place: [[0.0; 2]; 2],
+    }
+
+    #[test]
+    fn a_window_sees_the_same_motion() {
+        let smear = Smear {
+            at_centre_m: [1e-4, -2e-4],
+            by_place: [[0.01, -0.03], [0.02, 0.04]],
+            by_square_per_m: [0.7, -1.1],
         };
-        assert!(!along(0.99 * LEAST_SMEAR).matters(&camera) && along(1.01 * LEAST_SMEAR).matters(&camera));
+        let (middle, place) = ([4e-3, -7e-3], [1.5e-3, 2e-3]);
+        let seen = smear.seen_from(middle).displacement_m(place);
+        let whole = smear.displacement_m([middle[0] + place[0], middle[1] + place[1]]);
+        assert!((0..2).all(|k| (seen[k] - whole[k]).abs() < 1e-15), "{seen:?} {whole:?}");
+    }
+
+    #[test]
+    fn a_smear_changes_a_shape_by_what_its_energy_and_place_do_not_explain() {
+        let camera = crate::optics::Config::default().camera().unwrap();
+        let length = 0.3;
+        let smear = Smear {
+            at_centre_m: [length * camera.spot_sigma_m, 0.0],
+            ..Smear::default()
+        };
+        let displaced = smear.displaced(&camera, 1e-9);
+        let (mut own, mut both, mut smeared) = (0.0, 0.0, 0.0);
+        for k in -800..800 {
+            let x = 0.01 * f64::from(k);
+            let spot = |c: f64| (-0.5 * (x - c).powi(2)).exp();
+            let sum: f64 = displaced.nodes.iter().map(|(t, w)| w * spot(t * length)).sum();
+            own += spot(0.0).powi(2);
+            both += spot(0.0) * sum;
+            smeared += sum * sum;
+        }
+        let left = ((smeared - both * both / own) / own).sqrt();
+        assert!((left / displaced.change_of_shape() - 1.0).abs() < 0.03, "{left}");
     }
 }

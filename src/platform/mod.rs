@@ -251,16 +251,14 @@ impl Platform {
         }
     }
 
-    /// How spots move during an exposure of `exposure_s` at `time`, where the camera is placed as said; `None` where that is as good as not
-    /// at all, or not known.
+    /// How spots move during an exposure of `exposure_s` at `time`, where the camera is placed as said; `None` where that is not known.
     pub fn smear(&self, placement: &Placement, camera: &Camera, time: Timestamp, exposure_s: f64) -> Option<Smear> {
         let Placement::At { sight, .. } = placement else {
             return None;
         };
         let half_s = (0.5 * exposure_s).max(SMEAR_OVER_S);
         let rates = self.source.read(|poses| poses.mean_rates(self.stamp(time), half_s));
-        let smear = sight.smear(camera, &rates.flatten()?, exposure_s)?;
-        smear.matters(camera).then_some(smear)
+        sight.smear(camera, &rates.flatten()?, exposure_s)
     }
 
     /// The sight of a placed camera, where it may be another in the next frame.

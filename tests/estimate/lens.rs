@@ -295,6 +295,7 @@ fn smear() -> Smear {
     Smear {
         at_centre_m: [0.8 * length_m, 0.6 * length_m],
         by_place: [[0.0, -0.05], [0.05, 0.0]],
+        ..Smear::default()
     }
 }
 

@@ -287,15 +287,7 @@ fn a_measured_spot_that_varies_over_the_sensor_is_the_same_in_windows() {
         .into_iter()
         .map(|p| (p, ENERGY))
         .collect();
-    let frame = smeared(
-        &camera,
-        &spots,
-        &Smear {
-            at_centre_m: [0.0; 2],
-            by_place: [[0.0; 2]; 2],
-        },
-        4,
-    );
+    let frame = smeared(&camera, &spots, &Smear::default(), 4);
     let (by_windows, at_once) = (ml.estimate(&frame).unwrap(), whole.estimate(&frame).unwrap());
     let far = difference(&camera, &at_once, &by_windows);
     assert!(far < 0.1, "{far} standard deviations");
@@ -321,6 +313,7 @@ fn spots_smeared_differently_over_the_sensor_are_the_same_in_windows() {
     let smear = Smear {
         at_centre_m: [3e-4, 0.0],
         by_place: [[0.0, -0.03], [0.03, 0.0]],
+        ..Smear::default()
     };
     let frame = smeared(&camera, &spots, &smear, 6);
     let [by_windows, at_once] = [Rules::default(), Rules::without("windows").unwrap()].map(|rules| {

@@ -15,6 +15,9 @@ const LOSS: f64 = 0.02;
 /// Largest error of a smeared spot in units of the noise, at the brightest pixel: less costs a fit with the square of the displaced spots,
 /// more passes for another shape. A frame's score of 4096 pixels with nine spots then grows by less than one.
 const SMEAR_LOSS: f64 = 0.1;
+/// Standard deviations by which the smear changes the brightest spot from which on it is fitted: less costs a fit four to nine times as much in
+/// more frames, more passes for another shape.
+const NOTICEABLE: f64 = 1.0;
 /// Most emitters of a frame: bounds time and memory whatever the frame shows.
 const MAX_SOURCES: usize = 80;
 /// Excess of the deviance up to which noise alone explains it. Larger leaves faint sources unfound, smaller searches frames again.
@@ -91,9 +94,11 @@ impl CompressedFrame {
             bx.rank(LOSS / (amplitude * norm(by))),
             by.rank(LOSS / (amplitude * norm(bx))),
         ];
+        let significance = amplitude * norm(bx) * norm(by);
         self.smear = frame
             .smear
             .as_ref()
+            .filter(|smear| significance * smear.change_of_shape() > NOTICEABLE)
             .map(|smear| smear.to_within(SMEAR_LOSS / brightest));
         self.mx = self.rank[0].next_multiple_of(4).min(bx.stride);
         self.my = self.rank[1].next_multiple_of(4).min(by.stride);

@@ -45,8 +45,6 @@ pub(crate) struct SequenceEstimator {
     /// Of a moving platform, in the next frame; and what that frame sees where.
     sight: Option<Sight>,
     outlook: Option<Arc<Outlook>>,
-    /// Whether spots move so far during its exposure that it is not remembered.
-    is_smeared: bool,
     /// Times are seconds since this.
     epoch: Option<Timestamp>,
     window: Window,
@@ -72,7 +70,6 @@ impl SequenceEstimator {
             rules,
             sight: None,
             outlook: None,
-            is_smeared: false,
             epoch: None,
             window: Window::default(),
             left: ResidualSum::default(),
@@ -95,7 +92,6 @@ impl Estimator for SequenceEstimator {
     }
 
     fn set_smear(&mut self, smear: Option<&Smear>) {
-        self.is_smeared = smear.is_some();
         self.single.set_smear(smear);
     }
 
@@ -143,7 +139,7 @@ impl SequenceEstimator {
     /// remembered stays as it is.
     fn take(&mut self, time_s: f64, elapsed: f64, scale: f64, is_over: &dyn Fn() -> bool) -> Option<Estimate> {
         let mut budget = WorkBudget::new(is_over);
-        let is_even = self.single.loaded().1.variance.is_constant() && !self.is_smeared;
+        let is_even = self.single.loaded().1.variance.is_constant();
         if is_even && self.window.len() > 0 {
             let known = self.window.total.clone();
             let fresh = self.fresh(known.clone(), time_s);

@@ -5,7 +5,7 @@ use std::time::Instant;
 
 use super::measured::Measured;
 use crate::estimate;
-use crate::optics::{LEAST_SMEAR, Smear};
+use crate::optics::Smear;
 use crate::study::tradeoff::{Answer, Cell, Noise, Scene, bound_ratio};
 
 const CELLS: [(Noise, f64); 4] = [
@@ -15,7 +15,7 @@ const CELLS: [(Noise, f64); 4] = [
     (Noise::Paper, 4.0),
 ];
 /// Standard deviations of the smear, σ.
-const SMEARS: [f64; 5] = [0.0, LEAST_SMEAR, 0.5, 1.0, 2.0];
+const SMEARS: [f64; 5] = [0.0, 0.2, 0.5, 1.0, 2.0];
 /// Direction of the motion against the array, rad: no term of the model is aligned with it.
 const DIRECTION: f64 = 0.6;
 /// Of the frames whose emitters can be resolved, those with the number right, and the error over the bound, that must be reached.
@@ -78,7 +78,7 @@ pub fn smears(frames: u64, seed: u64) -> Measured {
             let length_m = 12f64.sqrt() * std * 1e-3 * sigma_mm;
             let smear = (std > 0.0).then_some(Smear {
                 at_centre_m: [length_m * DIRECTION.cos(), length_m * DIRECTION.sin()],
-                by_place: [[0.0; 2]; 2],
+                ..Smear::default()
             });
             let scenes = cell
                 .smeared_scenes(frames as usize, seed, smear.as_ref())
