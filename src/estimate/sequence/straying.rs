@@ -68,9 +68,9 @@ impl Straying {
         self.density = self.restlessness.density_m2_s3() * unit * unit;
     }
 
-    /// The frame does not tell its course, which then does not count as straight.
-    pub fn hide(&mut self) {
-        self.is_hidden = true;
+    /// The frame does not tell its course, which then does not count as straight, but its position, with this variance along an axis, σ².
+    pub fn hide(&mut self, variance: f64) {
+        (self.variance, self.is_hidden) = (variance, true);
     }
 
     /// The emitter has turned: what the frames have shown so far is of its course before.
@@ -91,7 +91,7 @@ impl Straying {
 
     /// Spectral density of the acceleration, σ²/s³.
     pub fn acceleration(&self) -> f64 {
-        STRAIGHT * self.variance / self.unbent_s().powi(3)
+        STRAIGHT * self.variance / self.straight_s().max(SHORTEST_S).powi(3)
     }
 
     fn unbent_s(&self) -> f64 {
@@ -135,7 +135,7 @@ mod tests {
         let mut straying = Straying::default();
         straying.add(Vector2::zeros(), 1.0);
         assert!(straying.straight_s() > 1.0);
-        straying.hide();
+        straying.hide(1.0);
         assert_eq!(straying.straight_s(), 0.0);
         straying.add(Vector2::zeros(), 1.0);
         assert!(straying.straight_s() > 1.0);
