@@ -3,7 +3,7 @@
 use nalgebra::Vector2;
 
 use super::displacement::Displacement;
-use super::search::{Pair, agreeing, search, search_turned, turn_of};
+use super::search::{Pair, agreeing, by_chance, search, search_turned, turn_of};
 use super::witness::Witness;
 use crate::monitor::stats::claim_consistency::share_after_averaging;
 use crate::monitor::stats::robust::{median_vector, variance_of_median};
@@ -14,6 +14,12 @@ const QUORUM: f64 = 2.0 / 3.0;
 /// more must agree. More ask for larger crowds before anything is corrected.
 const MIN_AGREEING: usize = 3;
 const MIN_AGREEING_TURNED: usize = 5;
+/// Displacements that chance may make, of all those possible, for another one to take the place of one that has held at once: claims that are
+/// as far off as users stand apart, with some of the beams dark, agree on one in every few frames. Not tuned.
+const BY_CHANCE: f64 = 1e-3;
+/// Time for which such a one must be found without the one before having a quorum in between, s. Longer leaves users displaced, shorter takes
+/// beams that are dark together for a displacement. Not tuned.
+const TAKES_PLACE_AFTER_S: f64 = 1.0;
 /// Time over which claims' errors are averaged, s. Longer is more exact, shorter follows a pose that wanders. Not measured; the
 /// soaks' pose wanders by 0.5 m within seconds to minutes.
 const SMOOTHING_S: f64 = 20.0;
@@ -41,6 +47,8 @@ pub struct PoseConsensus {
     agreeing: usize,
     witnesses: usize,
     averaged_s: f64,
+    /// How long another displacement has been found in its place, s.
+    contested_s: f64,
 }
 
 impl PoseConsensus {
@@ -71,8 +79,8 @@ impl PoseConsensus {
             return;
         }
         let mut pairs = agreeing(beams, witnesses, &self.displacement());
-        let mut is_new = false;
-        if pairs.len() < quorum {
+        let is_new = pairs.len() < quorum;
+        if is_new {
             // The displacement so far no longer holds; another may.
             let turned =
                 || search_turned(beams, witnesses).filter(|found| found.1.len() >= quorum.max(MIN_AGREEING_TURNED));
@@ -84,8 +92,17 @@ impl PoseConsensus {
                 self.agreeing = pairs.len();
                 return;
             };
-            (pairs, is_new, self.is_turned) = (found, true, is_turned);
+            self.contested_s += dt;
+            let is_likely = by_chance(beams, witnesses, found.len(), 1 + usize::from(is_turned)) < BY_CHANCE
+                || self.contested_s > TAKES_PLACE_AFTER_S
+                || self.averaged_s == 0.0;
+            if !is_likely {
+                self.agreeing = pairs.len();
+                return;
+            }
+            (pairs, self.is_turned) = (found, is_turned);
         }
+        self.contested_s = 0.0;
         self.agreeing = pairs.len();
         self.average(&pairs, dt, is_new);
         let mean_variance = witnesses.iter().map(|w| w.variance).sum::<f64>() / witnesses.len() as f64;
@@ -200,6 +217,35 @@ mod tests {
             }
             assert!(pose.displacement().shift.norm() < 1e-9, "{lie}: {pose:?}");
             assert!(!pose.is_turned);
+        }
+    }
+
+    #[test]
+    fn what_chance_agrees_on_displaces_nothing_until_it_lasts() {
+        let claims = grid(6);
+        // Three beams are dark; of the others, those of the second row lie about where the first row claims to be.
+        let shift = claims[3] - claims[0];
+        let beams: Vec<_> = claims[3..].to_vec();
+        let vague = |reach_m: f64| {
+            let of = witnesses(&claims[..5]).into_iter();
+            of.map(|w| Witness { reach_m, ..w }).collect::<Vec<_>>()
+        };
+        let mut pose = PoseConsensus::default();
+        pose.update(&claims, &vague(12.0), 0.1, 1.0);
+        let frames_until = |pose: &mut PoseConsensus, reach_m: f64| {
+            (1..100).find(|_| {
+                pose.update(&beams, &vague(reach_m)[..3], 0.1, 1.0);
+                (pose.displacement().shift - shift).norm() < 1.0
+            })
+        };
+        let mut sure = pose.clone();
+        assert_eq!(frames_until(&mut sure, 0.5), Some(1));
+        assert_eq!(frames_until(&mut pose.clone(), 12.0), Some(11));
+        for _ in 0..100 {
+            assert_eq!(frames_until(&mut pose.clone(), 12.0), Some(11));
+            pose.update(&beams, &vague(12.0)[..3], 0.1, 1.0);
+            pose.update(&claims, &vague(12.0), 0.1, 1.0);
+            assert!(pose.displacement().shift.norm() < 1e-9);
         }
     }
 

@@ -120,6 +120,21 @@ fn through(a: (Vector2<f64>, Vector2<f64>), b: (Vector2<f64>, Vector2<f64>)) -> 
     Some(found)
 }
 
+/// How many displacements at least so many witnesses would agree on by chance, if beams lay anywhere among claims and beams. So many `free`
+/// witnesses choose a displacement, one for a shift and two for one with a turn; each other one finds a beam within its reach.
+pub fn by_chance(beams: &[Vector2<f64>], witnesses: &[Witness], agreeing: usize, free: usize) -> f64 {
+    let places = || beams.iter().copied().chain(witnesses.iter().map(|w| w.claimed));
+    let low = places().reduce(|a, b| a.inf(&b)).unwrap_or_default();
+    let high = places().reduce(|a, b| a.sup(&b)).unwrap_or_default();
+    let (n, m) = (witnesses.len() as f64, beams.len() as f64);
+    let reach2 = witnesses.iter().map(|w| w.reach_m * w.reach_m).sum::<f64>() / n;
+    let found = (m * std::f64::consts::PI * reach2 / (high - low).product()).min(1.0);
+    let others = n - free as f64;
+    (0..agreeing.saturating_sub(free)).fold((n * m).powi(free as i32), |expected, j| {
+        expected * found * (others - j as f64) / (j as f64 + 1.0)
+    })
+}
+
 /// Shift, scale and turn by repeated medians (Siegel, 1982): over each witness the median of what it gives with each other,
 /// then over witnesses.
 pub fn turn_of(pairs: &[Pair]) -> Displacement {
