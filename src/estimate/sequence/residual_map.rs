@@ -107,8 +107,11 @@ pub(crate) struct ResidualSum {
 }
 
 impl ResidualSum {
-    /// Adds a frame's map; older ones fade, so that about `most` count.
+    /// Adds a frame's map; older ones fade, so that about `most` count. One that is empty, since its frame's work was used up, adds nothing.
     pub fn add(&mut self, filter: &MatchedFilter, map: &[f64], outlook: Option<Arc<Outlook>>, most: f64) {
+        if map.is_empty() {
+            return;
+        }
         let kept = 1.0 - 1.0 / most;
         self.frames = kept * self.frames + 1.0;
         self.sum.resize(map.len(), 0.0);
@@ -201,4 +204,26 @@ pub(crate) fn peaks(filter: &MatchedFilter, sum: &[f64], least: f64) -> Vec<(f64
     }
     found.sort_by(|a, b| b.0.total_cmp(&a.0));
     found
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::estimate::test_frame::Shown;
+
+    #[test]
+    fn a_frame_that_was_not_searched_leaves_the_sum_of_residuals_as_it_is() {
+        let test = Shown {
+            pixels_per_sigma: 2.0,
+            sources: &[([0.0, 0.0], 1.0)],
+            ..Shown::default()
+        }
+        .frame();
+        let filter = &test.space.matched_filter;
+        let mut sum = ResidualSum::default();
+        sum.add(filter, &[], None, 128.0);
+        sum.add(filter, &[1.0, 2.0], None, 128.0);
+        sum.add(filter, &[], None, 128.0);
+        assert_eq!((sum.sum.as_slice(), sum.frames), ([1.0, 2.0].as_slice(), 1.0));
+    }
 }
