@@ -3,6 +3,7 @@
 //! point.
 
 mod alone;
+mod any_flights;
 mod calibration;
 mod crowds;
 mod flights;
@@ -71,6 +72,7 @@ pub const ALL: &[Measurement] = &[
     with("stranger-in-crowd", 200, pixels::strangers_in_crowd),
     with("shadow", 10, pixels::shadows),
     with("shadow-fading", 10, pixels::shadows_fading),
+    with("any-flights", 60, any_flights::flights),
     with("flights", 10, flights::flights),
     measurement("calibration", 5, calibration::error_left),
     rows("lens", 40, lens::uncalibrated),

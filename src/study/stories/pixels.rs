@@ -91,11 +91,12 @@ impl PixelStory {
     /// The story's pixels alone.
     pub fn frames(&self) -> Vec<ndarray::Array2<f64>> {
         let plan = Plan::compile(&self.scene, self.seed).expect("a scene that can be simulated");
-        let frames = 0..(self.seconds * RATE_HZ) as u64;
+        let frames = 0..(self.seconds * self.scene.rate_hz) as u64;
         frames.map(|k| plan.frame(k).frame.pixels).collect()
     }
 
-    fn of(seed: u64, toml: &str) -> Self {
+    /// A scene as it stands.
+    pub fn of(seed: u64, toml: &str) -> Self {
         Self::told_by(seed, toml::from_str(toml).expect("a scene"))
     }
 
@@ -122,7 +123,8 @@ pub fn review(story: &PixelStory) -> Reviewed {
     let plan = Plan::compile(&story.scene, story.seed).expect("a scene that can be simulated");
     let plan = plan.starting_at(start());
     let mut config = story.config.clone();
-    config.source.rate_hz = Some(RATE_HZ);
+    let rate_hz = story.scene.rate_hz;
+    config.source.rate_hz = Some(rate_hz);
     config.adopt_platform(&story.scene);
     let mut pipeline = Pipeline::new(&config, plan.camera()).expect("a config that describes a pipeline");
     let mut told = Reviewed {
@@ -131,14 +133,14 @@ pub fn review(story: &PixelStory) -> Reviewed {
         truths: Vec::new(),
     };
     let mut maker = plan.maker();
-    for k in 0..(story.seconds * RATE_HZ) as u64 {
+    for k in 0..(story.seconds * rate_hz) as u64 {
         let mut made = maker.frame(k);
         if made.fate == Fate::Dropped {
             pipeline.claim(made.claims, made.frame.time);
             pipeline.receive_poses(made.poses, made.frame.time);
             continue;
         }
-        (story.tamper)(k as f64 / RATE_HZ, &mut made);
+        (story.tamper)(k as f64 / rate_hz, &mut made);
         pipeline.claim(made.claims, made.frame.time);
         pipeline.receive_poses(made.poses, made.frame.time);
         let step = pipeline.step(&made.frame);
