@@ -96,9 +96,9 @@ pub(crate) fn velocity_on_ground(camera: &Camera, sensor_m: [f64; 2], velocity: 
     }
 }
 
-/// The targets of the fitted newest frame that it or the frames before show elsewhere than
-/// straight on. The covariance of a change of position is what the covariance falls by (Kalman, 1960), and successive changes are independent.
-/// What all change alike is the pose's. `unit` is 1 m/s in σ/s.
+/// The targets of the fitted newest frame that it or the frames before show elsewhere than straight on from what was `known` before. The
+/// covariance of a change of position is what the covariance falls by (Kalman, 1960), and successive changes are independent. What all change
+/// alike is the pose's. `unit` is 1 m/s in σ/s.
 pub(crate) fn surprised(known: &JointInformation, fresh: &mut Window, unit: f64) -> Vec<usize> {
     let of = |knowledge: &JointInformation| {
         let covariance = knowledge.covariance()?;

@@ -50,7 +50,7 @@ impl Draw {
         let turning = self.one_of(&[0.0, 0.0, 1.0, -2.0, 3.0, 6.0]);
         let (speed, way) = (
             self.one_of(&[0.0, size]) * self.between(0.2, 2.0),
-            self.between(0.0, 6.28),
+            self.between(0.0, std::f64::consts::TAU),
         );
         let climb = size * self.one_of(&[0.0, 0.0, 0.5, -0.3]);
         let [east, north] = [speed * way.cos(), speed * way.sin()];
