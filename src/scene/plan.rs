@@ -196,16 +196,21 @@ impl Plan {
         arrivals.into_iter().map(claim).collect()
     }
 
-    /// The poses that came after frame k − 1 and not after frame k; with frame 0 those of the half second before.
+    /// The poses that came since frame k − 1, until the exposure of frame k ends; with frame 0 from half a second before it on.
     pub fn poses(&self, k: u64) -> Vec<Pose> {
-        let after = if k == 0 { -LEAD_S } else { self.seconds(k - 1) };
-        self.poses_between(after, self.seconds(k), &Ledger::default())
+        let after = if k == 0 { -LEAD_S } else { self.exposed(k - 1) };
+        self.poses_between(after, self.exposed(k), &Ledger::default())
     }
 
     /// The poses of the half second after frame k.
     pub fn poses_after(&self, k: u64) -> Vec<Pose> {
-        let last = self.seconds(k);
+        let last = self.exposed(k);
         self.poses_between(last, last + LEAD_S, &Ledger::default())
+    }
+
+    /// When the exposure of frame k ends, s: in its middle where nothing moves within it.
+    fn exposed(&self, k: u64) -> f64 {
+        self.seconds(k) + 0.5 * self.light.smears_over_s().unwrap_or(0.0)
     }
 
     fn poses_between(&self, after: f64, until: f64, ledger: &Ledger) -> Vec<Pose> {
