@@ -3,5 +3,6 @@
 mod attacks;
 mod faults;
 mod honest;
+mod px4_log;
 mod stage;
 mod tracks;
