@@ -34,6 +34,7 @@ impl Sight {
             at_centre_m: centre.into(),
             by_place: [[along_x.x, along_y.x], [along_x.y, along_y.y]],
             by_square_per_m: [bent_x.x, bent_y.y],
+            light_std: 0.0,
         })
     }
 }

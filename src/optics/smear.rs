@@ -14,6 +14,8 @@ pub struct Smear {
     pub by_place: [[f64; 2]; 2],
     /// c, 1/m.
     pub by_square_per_m: [f64; 2],
+    /// Standard deviation of an exposure's light over its mean, as beams fade within it: the light then lies unevenly along the way.
+    pub light_std: f64,
 }
 
 /// Most displaced spots of a sum: a fit costs as the square. So many add up to a smear of 7 σ within 4·10⁻⁷ of the peak.
@@ -38,6 +40,7 @@ impl Smear {
             at_centre_m: self.displacement_m(place_m),
             by_place,
             by_square_per_m: c,
+            light_std: self.light_std,
         }
     }
 
@@ -60,6 +63,7 @@ impl Smear {
             at_centre: self.at_centre_m.map(|d| d / sigma),
             by_place: self.by_place,
             by_square: self.by_square_per_m.map(|c| c * sigma),
+            light_std: self.light_std,
             length,
             nodes: gauss_legendre(nodes_within(length, tolerance)),
         }
@@ -87,6 +91,7 @@ pub struct DisplacedSpots {
     at_centre: [f64; 2],
     by_place: [[f64; 2]; 2],
     by_square: [f64; 2],
+    light_std: f64,
     /// The longest displacement.
     length: f64,
     /// Parts of the displacement, −½ to ½, and shares of the light.
@@ -106,6 +111,19 @@ impl DisplacedSpots {
     /// what has the spot's own shape.
     pub fn change_of_shape(&self) -> f64 {
         self.length * self.length / (24.0 * 2f64.sqrt())
+    }
+
+    /// Standard deviation of what uneven light changes of the shape, over the spot's norm: of light with white fading the second Legendre polynomial
+    /// has √5 times the standard deviation of the mean, and L²/60 times the second derivative.
+    pub fn unevenness(&self) -> f64 {
+        self.light_std * 5f64.sqrt() * self.length * self.length / (60.0 * 2f64.sqrt())
+    }
+
+    /// Covariance, σ², of the middle of the light about the middle of the way of a spot at `u`, σ: that of an even displacement at so many
+    /// independent draws.
+    pub fn cov_of_light(&self, u: [f64; 2]) -> [[f64; 2]; 2] {
+        let d = self.displacement(u).map(|d| self.light_std * d / 12f64.sqrt());
+        d.map(|r| d.map(|c| r * c))
     }
 
     /// Displacement during the exposure, σ, of a spot at `u`, σ.
@@ -220,6 +238,7 @@ mod tests {
             at_centre_m: [1e-4, -2e-4],
             by_place: [[0.01, -0.03], [0.02, 0.04]],
             by_square_per_m: [0.7, -1.1],
+            ..Smear::default()
         };
         let (middle, place) = ([4e-3, -7e-3], [1.5e-3, 2e-3]);
         let seen = smear.seen_from(middle).displacement_m(place);

@@ -10,7 +10,7 @@ use oapwatch::optics::spot::{Field, SpotShape, Template};
 use oapwatch::optics::{self, Camera, Smear, SpotError, add_spot};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use rand_distr::{Distribution, Normal};
+use rand_distr::{Distribution, Exp1, Normal};
 
 use crate::frames::{estimator, frame, places};
 
@@ -245,6 +245,7 @@ fn frames_without_light_hold_no_emitters_under_a_spot_error() {
     }
 }
 
+/// Where the light of a smear is uneven, each of its moments fades by itself, to an exponential distribution.
 fn draw(camera: &Camera, places: &[[f64; 2]], smear: &Smear, rng: &mut ChaCha8Rng) -> Frame {
     let noise = Normal::new(0.0, camera.noise_std_j).unwrap();
     let (ny, nx) = camera.shape();
@@ -254,7 +255,8 @@ fn draw(camera: &Camera, places: &[[f64; 2]], smear: &Smear, rng: &mut ChaCha8Rn
         for k in 0..MOMENTS {
             let t = (k as f64 + 0.5) / MOMENTS as f64 - 0.5;
             let at = [0, 1].map(|i| place[i] + t * moved[i]);
-            add_spot(camera, at, ENERGY_J / MOMENTS as f64, &mut pixels);
+            let light: f64 = if smear.light_std > 0.0 { Exp1.sample(rng) } else { 1.0 };
+            add_spot(camera, at, light * ENERGY_J / MOMENTS as f64, &mut pixels);
         }
     }
     frame(Array2::from_shape_vec((ny, nx), pixels).unwrap())
@@ -312,6 +314,17 @@ fn a_gaussian_spot_is_fitted_as_it_was_smeared() {
     // Of 120 squared normal variates the mean is within 1 ± 0.13 two times in three.
     assert!(right == 12 && (0.6..1.5).contains(&known), "{right} {known}");
     assert!(unknown > 2.0 * known, "{unknown} {known}");
+}
+
+#[test]
+fn uneven_light_along_a_smear_makes_no_emitters() {
+    let uneven = Smear {
+        light_std: (MOMENTS as f64).sqrt().recip(),
+        ..smear()
+    };
+    let (known, right) = measured(&camera(), &uneven, true);
+    println!("squared error over the stated: {known}, {right} of 12 frames right");
+    assert!(right == 12 && (0.5..1.5).contains(&known), "{right} {known}");
 }
 
 #[test]

@@ -219,8 +219,14 @@ impl FrameSearch {
         self.space.search(&self.compressed, &self.frame, budget)
     }
 
+    /// The share of their light by which the frame's spots may differ from the PSF, as far as is known before it is searched.
+    pub fn least_spot_error(&self) -> f64 {
+        self.spot_error.least().max(self.compressed.unevenness)
+    }
+
     /// The frame by the estimator's method.
     pub fn find(&mut self, budgets: &mut Budgets) -> Found {
+        let may_differ = self.least_spot_error() > 0.0;
         let mut search = self.space.search(&self.compressed, &self.frame, &mut budgets.search);
         let hypothesis = match self.spec.method {
             Method::Peak { steps } => {
@@ -236,7 +242,7 @@ impl FrameSearch {
             }
             Method::Pencil { steps } => initialise(&mut search, Nuisances::default(), steps).into_hypothesis(),
             Method::MaximumLikelihood | Method::MaximumPosterior | Method::Sequence => {
-                if self.spot_error.least() > 0.0 {
+                if may_differ {
                     // The search with the spot error is the only one. It starts from peaks: the pencil takes rings for sources.
                     let Reweighting { space, compressed } = &mut self.reweighting;
                     compressed.load(&self.frame, &space.bases.x, &space.bases.y);

@@ -55,7 +55,7 @@ impl FrameSearch {
     /// weights.
     pub fn allow_for_shape(&mut self, found: &mut Found, budgets: &mut Budgets) -> bool {
         if !self.spec.chooses_order() {
-            let error = self.spot_error.least();
+            let error = self.least_spot_error();
             if error > 0.0 {
                 drop_halo(
                     &self.space.bases,
@@ -67,7 +67,7 @@ impl FrameSearch {
             }
             return false;
         }
-        let known = self.spot_error.least();
+        let known = self.least_spot_error();
         if known > 0.0 {
             let Reweighting { space, compressed } = &mut self.reweighting;
             let (frame, budget) = (&self.frame, &mut budgets.reweighting);
@@ -156,16 +156,16 @@ impl FrameSearch {
     /// The spot error that recent frames showed, where it is more than what is known of the lens.
     pub fn shown_by_recent_frames(&self) -> Option<f64> {
         let shown = self.history.as_ref()?.spot_error()?;
-        (shown > self.spot_error.least()).then_some(shown)
+        (shown > self.least_spot_error()).then_some(shown)
     }
 
     /// Remembers the spot error that the frame shows. Where emitters explain the frame and a lens does as well, the frames decide.
     pub fn remember_shape(&mut self, found: &mut Found, budgets: &mut Budgets) {
         let is_explained = self.compressed_of(found.kind).is_explained_by(&found.hypothesis);
+        let known = self.least_spot_error();
         let Some(history) = self.history.as_mut().filter(|_| !found.hypothesis.sources.is_empty()) else {
             return;
         };
-        let known = self.spot_error.least();
         if found.spot_error > known || !is_explained {
             let shown = Some(found.spot_error).filter(|error| *error > known);
             history.push(shown.unwrap_or_default());

@@ -55,6 +55,8 @@ pub(crate) struct CompressedFrame {
     pub mean_variance: f64,
     pub light_weighted_variance: f64,
     pub smear: Option<DisplacedSpots>,
+    /// Share of a spot's light by which the smeared spots may differ from their model; zero where noise hides that.
+    pub unevenness: f64,
     /// Added to [`MOST_EXCESS`] where the frame is one of many windows: more of them have an excess by chance.
     pub spare_excess: f64,
     rows: Vec<f64>,
@@ -100,6 +102,12 @@ impl CompressedFrame {
             .as_ref()
             .filter(|smear| significance * smear.change_of_shape() > NOTICEABLE)
             .map(|smear| smear.to_within(SMEAR_LOSS / brightest));
+        let unevenness = self.smear.as_ref().map_or(0.0, DisplacedSpots::unevenness);
+        self.unevenness = if significance * unevenness > NOTICEABLE {
+            unevenness
+        } else {
+            0.0
+        };
         self.mx = self.rank[0].next_multiple_of(4).min(bx.stride);
         self.my = self.rank[1].next_multiple_of(4).min(by.stride);
         // Columns up to the multiple of 4 are stored anyway: use them.

@@ -173,6 +173,10 @@ pub(crate) fn localise(
                 }
                 own = moments.covariance;
             }
+            if let Some(smear) = frame.smear.as_ref().filter(|_| posterior.is_none()) {
+                let of_light = smear.cov_of_light(u);
+                own = [0, 1].map(|r| [0, 1].map(|c| own[r][c] + of_light[r][c]));
+            }
             let sensor_m = u.map(|u| u * sigma);
             let scale = sigma * sigma * inflation;
             let [x_m, y_m] = camera.to_ground(sensor_m);
