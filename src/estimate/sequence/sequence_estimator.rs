@@ -33,6 +33,8 @@ use crate::optics::{Camera, Smear};
 
 /// Steps of a fit to a new frame.
 const FRAME_STEPS: usize = 12;
+/// Emitters of which a moving platform's pose explains all: their six numbers are its own.
+const EXPLAINED_BY_POSE: usize = 3;
 /// Work of a search that has to end with its frame, in frames' searches: where what is remembered explains nothing.
 const SEARCH_WORK: f64 = 0.5;
 
@@ -139,8 +141,10 @@ impl SequenceEstimator {
     /// remembered stays as it is.
     fn take(&mut self, time_s: f64, elapsed: f64, scale: f64, is_over: &dyn Fn() -> bool) -> Option<Estimate> {
         let mut budget = WorkBudget::new(is_over);
-        let is_even = self.single.loaded().1.variance.is_constant();
-        if is_even && self.window.len() > 0 {
+        let compressed = self.single.loaded().1;
+        let is_even = compressed.variance.is_constant() && compressed.unevenness == 0.0;
+        let is_told = self.outlook.is_none() || self.window.present(time_s).len() > EXPLAINED_BY_POSE;
+        if is_even && is_told && self.window.len() > 0 {
             let known = self.window.total.clone();
             let fresh = self.fresh(known.clone(), time_s);
             let mut fresh = self.fit(fresh, &mut budget);
@@ -165,11 +169,15 @@ impl SequenceEstimator {
                 }
             }
         }
-        if is_even && self.window.age > YOUNG && self.search_again(time_s, is_over) {
+        if is_even && is_told && self.window.age > YOUNG && self.search_again(time_s, is_over) {
             return None;
         }
         // What is remembered is wrong where this frame alone is explained and its prediction is not.
         let found = self.single.estimate_loaded(scale, is_over);
+        if is_even && self.outlook.is_some() && found.emitters.len() <= EXPLAINED_BY_POSE {
+            self.forget();
+            return Some(found);
+        }
         let mut alone = Window {
             targets: Vec::new(),
             state: DVector::zeros(0),
