@@ -12,9 +12,6 @@ use crate::optics::Camera;
 const SPEEDS_M_S: [f64; 4] = [0.01, 0.7, 2.5, SPEED_STD_M_S];
 /// Relative rounding of a difference of covariances.
 const ROUNDING: f64 = 1e-8;
-/// Share of a coordinate's change that what all change alike must leave unexplained for the change to tell anything: with up to three emitters,
-/// six numbers, the six of a pose explain all of it.
-const LEAST_TOLD: f64 = 0.05;
 /// A hypothesis of less weight is left out.
 const LEAST_WEIGHT: f64 = 1e-3;
 
@@ -116,21 +113,13 @@ pub(crate) fn surprised(known: &JointInformation, fresh: &mut Window, unit: f64)
     for k in 0..n {
         errors[(k, k)] = errors[(k, k)].max(0.0) + ROUNDING * prior[(place(k), place(k))];
     }
-    let whole = now.diagonal();
-    let mut told = DVector::repeat(n, 1.0);
     let newest = fresh.snapshots.last();
     if let Some(outlook) = newest.and_then(|s| s.outlook.as_ref()) {
         let shared = outlook.shared(&fresh.places(&fresh.state, fresh.time_s));
-        told = unexplained(&shared);
         take_out(&shared, &mut now, &mut DVector::zeros(n));
         take_out(&shared, &mut errors, &mut change);
     }
     let mut is_surprised = |i: usize, e: usize| {
-        if (0..2).any(|k| told[2 * i + k] < LEAST_TOLD) {
-            let variance = 0.5 * (whole[2 * i] + whole[2 * i + 1]);
-            fresh.targets[e].straying.hide(variance);
-            return false;
-        }
         let block = |m: &DMatrix<f64>| Matrix2::from_fn(|k, l| m[(2 * i + k, 2 * i + l)]);
         let Some(std) = block(&errors).cholesky().map(|c| c.l()) else {
             return false;
@@ -151,12 +140,6 @@ pub(crate) fn surprised(known: &JointInformation, fresh: &mut Window, unit: f64)
     };
     let shown = present.iter().enumerate().filter(|(i, e)| is_surprised(*i, **e));
     shown.map(|(_, e)| *e).collect()
-}
-
-/// The share of each coordinate that the columns of `shared` leave unexplained: 1 less its leverage (Hoaglin and Welsch, 1978).
-fn unexplained(shared: &DMatrix<f64>) -> DVector<f64> {
-    let q = shared.clone().qr().q();
-    DVector::from_fn(shared.nrows(), |k, _| 1.0 - q.row(k).norm_squared())
 }
 
 /// Takes what the columns of `shared` span out of `change` and its covariance `cov`: what is left where that much is common to all.
@@ -181,15 +164,7 @@ pub(crate) fn take_out(shared: &DMatrix<f64>, cov: &mut DMatrix<f64>, change: &m
 mod tests {
     use nalgebra::{DMatrix, DVector};
 
-    use super::{take_out, unexplained};
-
-    #[test]
-    fn a_pose_explains_three_emitters_and_leaves_half_of_six() {
-        let shared = |n: usize| DMatrix::from_fn(2 * n, 6, |k, j| (1.3 * k as f64 + 0.7 * (k * j) as f64).sin());
-        assert!(unexplained(&shared(3)).amax() < 1e-9);
-        assert!(unexplained(&shared(2)).amax() < 1e-9);
-        assert!((unexplained(&shared(6)).mean() - 0.5).abs() < 1e-9);
-    }
+    use super::take_out;
 
     #[test]
     fn what_all_change_alike_is_nobody_s_own_change() {

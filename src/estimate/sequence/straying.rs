@@ -46,15 +46,13 @@ pub(crate) struct Straying {
     restlessness: Restlessness,
     /// Spectral density of the acceleration, σ²/s³.
     density: f64,
-    /// Whether frames do not tell its course.
-    is_hidden: bool,
 }
 
 impl Straying {
     /// Takes a new frame's change, in its standard deviations, and the variance that the position has then along an axis, σ². Whether chance does
     /// not explain the changes of some memory.
     pub fn add(&mut self, change: Vector2<f64>, variance: f64) -> bool {
-        (self.variance, self.is_hidden) = (variance, false);
+        self.variance = variance;
         for (sum, frames) in self.sums.iter_mut().zip(MEMORIES) {
             sum.add(change, 1.0 - 1.0 / frames);
         }
@@ -66,11 +64,6 @@ impl Straying {
         let (place_m, variance_m2) = (place.map(|v| v / unit), variance.map(|v| v / (unit * unit)));
         self.restlessness.see(place_m, variance_m2, time_s);
         self.density = self.restlessness.density_m2_s3() * unit * unit;
-    }
-
-    /// The frame does not tell its course, which then does not count as straight, but its position, with this variance along an axis, σ².
-    pub fn hide(&mut self, variance: f64) {
-        (self.variance, self.is_hidden) = (variance, true);
     }
 
     /// The emitter has turned: what the frames have shown so far is of its course before.
@@ -86,21 +79,17 @@ impl Straying {
 
     /// How long the course counts as straight, s.
     pub fn straight_s(&self) -> f64 {
-        if self.is_hidden { 0.0 } else { self.unbent_s() }
-    }
-
-    /// Spectral density of the acceleration, σ²/s³.
-    pub fn acceleration(&self) -> f64 {
-        STRAIGHT * self.variance / self.straight_s().max(SHORTEST_S).powi(3)
-    }
-
-    fn unbent_s(&self) -> f64 {
         if self.density == 0.0 {
             return LONGEST_S;
         }
         (STRAIGHT * self.variance / self.density)
             .cbrt()
             .clamp(SHORTEST_S, LONGEST_S)
+    }
+
+    /// Spectral density of the acceleration, σ²/s³.
+    pub fn acceleration(&self) -> f64 {
+        STRAIGHT * self.variance / self.straight_s().powi(3)
     }
 }
 
@@ -128,16 +117,5 @@ mod tests {
         // Two standard deviations a frame are 5.3 of eight frames.
         let bend = frames_until(2.0, &mut noise).expect("a bend is seen");
         assert!((3..16).contains(&bend), "after {bend} frames");
-    }
-
-    #[test]
-    fn whose_course_no_frame_tells_does_not_go_straight_on_until_one_does() {
-        let mut straying = Straying::default();
-        straying.add(Vector2::zeros(), 1.0);
-        assert!(straying.straight_s() > 1.0);
-        straying.hide(1.0);
-        assert_eq!(straying.straight_s(), 0.0);
-        straying.add(Vector2::zeros(), 1.0);
-        assert!(straying.straight_s() > 1.0);
     }
 }
