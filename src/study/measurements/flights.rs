@@ -1,6 +1,7 @@
 //! Platforms that move, through the simulator's pixels: honest users, strangers, and a place that is dragged away.
 
 use std::fmt::Write;
+use std::time::Instant;
 
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -30,6 +31,11 @@ const STRANGER_S: f64 = 4.0;
 const CLEAR_M: f64 = 15.0;
 /// When the dragging begins, s: the lasting error has been learned.
 const DRAGGED_S: f64 = 45.0;
+/// How late the autopilot is, s, and when it is asked how late it is taken to be, s.
+const LATE_S: f64 = 0.03;
+const LEARNED_S: f64 = 10.0;
+/// Frames of which the median tells what poses cost.
+const COST_FRAMES: u64 = 1000;
 /// Errors count from here on, s: the lasting pose error and the delay have been learned.
 const SETTLED_S: f64 = 15.0;
 /// Within these the issue's alerts must come, s, and the share of strangers for which they do.
@@ -93,11 +99,17 @@ fn scene(kind: &Kind, seed: u64) -> String {
     let place = [1.0; 3].map(&mut normal);
     let mut text = format!(
         "[platform]\n{}\n[platform.telemetry]\nattitude_sigma_rad = 0.026\nposition_sigma_m = 1.0\nattitude_noise_rad = 5e-4\n\
-         position_noise_m = 0.02\nattitude_bias_rad = {turn:?}\nposition_bias_m = {place:?}\ndelay_s = 0.03\n",
+         position_noise_m = 0.02\nattitude_bias_rad = {turn:?}\nposition_bias_m = {place:?}\ndelay_s = {LATE_S:?}\n",
         kind.laws
     );
+    text.push_str(&users(kind.shift_m));
+    text
+}
+
+fn users(shift_m: [f64; 2]) -> String {
+    let mut text = String::new();
     for (k, [x, y]) in USERS.into_iter().enumerate() {
-        let [x, y] = [x + kind.shift_m[0], y + kind.shift_m[1]];
+        let [x, y] = [x + shift_m[0], y + shift_m[1]];
         writeln!(
             text,
             "[[user]]\nname = \"u-{k}\"\nmotion.roam = {{ home_m = [{x:?}, {y:?}], spread_m = 3, time_s = 15 }}"
@@ -112,6 +124,27 @@ fn flown(kind: &Kind, estimator: &estimate::Config, seed: u64, seconds: f64, mor
     story.seconds = seconds;
     story.config.estimator = estimator.clone();
     review(&story)
+}
+
+/// What the poses of a platform that rests cost a frame, µs: the median of the same frames with and without, in turns.
+fn cost_us(estimator: &estimate::Config, seed: u64) -> f64 {
+    let mut opened = ["[platform.telemetry]\n", ""].map(|platform| {
+        let mut story = PixelStory::only(seed, &format!("{platform}{}", users([0.0; 2])));
+        story.config.estimator = estimator.clone();
+        story.open()
+    });
+    let more = (0..COST_FRAMES).map(|k| {
+        let [with, without] = opened.each_mut().map(|(plan, pipeline)| {
+            let made = plan.frame(k);
+            pipeline.claim(made.claims, made.frame.time);
+            let began = Instant::now();
+            pipeline.receive_poses(made.poses, made.frame.time);
+            pipeline.step(&made.frame);
+            began.elapsed().as_secs_f64() * 1e6
+        });
+        with - without
+    });
+    median(more.collect())
 }
 
 /// A stranger in view, clear of the users.
@@ -171,8 +204,8 @@ fn delay_s(raised: &Raised, wanted: crate::monitor::AlertKind, from_s: f64) -> f
 pub fn flights(stories: u64, seed: u64, estimator: &estimate::Config) -> Measured {
     let mut text = format!(
         "{stories} flights of each kind; honest ones of {HONEST_S} s. Errors are of users' positions after {SETTLED_S} s.\n\n\
-         | platform | flights with false alerts | median error m | mean squared error over the stated | stranger alerted within \
-         {STRANGER_LIMIT_S} s | dragged at 1 m/s: `pose_inconsistent` within {DRAG_LIMIT_S} s |\n|---|---|---|---|---|---|\n"
+         | platform | flights with false alerts | median error m | mean squared error over the stated | delay off after {LEARNED_S} s, ms | stranger alerted within \
+         {STRANGER_LIMIT_S} s | dragged at 1 m/s: `pose_inconsistent` within {DRAG_LIMIT_S} s |\n|---|---|---|---|---|---|---|\n"
     );
     let mut holds = true;
     let mut others = Vec::new();
@@ -183,7 +216,13 @@ pub fn flights(stories: u64, seed: u64, estimator: &estimate::Config) -> Measure
             .map(|k| {
                 let told = flown(kind, estimator, k, HONEST_S, "");
                 let (metres, normalised) = errors(&told);
-                ((k, told.raised()), median(metres), mean(&normalised))
+                let learned = told.delays_s[(LEARNED_S * RATE_HZ) as usize];
+                (
+                    (k, told.raised()),
+                    median(metres),
+                    mean(&normalised),
+                    1e3 * (learned - LATE_S).abs(),
+                )
             })
             .collect();
         let strangers: Vec<_> = seeds()
@@ -219,11 +258,12 @@ pub fn flights(stories: u64, seed: u64, estimator: &estimate::Config) -> Measure
         found_s.extend(delays.filter(|delay| delay.is_finite()));
         writeln!(
             text,
-            "| {} | {} | {:.2} | {:.2} | {seen} | {told} |",
+            "| {} | {} | {:.2} | {:.2} | {:.1} | {seen} | {told} |",
             kind.name,
             false_alerts.len(),
             median(honest.iter().map(|h| h.1).collect()),
             mean(&honest.iter().map(|h| h.2).collect::<Vec<_>>()),
+            median(honest.iter().map(|h| h.3).collect()),
         )
         .expect("text takes all");
         holds &= false_alerts.is_empty() && seen as f64 >= GOAL * stories as f64 && told as u64 == stories;
@@ -239,10 +279,12 @@ pub fn flights(stories: u64, seed: u64, estimator: &estimate::Config) -> Measure
         }
     }
     let slowest = found_s.iter().copied().fold(f64::NAN, f64::max);
-    let median = median(found_s);
+    let median_s = median(found_s);
+    let cost_us = cost_us(estimator, seed);
     writeln!(
         text,
-        "\nDrags are found after {median:.1} s in the median, the slowest after {slowest:.1} s.\n"
+        "\nDrags are found after {median_s:.1} s in the median, the slowest after {slowest:.1} s. Poses cost a frame {cost_us:.0} µs (the \
+         median of {COST_FRAMES}).\n"
     )
     .expect("text takes all");
     text.push_str(&others.concat());

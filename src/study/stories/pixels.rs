@@ -4,6 +4,7 @@ use super::start;
 use crate::config::Config;
 use crate::monitor::{AlertEvent, AlertEventKind, AlertKind, Report};
 use crate::pipeline::Pipeline;
+use crate::platform::Placement;
 use crate::scene::{Fate, Plan, Scene, SimulatedFrame, Truth};
 
 pub const RATE_HZ: f64 = 10.0;
@@ -100,6 +101,17 @@ impl PixelStory {
         Self::told_by(seed, toml::from_str(toml).expect("a scene"))
     }
 
+    /// What makes the frames, and what is told of them.
+    pub fn open(&self) -> (Plan, Pipeline) {
+        let plan = Plan::compile(&self.scene, self.seed).expect("a scene that can be simulated");
+        let plan = plan.starting_at(start());
+        let mut config = self.config.clone();
+        config.source.rate_hz = Some(self.scene.rate_hz);
+        config.adopt_platform(&self.scene);
+        let pipeline = Pipeline::new(&config, plan.camera()).expect("a config that describes a pipeline");
+        (plan, pipeline)
+    }
+
     fn told_by(seed: u64, scene: Scene) -> Self {
         Self {
             scene,
@@ -116,21 +128,19 @@ pub struct Reviewed {
     pub events: Vec<AlertEvent>,
     pub reports: Vec<Report>,
     pub truths: Vec<Truth>,
+    /// How late poses were taken to be, s; where there are none, zero.
+    pub delays_s: Vec<f64>,
 }
 
 /// Every frame of the story through the daemon's pipeline.
 pub fn review(story: &PixelStory) -> Reviewed {
-    let plan = Plan::compile(&story.scene, story.seed).expect("a scene that can be simulated");
-    let plan = plan.starting_at(start());
-    let mut config = story.config.clone();
+    let (plan, mut pipeline) = story.open();
     let rate_hz = story.scene.rate_hz;
-    config.source.rate_hz = Some(rate_hz);
-    config.adopt_platform(&story.scene);
-    let mut pipeline = Pipeline::new(&config, plan.camera()).expect("a config that describes a pipeline");
     let mut told = Reviewed {
         events: Vec::new(),
         reports: Vec::new(),
         truths: Vec::new(),
+        delays_s: Vec::new(),
     };
     let mut maker = plan.maker();
     for k in 0..(story.seconds * rate_hz) as u64 {
@@ -144,6 +154,10 @@ pub fn review(story: &PixelStory) -> Reviewed {
         pipeline.claim(made.claims, made.frame.time);
         pipeline.receive_poses(made.poses, made.frame.time);
         let step = pipeline.step(&made.frame);
+        told.delays_s.push(match &step.placement {
+            Placement::At { pose, .. } => crate::claims::seconds(made.frame.time, pose.pose.time),
+            _ => 0.0,
+        });
         told.events.extend(step.report.events.iter().cloned());
         told.reports.push(step.report);
         told.truths.push(made.truth);
