@@ -177,6 +177,13 @@ impl AnalyticEstimator {
         );
         let saturated_share = frame.saturated_share();
         let is_limited = budgets.is_limited();
+        // Of the lens: what a smear's uneven light makes of spots passes with the motion.
+        let is_of_lens = spot_error > self.search.compressed.unevenness;
+        let of_lens = if is_of_lens {
+            spot_error
+        } else {
+            self.search.spot_error.least()
+        };
         let mut flags = Flags::empty();
         flags.set(Flags::OUT_OF_TIME, is_cut_short);
         flags.set(Flags::LIMIT_REACHED, is_limited);
@@ -189,7 +196,7 @@ impl AnalyticEstimator {
             is_cut_short,
             is_limited,
             reduced_chi2: found.reduced_chi2,
-            spot_error,
+            spot_error: of_lens,
             saturated_share,
             condition: found.condition,
             steps: budgets.steps(),

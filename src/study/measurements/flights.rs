@@ -204,8 +204,8 @@ fn delay_s(raised: &Raised, wanted: crate::monitor::AlertKind, from_s: f64) -> f
 pub fn flights(stories: u64, seed: u64, estimator: &estimate::Config) -> Measured {
     let mut text = format!(
         "{stories} flights of each kind; honest ones of {HONEST_S} s. Errors are of users' positions after {SETTLED_S} s.\n\n\
-         | platform | flights with false alerts | median error m | mean squared error over the stated | delay off after {LEARNED_S} s, ms | stranger alerted within \
-         {STRANGER_LIMIT_S} s | dragged at 1 m/s: `pose_inconsistent` within {DRAG_LIMIT_S} s |\n|---|---|---|---|---|---|---|\n"
+         | platform | flights with false alerts | median error m | mean squared error over the stated | delay off after {LEARNED_S} s, ms | \
+         stranger alerted within {STRANGER_LIMIT_S} s | dragged at 1 m/s: `pose_inconsistent` within {DRAG_LIMIT_S} s |\n|---|---|---|---|---|---|---|\n"
     );
     let mut holds = true;
     let mut others = Vec::new();
