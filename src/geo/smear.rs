@@ -3,7 +3,7 @@
 use nalgebra::{Vector2, Vector6};
 
 use super::sight::Sight;
-use crate::optics::{Camera, Smear};
+use crate::optics::{Camera, Smear, light_std};
 
 impl Sight {
     /// Motion of spots from the ground during `exposure_s`, where the pose changes by `rates` (rotation about north, east, down, rad/s;
@@ -34,7 +34,7 @@ impl Sight {
             at_centre_m: centre.into(),
             by_place: [[along_x.x, along_y.x], [along_x.y, along_y.y]],
             by_square_per_m: [bent_x.x, bent_y.y],
-            light_std: 0.0,
+            light_std: light_std(exposure_s),
         })
     }
 }

@@ -21,6 +21,6 @@ pub use config::{BlurConfig, Config};
 pub use distortion::Distortion;
 pub use error::{CalibrationError, Error};
 pub use pixel_maps::PixelMaps;
-pub use smear::{DisplacedSpots, Smear};
+pub use smear::{COHERENCE_S, DisplacedSpots, Smear, light_std};
 pub use spot::SpotShape;
 pub use spot_pixels::add_spot;

@@ -18,6 +18,16 @@ pub struct Smear {
     pub light_std: f64,
 }
 
+/// Beams fade by about so much of their mean in strong turbulence, and anew after so long, s: the coherence time of a turbulent atmosphere.
+const FADING_STD: f64 = 0.9;
+pub const COHERENCE_S: f64 = 0.01;
+/// [`Smear::light_std`] of an exposure: light that fades anew so often has the first moment along the way of so many equal parts, within which
+/// none changes.
+pub fn light_std(exposure_s: f64) -> f64 {
+    let share = (COHERENCE_S / exposure_s).min(1.0);
+    FADING_STD * (share * (1.0 - share * share)).sqrt()
+}
+
 /// Most displaced spots of a sum: a fit costs as the square. So many add up to a smear of 7 σ within 4·10⁻⁷ of the peak.
 const MOST_NODES: usize = 12;
 
@@ -219,6 +229,17 @@ mod tests {
                 assert!(error < tolerance + 2e-7, "{length} at {x}: {error}");
             }
         }
+    }
+
+    #[test]
+    fn the_first_moment_of_uneven_light_is_as_stated() {
+        let parts = 7;
+        let at = |k: i32| (f64::from(k) + 0.5) / f64::from(parts) - 0.5;
+        // Of so many independent draws, each a part of the light and spread over a part of the way.
+        let variance = (0..parts).map(|k| (FADING_STD * at(k) / f64::from(parts)).powi(2));
+        let stated = light_std(f64::from(parts) * COHERENCE_S).powi(2) / 12.0;
+        assert!((variance.sum::<f64>() / stated - 1.0).abs() < 1e-9);
+        assert_eq!(light_std(0.5 * COHERENCE_S), 0.0);
     }
 
     #[test]

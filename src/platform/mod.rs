@@ -59,9 +59,6 @@ const RATES_OVER_S: f64 = 0.1;
 /// Rates within an exposure are taken over at least this time to either side of its middle, s: longer misses a sway's turning, shorter takes
 /// the poses' own noise for motion: 3 mrad a pose make 0.04 rad/s, or 0.4 mrad of smear in 10 ms.
 const SMEAR_OVER_S: f64 = 0.05;
-/// Beams fade by about so much of their mean in strong turbulence, and anew after so long, s.
-const FADING_STD: f64 = 0.9;
-const COHERENCE_S: f64 = 0.01;
 /// Frames that wait for the poses after them.
 const MOST_WAITING: usize = 64;
 
@@ -261,12 +258,7 @@ impl Platform {
         };
         let half_s = (0.5 * exposure_s).max(SMEAR_OVER_S);
         let rates = self.source.read(|poses| poses.mean_rates(self.stamp(time), half_s));
-        // Light that fades anew so often has the first moment along the way of so many equal parts; none changes within one.
-        let share = (COHERENCE_S / exposure_s).min(1.0);
-        Some(Smear {
-            light_std: FADING_STD * (share * (1.0 - share * share)).sqrt(),
-            ..sight.smear(camera, &rates.flatten()?, exposure_s)?
-        })
+        sight.smear(camera, &rates.flatten()?, exposure_s)
     }
 
     /// The sight of a placed camera, where it may be another in the next frame.

@@ -4,9 +4,8 @@ use crate::estimate::sequence::local_quadratic::Engine;
 use crate::estimate::sequence::search::WINDOW_STEPS;
 use crate::estimate::sequence::snapshot::view;
 use crate::estimate::sequence::window::Window;
+use crate::optics::COHERENCE_S;
 
-/// Frames nearer in time than this count as one draw of the fading, s: the coherence time of a turbulent atmosphere.
-const COHERENCE_S: f64 = 0.01;
 /// Frames of the window, and the numbers that all of them may hold: bounds memory, and the time of a fit of the whole window.
 pub(crate) const MAX_SNAPSHOTS: usize = 128;
 const MAX_NUMBERS: usize = 1 << 20;
@@ -21,6 +20,7 @@ pub(crate) fn most_snapshots(coefficients: usize) -> usize {
 /// Ends targets that have gone dark or left the view: frames before hold them still.
 pub(crate) fn bury(window: &mut Window, engine: &mut Engine, elapsed: f64) {
     let Some(last) = window.snapshots.last() else { return };
+    // Frames nearer in time than the coherence time count as one draw of the fading.
     let (time_s, weight) = (last.time_s, (elapsed / COHERENCE_S).clamp(0.0, 1.0));
     let (positions, view) = (window.positions(engine.bases), view(engine.bases));
     let mut has_died = false;
