@@ -216,11 +216,8 @@ impl FrameContext {
             }
         }
         let drifted = self.track_frame_cov.map(|cov| cov + found.cov);
-        let of = |cov: &Matrix6<f64>| {
-            let seen = sight.corrected(&Vector6::zeros(), *cov);
-            let point = seen.ground_at(self.view.nadir_m().into());
-            point.map_or(0.0, |p| p.pose_cov(cov).trace())
-        };
+        let nadir = sight.ground_at(self.view.nadir_m().into());
+        let of = |cov: &Matrix6<f64>| nadir.as_ref().map_or(0.0, |p| p.pose_cov(cov).trace());
         let cov = match drifted {
             Some(drifted) if of(&drifted) < of(sight.cov()) => drifted,
             _ => *sight.cov(),

@@ -2,7 +2,8 @@
 //!
 //! Detection j of track i is z = x + H·ξ + noise, ξ the error of the frame's pose, common to all. With the track's prediction
 //! as x's prior the posterior of ξ given all tracks but i (Gaussian, linear) makes z − H·ξ a measurement of x alone, whose
-//! covariance says what is left of the common error: all of it where one beam is all there is.
+//! covariance says what is left of the common error: all of it where one beam is all there is. With C the posterior's covariance given
+//! all, and W the weight of i in it, that without i is H·C·Hᵀ over 1 − H·C·Hᵀ·W (Woodbury, 1950).
 
 use nalgebra::{Matrix2, Matrix6, Vector2, Vector6};
 
@@ -37,6 +38,7 @@ struct Pair {
     detection: usize,
     innovation: Vector2<f64>,
     cov: Matrix2<f64>,
+    inverse_cov: Matrix2<f64>,
     /// Hᵀ S⁻¹ H and Hᵀ S⁻¹ ν.
     information: Matrix6<f64>,
     vector: Vector6<f64>,
@@ -56,37 +58,42 @@ pub fn register(
     let prior = prior + Matrix6::from_diagonal(&least.into());
     let prior_information = prior.cholesky()?.inverse();
     let mut pairs = pairs(tracks, detections, &prior);
-    let posterior = |pairs: &[Pair], without: Option<usize>| {
+    let posterior = |pairs: &[Pair]| {
         let (mut information, mut vector) = (prior_information, Vector6::zeros());
-        for (_, pair) in pairs.iter().enumerate().filter(|(k, _)| Some(*k) != without) {
+        for pair in pairs {
             information += pair.information * pair.weight;
             vector += pair.vector * pair.weight;
         }
-        let cov = information.cholesky().map(|c| c.inverse())?;
-        Some(Registration {
-            error: cov * vector,
-            cov,
-        })
+        let factor = information.cholesky()?;
+        Some((factor.solve(&vector), factor))
     };
-    let mut all = posterior(&pairs, None)?;
+    let (mut error, mut factor) = posterior(&pairs)?;
     for _ in 0..ROUNDS {
         for pair in &mut pairs {
             let h = &detections[pair.detection].by_pose;
-            let d2 = mahalanobis2(pair.innovation - h * all.error, pair.cov);
+            let d2 = mahalanobis2(pair.innovation - h * error, pair.cov);
             pair.weight = 1.0 / (1.0 + d2 / (HALF_WEIGHT * HALF_WEIGHT));
         }
-        all = posterior(&pairs, None)?;
+        (error, factor) = posterior(&pairs)?;
     }
-    let mut corrections: Vec<Option<Registration>> = vec![None; detections.len()];
-    for (k, pair) in pairs.iter().enumerate() {
-        corrections[pair.detection] = posterior(&pairs, Some(k));
+    let cov = factor.inverse();
+    let common = |detection: &Detection| {
+        let h = &detection.by_pose;
+        (h * error, h * cov * h.transpose())
+    };
+    let mut shifts: Vec<_> = detections.iter().map(common).collect();
+    for pair in &pairs {
+        let (shift, spread) = &mut shifts[pair.detection];
+        let own = *spread * pair.inverse_cov * pair.weight;
+        let others = (Matrix2::identity() - own).try_inverse()?;
+        *shift = others * (*shift - own * pair.innovation);
+        *spread = others * *spread;
     }
-    for (detection, own) in detections.iter_mut().zip(&corrections) {
-        let found = own.as_ref().unwrap_or(&all);
-        detection.position -= detection.by_pose * found.error * (1.0 - left);
-        detection.cov += detection.by_pose * found.cov * detection.by_pose.transpose();
+    for (detection, (shift, spread)) in detections.iter_mut().zip(shifts) {
+        detection.position -= shift * (1.0 - left);
+        detection.cov += 0.5 * (spread + spread.transpose());
     }
-    Some(all)
+    Some(Registration { error, cov })
 }
 
 /// Confirmed tracks that stand alone, each with its detection. A shift that all share changes which assignment is least by
@@ -106,12 +113,13 @@ fn pairs(tracks: &[Track], detections: &[Detection], prior: &Matrix6<f64>) -> Ve
         let d = &detections[j];
         let innovation = d.position - known[i].filter.position();
         let cov = known[i].filter.position_cov() + d.cov + Matrix2::identity() * COURSE_M.powi(2);
-        let inverse = cov.try_inverse()?;
-        let weighted = d.by_pose.transpose() * inverse;
+        let inverse_cov = cov.try_inverse()?;
+        let weighted = d.by_pose.transpose() * inverse_cov;
         Some(Pair {
             detection: j,
             innovation,
             cov,
+            inverse_cov,
             information: weighted * d.by_pose,
             vector: weighted * innovation,
             weight: 1.0,
