@@ -114,14 +114,16 @@ impl Daemon {
 
     /// Runs until SIGTERM or SIGINT.
     pub async fn run(mut self, logging: logging::Handle) -> Result<()> {
-        let listen = &self.config.api.listen;
-        let listener = api::Listener::bind(listen).with_context(|| format!("api.listen: cannot listen on {listen}"))?;
         let metrics = self.metrics.clone();
         let started_at = Timestamp::now();
+        let is_replay = self.config.source.kind == SourceKind::Replay;
+        let first_clock = compute::first_clock(is_replay, self.config.source.start);
         let open = self.journal.open_alerts()?;
         let known: Vec<_> = open.iter().map(|a| (a.id.clone(), a.kind)).collect();
         self.pipeline.monitor.restore(open);
-        operator::restore(&self.journal, &mut self.pipeline.monitor)?;
+        operator::restore(&self.journal, &mut self.pipeline.monitor, first_clock)?;
+        let listen = &self.config.api.listen;
+        let listener = api::Listener::bind(listen).with_context(|| format!("api.listen: cannot listen on {listen}"))?;
 
         let (stop, stopped) = watch::channel(false);
         let stops = || {
@@ -146,7 +148,6 @@ impl Daemon {
         endpoints.extend(exports.replace(self.exports));
         let (notifier, deliveries) =
             notify::spawn(endpoints, self.journal.clone(), notify::Clock::wall(), micros, stops());
-        let is_replay = self.config.source.kind == SourceKind::Replay;
         let inbox = Inbox::new(self.pipeline.claims.roster());
         if let Some(station) = self.station {
             // A recording has its own claims.
@@ -216,7 +217,7 @@ impl Daemon {
             is_replay,
             stop: halt.clone(),
             ready,
-            state: State::new(started_at, compute::first_clock(is_replay, source.start), known),
+            state: State::new(started_at, first_clock, known),
         };
         let mut compute = tokio::task::spawn_blocking(move || compute.run());
         let mut serving = tokio::spawn(self.server.serve(listener, state, stops()));

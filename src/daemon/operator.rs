@@ -1,6 +1,7 @@
 //! What operators set over the API: known lights, zones and maintenance windows. The journal keeps it over restarts.
 
 use anyhow::{Context, Result};
+use jiff::Timestamp;
 use serde::de::DeserializeOwned;
 
 use super::compute::Compute;
@@ -16,8 +17,8 @@ const MAINTENANCE: &str = "maintenance";
 /// The id of all drawn zones, which are kept as one.
 const DRAWN: &str = "drawn";
 
-/// Puts what the journal has kept in force.
-pub fn restore(journal: &Journal, monitor: &mut Monitor) -> Result<()> {
+/// Puts what the journal has kept in force, but for maintenance that has ended `now`.
+pub fn restore(journal: &Journal, monitor: &mut Monitor, now: Timestamp) -> Result<()> {
     monitor.restore_lights(kept(journal, LIGHT)?);
     for drawn in kept::<serde_json::Value>(journal, ZONES)? {
         // The config may have gained zones of the same name, or too many, since.
@@ -25,8 +26,10 @@ pub fn restore(journal: &Journal, monitor: &mut Monitor) -> Result<()> {
         put.context("zones drawn over the API, which the journal has kept")?;
     }
     for window in kept::<Window>(journal, MAINTENANCE)? {
-        let from = window.from;
-        monitor.add_maintenance(window, from)?;
+        match window.until > now {
+            true => monitor.add_maintenance(window)?,
+            false => journal.keep(MAINTENANCE, &window.id, None),
+        }
     }
     Ok(())
 }
@@ -84,7 +87,7 @@ impl Compute {
                 }
                 drop(reply.send(put));
             }
-            Command::Maintenance { reply } => drop(reply.send(monitor.maintenance().to_vec())),
+            Command::Maintenance { reply } => drop(reply.send(monitor.maintenance(now))),
             Command::BeginMaintenance {
                 from,
                 until,
@@ -100,7 +103,10 @@ impl Compute {
                     note,
                     is_fixed: false,
                 };
-                let begun = monitor.add_maintenance(window.clone(), now).map(|()| window);
+                for ended in monitor.take_ended_maintenance(now) {
+                    self.journal.keep(MAINTENANCE, &ended.id, None);
+                }
+                let begun = monitor.add_maintenance(window.clone()).map(|()| window);
                 if let Ok(window) = &begun {
                     self.journal.keep(MAINTENANCE, &window.id, json(window));
                 }

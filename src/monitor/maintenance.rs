@@ -125,8 +125,14 @@ impl Maintenance {
         in_force.max_by_key(|w| w.until)
     }
 
-    pub fn windows(&self) -> &[Window] {
-        &self.windows
+    /// Those that have not ended.
+    pub fn windows(&self, now: Timestamp) -> Vec<Window> {
+        self.windows.iter().filter(|w| now < w.until).cloned().collect()
+    }
+
+    /// Forgets and returns those that have ended.
+    pub fn take_ended(&mut self, now: Timestamp) -> Vec<Window> {
+        self.windows.extract_if(.., |w| w.until <= now).collect()
     }
 
     /// Puts the config's windows in force in place of those of an earlier config.
@@ -135,9 +141,8 @@ impl Maintenance {
         self.windows.extend(windows);
     }
 
-    pub fn add(&mut self, window: Window, now: Timestamp) -> Result<(), MaintenanceError> {
+    pub fn add(&mut self, window: Window) -> Result<(), MaintenanceError> {
         window.check()?;
-        self.windows.retain(|w| w.is_fixed || w.until > now);
         if self.windows.len() >= MAX_WINDOWS {
             return Err(MaintenanceError::TooMany);
         }

@@ -75,12 +75,17 @@ impl Monitor {
     }
 
     /// Maintenance windows in force and to come.
-    pub fn maintenance(&self) -> &[Window] {
-        self.frame.maintenance.windows()
+    pub fn maintenance(&self, now: Timestamp) -> Vec<Window> {
+        self.frame.maintenance.windows(now)
     }
 
-    pub fn add_maintenance(&mut self, window: Window, now: Timestamp) -> Result<(), MaintenanceError> {
-        self.frame.maintenance.add(window, now)
+    /// Forgets and returns the maintenance windows that have ended.
+    pub fn take_ended_maintenance(&mut self, now: Timestamp) -> Vec<Window> {
+        self.frame.maintenance.take_ended(now)
+    }
+
+    pub fn add_maintenance(&mut self, window: Window) -> Result<(), MaintenanceError> {
+        self.frame.maintenance.add(window)
     }
 
     pub fn end_maintenance(&mut self, id: &str) -> Result<Window, MaintenanceError> {

@@ -243,7 +243,7 @@ fn place(monitor: &mut Monitor, command: Command) {
             };
             drop(reply.send(put.map(|()| monitor.zones())));
         }
-        Command::Maintenance { reply } => drop(reply.send(monitor.maintenance().to_vec())),
+        Command::Maintenance { reply } => drop(reply.send(monitor.maintenance(at(0)))),
         Command::BeginMaintenance {
             from,
             until,
@@ -259,7 +259,7 @@ fn place(monitor: &mut Monitor, command: Command) {
                 note,
                 is_fixed: false,
             };
-            drop(reply.send(monitor.add_maintenance(window.clone(), at(0)).map(|()| window)));
+            drop(reply.send(monitor.add_maintenance(window.clone()).map(|()| window)));
         }
         Command::EndMaintenance { id, reply } => drop(reply.send(monitor.end_maintenance(&id))),
         _ => {}

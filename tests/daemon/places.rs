@@ -281,6 +281,30 @@ fn during_maintenance_an_alert_is_recorded_and_sent_when_it_ends() {
 }
 
 #[test]
+fn maintenance_in_force_goes_on_after_kill_9_beside_one_to_come() {
+    let dir = tempfile::tempdir().unwrap();
+    scene(dir.path());
+    let first = Daemon::start(dir.path(), CONFIG);
+    first.wait_until_up();
+    let after = |hours: i64| jiff::Timestamp::now() + jiff::SignedDuration::from_hours(hours);
+    for body in [
+        json!({ "until": after(1), "by": "K. Novak" }),
+        json!({ "from": after(2), "until": after(3), "by": "K. Novak" }),
+    ] {
+        assert_eq!(first.post("/v1/maintenance", &body.to_string()).0, 201);
+    }
+    let before = first.wait_for("/v1/maintenance", "both windows", |_| true);
+    // The journal writes behind.
+    std::thread::sleep(std::time::Duration::from_secs(1));
+    first.signal("-KILL");
+    first.end();
+    let second = Daemon::start(dir.path(), CONFIG);
+    second.wait_until_up();
+    let after = second.wait_for("/v1/maintenance", "both windows", |_| true);
+    assert_eq!(before, after);
+}
+
+#[test]
 fn zones_that_cannot_be_used_end_the_program() {
     let dir = tempfile::tempdir().unwrap();
     let yard = "polygon = [[0, 0], [9, 0], [9, 9]]\n";
