@@ -173,7 +173,7 @@ impl AlertLifecycle {
     }
 
     /// Raises the cause's alert, or updates the open one (an event only when its severity rises).
-    fn present(&mut self, cause: Cause, content: Content, now: Timestamp, frame: u64) {
+    fn present(&mut self, cause: Cause, mut content: Content, now: Timestamp, frame: u64) {
         if let Some(open) = self.open.get_mut(&cause) {
             open.is_restored = false;
             let hold_s = self.cleared.hold_s(open.recurrences);
@@ -189,6 +189,17 @@ impl AlertLifecycle {
             let is_released = alert.maintenance.is_some() && content.maintenance.is_none();
             if is_released {
                 alert.maintenance = None;
+            } else if alert.maintenance.is_none() {
+                // Who was sent it is sent what follows.
+                let before = alert.webhooks.take();
+                content.webhooks = before.zip(content.webhooks).map(|(mut names, more)| {
+                    names.extend(
+                        more.into_iter()
+                            .filter(|name| !names.contains(name))
+                            .collect::<Vec<_>>(),
+                    );
+                    names
+                });
             }
             content.write_to(alert, open.recurrences);
             alert.severity = severity;

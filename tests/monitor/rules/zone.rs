@@ -159,7 +159,7 @@ fn maintenance_keeps_alerts_from_the_webhooks_until_it_ends() {
                 note: None,
                 is_fixed: false,
             };
-            monitor.add_maintenance(window, at(0.0)).unwrap();
+            monitor.add_maintenance(window).unwrap();
         }
     });
     let told = tell(&story);
@@ -173,6 +173,33 @@ fn maintenance_keeps_alerts_from_the_webhooks_until_it_ends() {
         );
     }
     assert!(second.maintenance.is_none() && second.webhooks.is_none(), "{second:?}");
+}
+
+#[test]
+fn an_alert_that_was_sent_is_cleared_during_maintenance_as_well() {
+    let mut actors = crowd();
+    actors.push(Actor::intruder(|t| (t < 12.0).then_some([30.0, 5.0])));
+    let mut story = Story::new(4, actors);
+    story.operator = Box::new(|t, monitor, _| {
+        if t == 8.0 {
+            let window = Window {
+                id: "mast".into(),
+                from: at(8.0),
+                until: at(60.0),
+                by: "K. Novak".into(),
+                note: None,
+                is_fixed: false,
+            };
+            monitor.add_maintenance(window).unwrap();
+        }
+    });
+    let told = tell(&story);
+    assert_eq!((told.raised().len(), told.cleared().len()), (1, 1));
+    let cleared = &told.events.last().unwrap().alert;
+    assert!(
+        cleared.cleared_at > Some(at(8.0)) && cleared.webhooks.is_none(),
+        "{cleared:?}"
+    );
 }
 
 #[test]
