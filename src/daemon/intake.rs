@@ -78,10 +78,17 @@ impl Compute {
             monitor,
             claims,
             places,
+            taken,
         }) = self.settings.try_recv()
         else {
             return;
         };
+        let put = places.put(&mut self.pipeline.monitor);
+        let is_put = put.is_ok();
+        drop(taken.send(put));
+        if !is_put {
+            return;
+        }
         self.pipeline.reconfigure(&monitor, &claims);
         match (&mut self.follower, &claims.log) {
             (_, None) => self.follower = None,
@@ -93,9 +100,6 @@ impl Compute {
                     Err(error) => tracing::error!(%error, "the claims log is not followed: no thread for it"),
                 }
             }
-        }
-        if let Err(error) = places.put(&mut self.pipeline.monitor) {
-            tracing::error!(%error, "zones of the config and of the API do not go together; those from before stay");
         }
         self.claims_log = claims.log.map(|path| path.display().to_string());
     }

@@ -4,10 +4,10 @@ use std::path::PathBuf;
 
 use anyhow::Result;
 use tokio::signal::unix::{SignalKind, signal};
-use tokio::sync::mpsc;
+use tokio::sync::{mpsc, oneshot};
 
 use crate::config::Config;
-use crate::pipeline::Places;
+use crate::pipeline::{self, Places};
 use crate::supervisor::Supervisor;
 use crate::{claims, export, logging, monitor, notify};
 
@@ -17,6 +17,8 @@ pub struct Settings {
     pub monitor: monitor::Config,
     pub claims: claims::Config,
     pub places: Places,
+    /// Takes whether they are in force: where zones do not go with those drawn over the API none of them is.
+    pub taken: oneshot::Sender<Result<(), pipeline::Error>>,
 }
 
 /// What a reload reads and changes.
@@ -62,30 +64,34 @@ impl Reload {
         new.monitor.validate()?;
         new.claims.validate()?;
         new.journal.validate()?;
+        new.log.filter()?;
         let places = Places::of(&new)?;
         let mut endpoints = notify::load(&new.webhook)?;
         let exports = export::load(&new.export, &endpoints, &new.world)?;
         for warning in new.warnings(&new.camera()?) {
             tracing::warn!("{warning}");
         }
+        let claims = claims::Config {
+            // The origin changes with a restart only, as all of [world].
+            axes: self.current.claims.axes,
+            ..new.claims.clone()
+        };
+        let (taken, answer) = oneshot::channel();
+        let settings = Settings {
+            monitor: new.monitor.clone(),
+            claims: claims.clone(),
+            places,
+            taken,
+        };
+        // An error would mean that the compute thread has ended, and with it the daemon.
+        let _ = self.settings.send(settings).await;
+        answer.await.unwrap_or(Ok(()))?;
         if new.log != self.current.log {
             self.logging.set(&new.log)?;
         }
         let changed = new.tables_that_differ(&self.current);
         endpoints.extend(self.exports.replace(exports));
         self.webhooks.replace(endpoints).await?;
-        let claims = claims::Config {
-            // The origin changes with a restart only, as all of [world].
-            axes: self.current.claims.axes,
-            ..new.claims.clone()
-        };
-        let settings = Settings {
-            monitor: new.monitor.clone(),
-            claims: claims.clone(),
-            places,
-        };
-        // An error would mean that the compute thread has ended, and with it the daemon.
-        let _ = self.settings.send(settings).await;
         self.current.log = new.log.clone();
         self.current.monitor = new.monitor.clone();
         self.current.claims = claims;

@@ -53,19 +53,29 @@ fn a_reload_changes_claims_monitor_and_webhooks_and_keeps_the_rest() {
     assert_eq!(alerts(&before).len(), 1, "8 m are within 20: {before}");
     let seen = daemon.wait_for("/v1/positions", "positions", |v| v["frame"].as_u64() > Some(30));
 
-    // A bad file changes nothing, although its first tables are good.
-    let bad = config("b.ndjson", 5.0, &[webhook("comes", port)]).replace("\"secret\"", "\"no-such-file\"");
-    std::fs::write(&file, bad).unwrap();
-    daemon.signal("-HUP");
-    std::fs::write(dir.path().join("b.ndjson"), "no claim\n").unwrap();
-    let later = seen["frame"].as_u64().map(|f| f + 20);
-    daemon.wait_for("/v1/positions", "later positions", |v| v["frame"].as_u64() > later);
-    let status = daemon.wait_for("/v1/status", "status", |v| v["claims"]["log"].is_string());
-    assert!(
-        status["claims"]["log"].as_str().unwrap().ends_with("a.ndjson"),
-        "{status}"
+    // A bad file changes nothing, although its first tables are good; nor does one whose zone has the name of one that was drawn.
+    let corners = "[[200, 200], [210, 200], [210, 210], [200, 200]]";
+    let drawn = format!(
+        r#"{{"type": "FeatureCollection", "features": [{{"type": "Feature", "properties": {{"name": "yard", "kind": "watch"}},
+            "geometry": {{"type": "Polygon", "coordinates": [{corners}]}}}}]}}"#
     );
-    assert_eq!(status["webhooks"][1]["name"], "goes");
+    let (status, answer) = daemon.send("PUT", "/v1/zones", "", &drawn);
+    assert_eq!(status, 200, "{answer}");
+    let comes = config("b.ndjson", 5.0, &[webhook("comes", port)]);
+    let bad = comes.replace("\"secret\"", "\"no-such-file\"");
+    let same = format!("{comes}[[zone]]\nname = \"yard\"\nkind = \"watch\"\npolygon = [[0, 0], [9, 0], [9, 9]]\n");
+    std::fs::write(dir.path().join("b.ndjson"), "no claim\n").unwrap();
+    let mut frame = seen["frame"].as_u64();
+    for bad in [bad, same] {
+        std::fs::write(&file, bad).unwrap();
+        daemon.signal("-HUP");
+        frame = frame.map(|f| f + 20);
+        daemon.wait_for("/v1/positions", "later positions", |v| v["frame"].as_u64() > frame);
+        let status = daemon.wait_for("/v1/status", "status", |v| v["claims"]["log"].is_string());
+        let log = status["claims"]["log"].as_str().unwrap();
+        assert!(log.ends_with("a.ndjson"), "{status}");
+        assert_eq!(status["webhooks"][1]["name"], "goes");
+    }
 
     let good = config("b.ndjson", 5.0, &[webhook("comes", port), webhook("stays", port)]);
     std::fs::write(&file, good.replace("[journal]", "rate_hz = 20.0\n[journal]")).unwrap();
