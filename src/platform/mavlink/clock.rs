@@ -11,6 +11,8 @@ const PENDING: usize = 10;
 const STEP_NS: f64 = 10e6;
 /// Contradictions in a row after which the new offset is believed: a single one may be a late or a forged answer.
 const STEPS_IN_A_ROW: u32 = 5;
+/// Without an answer for so long, ns, stamps alone may show that: ten requests a second were not answered.
+const SILENT_NS: i64 = 10_000_000_000;
 /// How far in our past or future a stamp may lie, ns. A sample older than this is of no use, whatever delayed it.
 const OLDEST_NS: i64 = 2_000_000_000;
 const NEWEST_NS: i64 = 20_000_000;
@@ -48,6 +50,8 @@ pub enum Relation {
 #[derive(Debug, Default)]
 pub struct Clock {
     exchange: Option<Offset>,
+    /// When the last request was answered, on our clock.
+    answered_ns: i64,
     /// The smallest difference of arrival and stamp.
     arrival: Option<Offset>,
     contradictions: u32,
@@ -91,6 +95,7 @@ impl Clock {
             bound_ns: way_ns as f64 / 2.0,
             at_ns: now_ns,
         };
+        self.answered_ns = now_ns;
         Self::refine(&mut self.exchange, &mut self.contradictions, found, now_ns)
     }
 
@@ -119,7 +124,15 @@ impl Clock {
 
     fn time_of(&mut self, stamp_ns: i64, now_ns: i64) -> Result<i64, Refusal> {
         if let Some(offset) = self.exchange {
-            return plausible(stamp_ns.saturating_add(offset.ns), now_ns);
+            let time = plausible(stamp_ns.saturating_add(offset.ns), now_ns);
+            if now_ns - self.answered_ns < SILENT_NS {
+                return time;
+            }
+            self.contradictions = if time.is_ok() { 0 } else { self.contradictions + 1 };
+            if self.contradictions < STEPS_IN_A_ROW {
+                return time;
+            }
+            (self.exchange, self.arrival) = (None, None);
         }
         let found = Offset {
             ns: now_ns.saturating_sub(stamp_ns),
@@ -139,6 +152,8 @@ impl Clock {
                         return Err(Refusal::Time);
                     }
                     (self.arrival, self.contradictions) = (Some(found), 0);
+                } else {
+                    self.contradictions = 0;
                 }
             }
         }
@@ -240,6 +255,36 @@ mod tests {
         assert!(clock.time_of_us(1_001_020_000, 51 * 20 * MS, 0).is_ok());
         let refused = (52..72).filter(|k| clock.time_of_us(*k as u64 * 20_000, k * 20 * MS, 0).is_err());
         assert_eq!(refused.count(), STEPS_IN_A_ROW as usize - 1);
+    }
+
+    #[test]
+    fn a_restart_is_believed_after_exchanges_have_ended() {
+        let mut clock = Clock::default();
+        clock.requested(S);
+        clock.answered(S, 100 * S, S).unwrap();
+        assert!(clock.time_of_us(100_020_000, S + 20 * MS, 0).is_ok());
+        // Restarted while answers still come, or may: they decide.
+        assert!((0..50).all(|k| clock.time_of_us(k * 20_000, 2 * S + k as i64 * 20 * MS, 0).is_err()));
+        let after = S + SILENT_NS;
+        assert!(clock.time_of_us(110_000_000, after, 0).is_ok());
+        let refused = (0..20).filter(|k| clock.time_of_us(*k as u64 * 20_000, after + k * 20 * MS, 0).is_err());
+        assert_eq!(refused.count(), STEPS_IN_A_ROW as usize - 1);
+        assert_eq!(clock.relation(after + S), Relation::Arrival);
+    }
+
+    #[test]
+    fn contradictions_with_others_between_them_do_not_add_up() {
+        let mut clock = Clock::default();
+        for k in 0..50i64 {
+            let now = k * 20 * MS;
+            // Each one but the first a little late, every other one absurd.
+            let stamp = if k % 2 == 1 {
+                77
+            } else {
+                1_000_000_000 + k as u64 * 20_000 - 10.min(k as u64)
+            };
+            assert_eq!(clock.time_of_us(stamp, now, 0).is_ok(), k % 2 == 0, "{k}");
+        }
     }
 
     #[test]
