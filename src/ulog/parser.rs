@@ -121,7 +121,7 @@ impl Parser {
                     1 => format!("{prefix}{name}"),
                     _ => format!("{prefix}{name}[{k}]"),
                 };
-                at = match Basic::of(kind) {
+                let end = match Basic::of(kind) {
                     Some(kind) => {
                         found.insert(name, Number { kind, at });
                         at + kind.size()
@@ -129,6 +129,10 @@ impl Parser {
                     None if depth > 0 => self.lay_out(kind, &format!("{name}."), at, depth - 1, found)?,
                     None => return Err(format!("format {format}: nested too deeply")),
                 };
+                if end == at {
+                    return Err(format!("format {kind}: no fields"));
+                }
+                at = end;
                 if at > usize::from(u16::MAX) {
                     return Err(format!("format {format}: longer than a message can be"));
                 }
