@@ -45,6 +45,8 @@ const COMPANION: f64 = 6.0;
 const FAINT: f64 = 0.5;
 /// Fewest emitters that show what is common to them.
 const FEWEST: usize = 3;
+/// Sizes of windows whose searches are kept: a large sensor has thousands. Fewer make searches anew, more take memory.
+const MOST_SIZES: usize = 64;
 
 /// Searches windows of a frame, or all of it where windows gain nothing.
 pub(crate) struct WindowedEstimator {
@@ -55,6 +57,8 @@ pub(crate) struct WindowedEstimator {
     segmentation: Segmentation,
     /// By the number of pixels along x and y.
     searches: BTreeMap<[usize; 2], WindowSearch>,
+    /// Windows so far.
+    searched: u64,
     /// Made for the first frame that needs it: it takes memory that grows with the area.
     whole: Option<AnalyticEstimator>,
     smear: Option<Smear>,
@@ -62,6 +66,8 @@ pub(crate) struct WindowedEstimator {
 
 /// The search of windows of one size.
 struct WindowSearch {
+    /// The last of the windows that it was used for.
+    used_for: u64,
     /// The window's lower edges on its own sensor, m.
     low_m: [f64; 2],
     estimator: AnalyticEstimator,
@@ -84,6 +90,7 @@ impl WindowedEstimator {
             source_penalty,
             segmentation: Segmentation::new(camera, source_penalty.sqrt()),
             searches: BTreeMap::new(),
+            searched: 0,
             whole: None,
             smear: None,
         }
@@ -125,10 +132,22 @@ impl WindowedEstimator {
     ) -> Option<Found> {
         let [x, y] = &window.pixels;
         let size = [x.len(), y.len()];
+        if self.searches.len() == MOST_SIZES
+            && !self.searches.contains_key(&size)
+            && let Some(oldest) = self
+                .searches
+                .iter()
+                .min_by_key(|(_, s)| s.used_for)
+                .map(|(size, _)| *size)
+        {
+            self.searches.remove(&oldest);
+        }
+        self.searched += 1;
         let search = self
             .searches
             .entry(size)
             .or_insert_with(|| WindowSearch::new(self.spec, &self.camera, self.rules, self.source_penalty, size));
+        search.used_for = self.searched;
         let part = s![y.clone(), x.clone()];
         search.frame.pixels.assign(&frame.pixels.slice(part));
         let Dark { level_j, noise_std_j } = self.segmentation.dark;
@@ -252,6 +271,7 @@ impl WindowSearch {
             ..camera.clone()
         };
         Self {
+            used_for: 0,
             low_m: [own.x.min_m, own.y.min_m],
             estimator: AnalyticEstimator::of_window(spec, &own, rules, source_penalty),
             frame: Frame {
