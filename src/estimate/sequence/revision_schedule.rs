@@ -3,7 +3,7 @@
 use crate::estimate::sequence::residual_map::ResidualSum;
 use crate::estimate::sequence::revision::{Revised, Revision};
 use crate::estimate::sequence::search::WindowSearch;
-use crate::estimate::sequence::snapshot::Snapshot;
+use crate::estimate::sequence::upkeep::bury;
 use crate::estimate::sequence::window::Window;
 
 /// A search of the window begins when it has grown by this factor since the last, and at the latest after this many frames.
@@ -68,8 +68,11 @@ impl RevisionSchedule {
             }
             Revised::Better(mut better) => {
                 let newer = window.snapshots.iter().filter(|s| s.time_s > revision.time_s());
-                let newer: Vec<Snapshot> = newer.cloned().collect();
-                better.catch_up(search.engine, &newer, memory_s);
+                for snapshot in newer {
+                    let elapsed = snapshot.time_s - better.time_s;
+                    better.catch_up(search.engine, snapshot, memory_s);
+                    bury(&mut better, search.engine, elapsed);
+                }
                 *window = *better;
                 self.searched = 0;
                 true

@@ -167,6 +167,7 @@ impl Window {
             }
         }
         self.prior = prior;
+        self.total = self.sum(&self.state, self.snapshots.iter().map(|s| &s.local));
         cost
     }
 
@@ -238,18 +239,17 @@ impl Window {
         let bent = self.snapshots.iter().take_while(|s| now_s - s.time_s > span_s).count();
         if bent > 0 {
             self.fold(bent);
-            self.total = self.sum(&self.state, self.snapshots.iter().map(|s| &s.local));
         }
     }
 
-    /// Goes on with frames that came while this window was searched.
-    pub fn catch_up(&mut self, engine: &mut Engine, newer: &[Snapshot], memory_s: f64) {
-        for s in newer {
-            self.advance(s.time_s, memory_s);
-            self.snapshots.push(s.clone());
-            self.relinearise(engine, self.snapshots.len() - 1);
-            self.step();
-        }
+    /// Takes a frame that came while this window was searched.
+    pub fn catch_up(&mut self, engine: &mut Engine, newer: &Snapshot, memory_s: f64) {
+        self.advance(newer.time_s, memory_s);
+        self.snapshots.push(newer.clone());
+        self.relinearise(engine, self.snapshots.len() - 1);
+        self.step();
+        self.pose_error = self.snapshots.last().map_or(self.pose_error, |s| s.local.pose_error);
+        self.age += 1;
     }
 
     /// Forgets targets, highest index first, and that any snapshot held them.
