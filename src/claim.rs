@@ -186,11 +186,6 @@ fn number() -> ObjectBuilder {
     ObjectBuilder::new().schema_type(Type::Number)
 }
 
-/// Seconds from `from` to `to`.
-pub(crate) fn seconds(from: Timestamp, to: Timestamp) -> f64 {
-    (to.as_nanosecond() - from.as_nanosecond()) as f64 * 1e-9
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;

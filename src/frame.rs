@@ -1,4 +1,4 @@
-//! The one thing every floor hands on: an exposure of the photodetector array.
+//! What the chain begins with: an exposure of the photodetector array.
 
 use jiff::Timestamp;
 use ndarray::Array2;

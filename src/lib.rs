@@ -22,6 +22,7 @@ pub mod optics;
 pub mod pose;
 pub mod stats;
 pub mod supervisor;
+pub mod time;
 pub mod toml_file;
 pub mod ulog;
 
@@ -49,10 +50,7 @@ pub mod study;
 #[allow(clippy::disallowed_methods, reason = "progress and latencies are shown to people")]
 pub mod cli;
 pub mod config;
-#[allow(
-    clippy::disallowed_methods,
-    reason = "it lives in the present and hands the time down"
-)]
+#[allow(clippy::disallowed_methods, reason = "it reads the clock and hands the time down")]
 pub mod daemon;
 pub mod hub;
 #[allow(

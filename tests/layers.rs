@@ -12,6 +12,7 @@ const LAYERS: &[&str] = &[
     "logging",
     "metric",
     "supervisor",
+    "time",
     "frame",
     "claim",
     "pose",

@@ -37,7 +37,7 @@ const LIT: f64 = 3.0;
 /// Levels of light, each with the same number of pixels.
 const LEVELS: usize = 24;
 /// A pixel whose variance exceeds its level's median by this factor flickers by itself.
-const RESTLESS: f64 = 4.0;
+const UNSTEADY: f64 = 4.0;
 /// The slope must be this many of its standard deviations above zero.
 const SIGNIFICANT: f64 = 5.0;
 
@@ -275,7 +275,7 @@ fn levels(pixels: &[(f64, f64)], differences: f64) -> Vec<Level> {
             let mut sorted: Vec<f64> = pixels.iter().map(|p| p.1).collect();
             sorted.sort_by(f64::total_cmp);
             let median = sorted[sorted.len() / 2];
-            let calm: Vec<&(f64, f64)> = pixels.iter().filter(|p| p.1 <= RESTLESS * median).collect();
+            let calm: Vec<&(f64, f64)> = pixels.iter().filter(|p| p.1 <= UNSTEADY * median).collect();
             let count = calm.len() as f64;
             Level {
                 mean: calm.iter().map(|p| p.0).sum::<f64>() / count,

@@ -5,7 +5,8 @@ use std::collections::VecDeque;
 use jiff::Timestamp;
 
 use super::outcome::Outcome;
-use super::{Claim, ClaimState, seconds};
+use super::{Claim, ClaimState};
+use crate::time::seconds;
 
 /// Claims kept per user, the newest included. Sixteen reach back sixteen seconds at 1 Hz, further than a beam's trail (6 s).
 pub(super) const HISTORY: usize = 16;

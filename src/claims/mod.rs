@@ -31,6 +31,4 @@ pub use pressure::{Squeeze, WINDOW_S};
 pub use roster::Roster;
 pub use store::{Beam, Counts, Store};
 
-pub(crate) use crate::claim::seconds;
-
 pub use crate::claim::{Claim, ClaimState};

@@ -8,7 +8,8 @@ use jiff::Timestamp;
 use super::candidates::{Bearing, Index};
 use super::history::{History, Standing};
 use super::outcome::Outcome;
-use super::{Claim, Roster, seconds};
+use super::{Claim, Roster};
+use crate::time::seconds;
 
 /// A name counts as known after this time and this many claims, seen or not: longer than a burst, shorter than an operator waits.
 const KNOWN_AFTER_S: f64 = 30.0;

@@ -10,7 +10,8 @@ use super::history::Standing;
 use super::outcome::Outcome;
 use super::pressure::{Dropped, Pressure, Squeeze};
 use super::registry::{Registry, User};
-use super::{Claim, Config, Roster, seconds};
+use super::{Claim, Config, Roster};
+use crate::time::seconds;
 
 /// A user silent or ended for this long is forgotten first when room is needed, whoever they are. Longer keeps names that a flood left
 /// behind, shorter forgets an honest user in a pause. Not tuned.

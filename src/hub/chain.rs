@@ -10,13 +10,14 @@ use serde_json::json;
 use super::alerts::{Finding, HubAlerts, OwnCause, SavedAlerts};
 use super::conflicts::Conflicts;
 use super::picture::Picture;
-use super::stations::{Refused, SavedStation, Sighting, Stations, seconds};
+use super::stations::{Refused, SavedStation, Sighting, Stations};
 use crate::api::StationStatus;
 use crate::config::Config;
 use crate::fleet::Topic;
 use crate::fleet::message::{AlertMessage, HealthMessage, PoseMessage, PositionsMessage};
 use crate::journal::Origin;
 use crate::monitor::{Acknowledgement, Alert, AlertEvent, AlertKind, StationName, Withdrawal};
+use crate::time::seconds;
 
 /// What a config says of the chain.
 #[derive(Clone, Copy, Debug)]

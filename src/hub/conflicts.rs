@@ -5,7 +5,9 @@ use std::collections::BTreeMap;
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 
-use super::stations::{Sighting, seconds};
+use super::stations::Sighting;
+
+use crate::time::seconds;
 
 /// A conflict lasts so long before it is raised, s: at a handover, one station's track outlives the beam by some frames.
 const RAISED_AFTER_S: f64 = 1.5;

@@ -14,6 +14,7 @@ use crate::claim::{Claim, ClaimState};
 use crate::fleet::message::{HealthMessage, PoseMessage, PositionsMessage};
 use crate::geo::Geodetic;
 use crate::monitor::{StationName, TrackedPosition};
+use crate::time::seconds;
 
 /// Stations known at once. Each costs some 50 kB with its positions and status.
 const MOST_STATIONS: usize = 4096;
@@ -351,11 +352,6 @@ impl<'a> Place<'a> {
         let gone = FASTEST_M_S * seconds(self.time, other.time).abs();
         self.name != other.name && (self.at - other.at).norm() > tolerated_m + DIFFERENCE_SIGMAS * sigma + gone
     }
-}
-
-/// From `a` to `b`, s.
-pub fn seconds(a: Timestamp, b: Timestamp) -> f64 {
-    b.duration_since(a).as_secs_f64()
 }
 
 #[cfg(test)]

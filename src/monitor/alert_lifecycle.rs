@@ -11,7 +11,7 @@ use super::alert::{
 use super::alert_ids::AlertIds;
 use super::cleared_causes::ClearedCauses;
 use super::finding::{Cause, Content, Finding};
-use crate::claims::seconds;
+use crate::time::seconds;
 
 /// The alerts of a run: one per cause, from raise to clear.
 #[derive(Debug)]

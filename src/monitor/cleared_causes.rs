@@ -6,7 +6,7 @@ use jiff::Timestamp;
 
 use super::alert::{AlertKind, SAME_PLACE_M};
 use super::finding::Cause;
-use crate::claims::seconds;
+use crate::time::seconds;
 
 /// Absence after which an alert clears at the first occurrence of its cause, s. Longer keeps alerts open after their cause
 /// has gone; shorter splits one cause into several alerts. Doubled at each recurrence, so that only a cause's first

@@ -29,9 +29,9 @@ use super::track::registration::register;
 use super::track::tracker::Tracker;
 use super::track::user_tracks::UserTracks;
 use super::zones::ZoneMap;
-use crate::claims::seconds;
 use crate::geo::{LocalAxes, View};
 use crate::optics::Camera;
+use crate::time::seconds;
 
 /// Standard deviation of what is systematic in positions and does not average out, m. Larger delays the alert of a drift, smaller
 /// takes calibration errors for one. Not measured.

@@ -61,7 +61,7 @@ pub enum MaintenanceError {
 
 impl Window {
     pub fn check(&self) -> Result<(), MaintenanceError> {
-        let length_s = crate::claims::seconds(self.from, self.until);
+        let length_s = crate::time::seconds(self.from, self.until);
         if !(length_s > 0.0 && length_s <= MAX_LENGTH_S) {
             return Err(MaintenanceError::Length {
                 from: self.from,

@@ -21,9 +21,10 @@ use super::track::association::{Association, associate};
 use super::track::beam_track::Track;
 use super::track::detection::Detection;
 use super::track::eligibility::Eligibility;
-use crate::claims::{Beam, Store, seconds};
+use crate::claims::{Beam, Store};
 use crate::estimate::Estimate;
 use crate::optics::Camera;
+use crate::time::seconds;
 
 /// How far back a time may lie before the clock counts as set back, s: frames and failures are stamped apart. Smaller restarts
 /// the monitor for stamps that are out of order, larger lets a clock that was set back stop verdicts for that long.

@@ -6,8 +6,8 @@ use std::collections::VecDeque;
 use jiff::{SignedDuration, Timestamp};
 use nalgebra::Vector6;
 
-use crate::claim::seconds;
 use crate::pose::Pose;
+use crate::time::seconds;
 
 /// Poses kept: 20 s of an autopilot's 200 Hz, so that the frames of a slow estimator still find theirs.
 const CAPACITY: usize = 4096;

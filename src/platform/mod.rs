@@ -24,14 +24,14 @@ use nalgebra::Vector6;
 pub use buffer::{Counts, Outcome, PoseAt, PoseBuffer};
 pub use config::{Config, ConfigError, Kind};
 pub use inbox::PoseInbox;
-pub use place::{Geodetic, Origin, Place, Unplaced};
+pub use place::{Origin, Place, SeaLevelPlace, Unplaced};
 pub use replay::{Error as ReplayError, LineError};
 pub use telemetry::{Error as TelemetryError, Telemetry, open as open_telemetry};
 
-use crate::claim::seconds;
 use crate::geo::{self, Sight, Terrain};
 use crate::optics::{Camera, Smear};
 use crate::pose::{Mount, Pose};
+use crate::time::seconds;
 use delay::DelayEstimate;
 use replay::Replay;
 

@@ -4,7 +4,7 @@ use crate::geo::{self, Datum, LocalAxes};
 
 /// A place by latitude, longitude and height.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Geodetic {
+pub struct SeaLevelPlace {
     pub latitude_deg: f64,
     pub longitude_deg: f64,
     /// Above mean sea level: autopilots state no other.
@@ -17,9 +17,9 @@ pub enum Origin {
     /// Where the autopilot started, wherever that was.
     Unknown,
     /// Where the autopilot started.
-    Start(Geodetic),
+    Start(SeaLevelPlace),
     /// The place itself, or one close by: the autopilot has no axes of its own.
-    Passing(Geodetic),
+    Passing(SeaLevelPlace),
 }
 
 /// Where a sample was taken.
@@ -76,7 +76,7 @@ impl Place {
 mod tests {
     use super::*;
 
-    const START: Geodetic = Geodetic {
+    const START: SeaLevelPlace = SeaLevelPlace {
         latitude_deg: 48.137,
         longitude_deg: 11.575,
         sea_level_m: 520.0,

@@ -2,7 +2,7 @@
 
 use nalgebra::{Matrix6, UnitQuaternion};
 
-use super::place::{Geodetic, Origin, Place};
+use super::place::{Origin, Place, SeaLevelPlace};
 use crate::pose::{PoseSigmas, attitude_of};
 use crate::ulog::{self, Log};
 
@@ -64,7 +64,7 @@ fn between(a: &ulog::Place, b: &ulog::Place, share: f64, undulation_m: Option<f6
     let (a, b) = if a.reference == b.reference { (a, b) } else { (a, a) };
     let [north, east, down] = [0, 1, 2].map(|k| a.ned_m[k] + (b.ned_m[k] - a.ned_m[k]) * share);
     let [latitude_deg, longitude_deg, sea_level_m] = a.reference;
-    let at = Geodetic {
+    let at = SeaLevelPlace {
         latitude_deg,
         longitude_deg,
         sea_level_m,

@@ -8,9 +8,9 @@ use serde_json::Value;
 
 use super::place::Unplaced;
 use super::px4_log;
-use crate::claim::seconds;
 use crate::geo::{self, Geodetic, LocalAxes};
 use crate::pose::{AttitudeError, Pose, PoseSigmas, attitude_of};
+use crate::time::seconds;
 use crate::ulog;
 
 /// How far ahead of a frame poses are read, s: a pose after it to interpolate to, also where the file is a little out of order.

@@ -56,7 +56,7 @@ pub(crate) struct WindowedEstimator {
     source_penalty: f64,
     segmentation: Segmentation,
     /// By the number of pixels along x and y.
-    searches: BTreeMap<[usize; 2], WindowSearch>,
+    searches: BTreeMap<[usize; 2], SizedSearch>,
     /// Windows so far.
     searched: u64,
     /// Made for the first frame that needs it: it takes memory that grows with the area.
@@ -65,7 +65,7 @@ pub(crate) struct WindowedEstimator {
 }
 
 /// The search of windows of one size.
-struct WindowSearch {
+struct SizedSearch {
     /// The last of the windows that it was used for.
     used_for: u64,
     /// The window's lower edges on its own sensor, m.
@@ -146,7 +146,7 @@ impl WindowedEstimator {
         let search = self
             .searches
             .entry(size)
-            .or_insert_with(|| WindowSearch::new(self.spec, &self.camera, self.rules, self.source_penalty, size));
+            .or_insert_with(|| SizedSearch::new(self.spec, &self.camera, self.rules, self.source_penalty, size));
         search.used_for = self.searched;
         let part = s![y.clone(), x.clone()];
         search.frame.pixels.assign(&frame.pixels.slice(part));
@@ -252,7 +252,7 @@ impl Total {
     }
 }
 
-impl WindowSearch {
+impl SizedSearch {
     fn new(
         spec: &'static EstimatorSpec,
         camera: &Camera,

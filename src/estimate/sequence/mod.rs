@@ -5,6 +5,7 @@
 //! Recent frames are kept as a window that is fitted anew where its linearisation no longer holds; older ones leave it as information on
 //! all positions and velocities together.
 
+mod acceleration_bank;
 mod chances;
 mod course;
 mod joint_information;
@@ -14,7 +15,6 @@ mod outlook;
 mod report;
 mod reprojection;
 mod residual_map;
-mod restlessness;
 mod revision;
 mod revision_schedule;
 mod search;

@@ -2,7 +2,7 @@
 
 use nalgebra::Vector2;
 
-use crate::estimate::sequence::restlessness::Restlessness;
+use crate::estimate::sequence::acceleration_bank::AccelerationBank;
 
 /// Frames over which changes of an emitter's position are added up: the newest alone shows a corner, more of them a bend.
 const MEMORIES: [f64; 3] = [1.0, 8.0, 32.0];
@@ -43,7 +43,7 @@ pub(crate) struct Straying {
     sums: [Sum; MEMORIES.len()],
     /// Variance of the position along an axis, σ².
     variance: f64,
-    restlessness: Restlessness,
+    accelerations: AccelerationBank,
     /// Spectral density of the acceleration, σ²/s³.
     density: f64,
 }
@@ -62,19 +62,19 @@ impl Straying {
     /// Takes where the frame at `time_s` alone shows it, σ, with the variance of each coordinate, σ². `unit` is 1 m in σ.
     pub fn see(&mut self, place: [f64; 2], variance: [f64; 2], time_s: f64, unit: f64) {
         let (place_m, variance_m2) = (place.map(|v| v / unit), variance.map(|v| v / (unit * unit)));
-        self.restlessness.see(place_m, variance_m2, time_s);
-        self.density = self.restlessness.density_m2_s3() * unit * unit;
+        self.accelerations.see(place_m, variance_m2, time_s);
+        self.density = self.accelerations.density_m2_s3() * unit * unit;
     }
 
     /// The emitter has turned: what the frames have shown so far is of its course before.
     pub fn turn(&mut self) {
         self.sums = Default::default();
-        self.restlessness.turn();
+        self.accelerations.turn();
     }
 
     /// What it has shown of accelerations so far is forgotten.
     pub fn go_straight(&mut self) {
-        (self.restlessness, self.density) = Default::default();
+        (self.accelerations, self.density) = Default::default();
     }
 
     /// How long the course counts as straight, s.

@@ -2,9 +2,11 @@
 
 use std::collections::{BTreeMap, VecDeque};
 
-use crate::claim::{Claim, ClaimState, seconds};
+use crate::claim::{Claim, ClaimState};
+
 use crate::frames::Arrivals;
 use crate::pose::Pose;
+use crate::time::seconds;
 
 /// Most users kept; beyond it those who have ended are removed first.
 const MOST_USERS: usize = 10_000;

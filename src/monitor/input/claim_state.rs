@@ -3,12 +3,14 @@
 use jiff::{SignedDuration, Timestamp};
 use nalgebra::{Matrix2, Vector2};
 
-use crate::claims::{Beam, Bearing, Claim, ClaimState, Standing, Store, seconds};
+use crate::claims::{Beam, Bearing, Claim, ClaimState, Standing, Store};
+
 use crate::geo::View;
 use crate::monitor::config::Config;
 use crate::monitor::stats::gaussian::largest_eigenvalue;
 use crate::monitor::track::detection::{OVERLAP, spot_m};
 use crate::monitor::track::user_track::UserTrack;
+use crate::time::seconds;
 
 /// Speed at which a user may leave their last claim without a new one, beyond the one they claimed, m/s: a walk. Larger widens
 /// what is tolerated between claims, smaller raises a mismatch for who sets off. Not measured.

@@ -4,8 +4,8 @@ use jiff::Timestamp;
 
 use super::claim_state::ActiveClaim;
 use super::crowding::Crowding;
-use crate::claims::seconds;
 use crate::monitor::stats::robust::median_high;
+use crate::time::seconds;
 
 /// Claim periods after which, at the start of a run, every user's claim has come. Longer delays the first verdicts of a run,
 /// shorter alerts users whose first claim is still to come. Not measured.

@@ -5,9 +5,9 @@ use std::collections::VecDeque;
 use jiff::Timestamp;
 use serde_json::{Value, json};
 
-use crate::claims::seconds;
 use crate::estimate::Estimate;
 use crate::monitor::report::Observation;
+use crate::time::seconds;
 
 /// Share of saturated pixels from which a frame is evidence of nothing. Nine users' spots, four σ wide at σ_eff = 1 mm, cover an
 /// eighth of the paper's sensor; a lamp that covers a quarter hides whoever wants to be hidden.

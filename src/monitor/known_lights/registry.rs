@@ -8,7 +8,6 @@ use nalgebra::Vector2;
 use super::light::{DEFAULT_RADIUS_M, KnownLight, LightError, LightSource, MAX_LIGHTS, RADIUS_M, Request};
 use super::range::LightRange;
 use super::state::{KnownLightStatus, LightState};
-use crate::claims::seconds;
 use crate::monitor::alert::{Alert, AlertKind, KNOWN_LIGHT};
 use crate::monitor::alert_lifecycle::AlertLifecycle;
 use crate::monitor::finding::Cause;
@@ -18,6 +17,7 @@ use crate::monitor::stats::robust::median_high;
 use crate::monitor::track::association::Association;
 use crate::monitor::track::tracker::Tracker;
 use crate::monitor::track::user_tracks::COINCIDENCE_S;
+use crate::time::seconds;
 
 /// Standard deviations of a beam's position by which it may be outside of a light's radius.
 const REACH: f64 = 3.0;

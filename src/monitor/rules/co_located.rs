@@ -4,7 +4,6 @@ use jiff::Timestamp;
 use nalgebra::Vector2;
 use serde_json::json;
 
-use crate::claims::seconds;
 use crate::monitor::alert::{Alert, AlertKind, SHARED_SPOT, Severity};
 use crate::monitor::by_user::ByUser;
 use crate::monitor::evidence::power_against_reported;
@@ -19,6 +18,7 @@ use crate::monitor::stats::robust::{common_displacement, median_high};
 use crate::monitor::stats::second_moment::CommonMode;
 use crate::monitor::stats::step_change::{CandidateSteps, TRIED};
 use crate::monitor::track::beam_track::Track;
+use crate::time::seconds;
 
 /// Users besides the one at hand from which their median is taken for what all beams share. With one, a single other beam would
 /// decide; more leave small groups without a common mode.

@@ -3,12 +3,14 @@
 
 use serde_json::json;
 
-use crate::claims::{WINDOW_S, seconds};
+use crate::claims::WINDOW_S;
+
 use crate::monitor::alert::{AlertKind, Severity};
 use crate::monitor::evidence::claimed;
 use crate::monitor::finding::{Cause, Content, Finding};
 use crate::monitor::frame_context::FrameContext;
 use crate::monitor::input::overload::Overload;
+use crate::time::seconds;
 
 /// Claim periods for which the whole log may be quiet, where they are longer than `claims_stale_s`.
 const QUIET_PERIODS: f64 = 5.0;

@@ -5,7 +5,6 @@ use jiff::Timestamp;
 use nalgebra::{Matrix2, Vector2};
 use serde_json::json;
 
-use crate::claims::seconds;
 use crate::monitor::alert::{KNOWN_LIGHT, Severity};
 use crate::monitor::finding::{Cause, Content, Finding};
 use crate::monitor::frame_context::FrameContext;
@@ -16,6 +15,7 @@ use crate::monitor::stats::co_location::CoLocationEvidence;
 use crate::monitor::stats::error_budget::TestFamily;
 use crate::monitor::stats::gaussian::neg_log_p_outside;
 use crate::monitor::track::beam_track::Track;
+use crate::time::seconds;
 
 /// Share of the threshold from which the present is no evidence of what a light is usually like, as for users' spots.
 const SUSPECT_SHARE: f64 = 0.2;

@@ -6,7 +6,6 @@ use jiff::Timestamp;
 use nalgebra::Vector2;
 use serde_json::{Value, json};
 
-use crate::claims::seconds;
 use crate::monitor::alert::{SAME_PLACE_M, Severity};
 use crate::monitor::alert_lifecycle::AlertLifecycle;
 use crate::monitor::evidence::stranger_likelihood_ratio;
@@ -16,6 +15,7 @@ use crate::monitor::stats::error_budget::TestFamily;
 use crate::monitor::stats::robust::median_high;
 use crate::monitor::track::beam_track::Track;
 use crate::monitor::track::detection::view_m2;
+use crate::time::seconds;
 
 /// Resolutions of a spot within which the beam that an alert was about and the one that now has no claim are the same two. Larger
 /// moves an alert to a beam that has nothing to do with it, smaller raises a second one for the same two beams. Not measured.

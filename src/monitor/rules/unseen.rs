@@ -3,7 +3,6 @@
 use jiff::Timestamp;
 use serde_json::json;
 
-use crate::claims::seconds;
 use crate::monitor::alert::{AlertKind, Severity};
 use crate::monitor::evidence::claimed;
 use crate::monitor::finding::{Cause, Content, Finding};
@@ -12,6 +11,7 @@ use crate::monitor::input::claim_state::ActiveClaim;
 use crate::monitor::stats::error_budget::TestFamily;
 use crate::monitor::track::user_track::UserTrack;
 use crate::monitor::track::user_tracks::COINCIDENCE_S;
+use crate::time::seconds;
 
 /// Users never seen at all who have an alert each; more of them within a cool-down share one, since they have one cause. More bury
 /// other alerts under a flood of invented users, fewer deny a new user's absence an alert of its own.

@@ -2,7 +2,6 @@
 
 use serde_json::json;
 
-use crate::claims::seconds;
 use crate::monitor::alert::{AlertKind, Severity};
 use crate::monitor::evidence::claimed;
 use crate::monitor::finding::{Cause, Content, Finding};
@@ -10,6 +9,7 @@ use crate::monitor::frame_context::FrameContext;
 use crate::monitor::stats::error_budget::TestFamily;
 use crate::monitor::track::beam_track::Track;
 use crate::monitor::zones::{Inside, REACH_M, Zone, ZoneKind};
+use crate::time::seconds;
 
 /// Standard deviations of a position by which a user must be inside of a restricted zone. More let somebody in before the alert, fewer
 /// raise alerts for who walks along its edge.

@@ -8,7 +8,7 @@ use nalgebra::{Matrix2, Vector2};
 use super::block_history::{BLOCK_FRAMES, MAX_BLOCKS, Recent};
 use super::gaussian::mahalanobis2;
 use super::window_excess::{WINDOWS, WindowExcess, most_significant};
-use crate::claims::seconds;
+use crate::time::seconds;
 
 /// Accelerations of honest users, r.m.s., m/s²: half a g is a hard brake. Larger hides a second beam, smaller takes a brake for
 /// one. At 10 frames/s it moves a second difference by 5 cm, and two beams a metre apart by four times as much; at

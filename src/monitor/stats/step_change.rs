@@ -7,7 +7,7 @@ use nalgebra::Vector2;
 
 use super::jitter::ACCELERATION;
 use super::robust::ninth_decile;
-use crate::claims::seconds;
+use crate::time::seconds;
 
 /// Frames of the line before a step, and of the lines after it that are tried: three are found sooner, five are more exact.
 const BEFORE: usize = 3;

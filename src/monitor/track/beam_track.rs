@@ -7,8 +7,8 @@ use nalgebra::Vector2;
 
 use super::detection::{Detection, Earlier};
 use super::manoeuvring::ManoeuvringFilter;
-use crate::claims::seconds;
 use crate::monitor::stats::gaussian::largest_eigenvalue;
+use crate::time::seconds;
 
 /// Added to the gate per axis, m: a beam may turn between two frames faster than the motion model allows. Not measured.
 pub const GATE_FLOOR_M: f64 = 0.4;

@@ -7,7 +7,7 @@ use jiff::Timestamp;
 use nalgebra::Vector2;
 
 use super::beam_track::Track;
-use crate::claims::{Store, seconds};
+use crate::claims::Store;
 use crate::monitor::alert::AlertKind;
 use crate::monitor::alert_lifecycle::AlertLifecycle;
 use crate::monitor::config::Config;
@@ -15,6 +15,7 @@ use crate::monitor::finding::Cause;
 use crate::monitor::input::claim_state::{ActiveClaim, CLAIM_LIFE_S};
 use crate::monitor::input::claim_timing::ClaimTiming;
 use crate::monitor::input::crowding::Crowding;
+use crate::time::seconds;
 
 /// Share of the tolerated distance by which a claim that stays where it is may move: half of it is the error of an honest claim.
 const STAYS: f64 = 0.5;

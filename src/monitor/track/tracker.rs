@@ -6,8 +6,8 @@ use nalgebra::Matrix2;
 use super::beam_track::{GATE_FLOOR_M, Track};
 use super::detection::Detection;
 use crate::assign::assign;
-use crate::claims::seconds;
 use crate::monitor::stats::gaussian::mahalanobis2;
+use crate::time::seconds;
 
 /// Squared Mahalanobis gate of the association: χ² of two degrees exceeds it 4 times in 10⁶. Larger lets neighbours swap, smaller
 /// loses a track to an error of its covariance.

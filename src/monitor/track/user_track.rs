@@ -2,7 +2,7 @@
 
 use jiff::Timestamp;
 
-use crate::claims::seconds;
+use crate::time::seconds;
 
 /// Time for which a beam must have been associated with a user's claims before the two are taken to belong together, s: longer than a
 /// chance meeting of two who walk lasts. Longer keeps honest newcomers unknown during a flood of claims. Not measured.

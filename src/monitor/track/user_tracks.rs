@@ -4,9 +4,9 @@ use jiff::Timestamp;
 
 use super::association::Association;
 use super::user_track::UserTrack;
-use crate::claims::seconds;
 use crate::monitor::by_user::ByUser;
 use crate::monitor::input::claim_state::ActiveClaim;
+use crate::time::seconds;
 
 /// Probability that a beam in view is missed in a frame, at the worst. Assumed; the stories' beams are missed in 0.2 to 3 %.
 const MISS_PROBABILITY: f64 = 0.1;

@@ -6,7 +6,7 @@ use super::clock::{Clock, Relation};
 use super::frame::{Frame, Kind, Payload};
 use super::refusal::Refusal;
 use crate::geo::{self, LocalAxes};
-use crate::platform::place::{Geodetic, Origin, Place};
+use crate::platform::place::{Origin, Place, SeaLevelPlace};
 use crate::pose::{PoseSigmas, attitude_of, swap_ned_enu};
 
 /// A norm this far from 1 is no rounding of single precision: the message means something else.
@@ -59,7 +59,7 @@ pub struct Moment {
 #[derive(Clone, Copy, Debug)]
 struct Fix {
     time_ns: i64,
-    at: Geodetic,
+    at: SeaLevelPlace,
     velocity_ned: [f64; 3],
 }
 
@@ -71,7 +71,7 @@ pub struct Vehicle {
     pub clock: Clock,
     sigmas: PoseSigmas,
     odometry_ns: Option<i64>,
-    origin: Option<Geodetic>,
+    origin: Option<SeaLevelPlace>,
     fix: Option<Fix>,
     undulation_m: Option<f64>,
     /// Horizontal and vertical, m.
@@ -241,7 +241,7 @@ impl Vehicle {
     }
 
     /// Where the autopilot's local axes begin, by a position that it gives both ways.
-    fn derived_origin(&self, time_ns: i64, enu_m: [f64; 3]) -> Option<Geodetic> {
+    fn derived_origin(&self, time_ns: i64, enu_m: [f64; 3]) -> Option<SeaLevelPlace> {
         let place = self.carried(time_ns)?;
         let Origin::Passing(at) = place.origin else {
             return None;
@@ -252,7 +252,7 @@ impl Vehicle {
             height_m: at.sea_level_m,
         });
         let back = axes.to_geodetic([0, 1, 2].map(|k| place.enu_m[k] - enu_m[k]));
-        Some(Geodetic {
+        Some(SeaLevelPlace {
             latitude_deg: back.latitude_deg,
             longitude_deg: back.longitude_deg,
             sea_level_m: back.height_m,
@@ -287,9 +287,9 @@ fn attitude(q: [f64; 4]) -> Result<UnitQuaternion<f64>, Refusal> {
 }
 
 /// Latitude and longitude in 10⁻⁷ degrees and height in mm, as three integers. Zero and zero stand for "none yet".
-fn geodetic(p: &Payload, at: usize) -> Option<Geodetic> {
+fn geodetic(p: &Payload, at: usize) -> Option<SeaLevelPlace> {
     let [latitude, longitude, height] = [0, 4, 8].map(|k| f64::from(p.i32(at + k)));
-    let found = Geodetic {
+    let found = SeaLevelPlace {
         latitude_deg: latitude * 1e-7,
         longitude_deg: longitude * 1e-7,
         sea_level_m: height * 1e-3,

@@ -155,7 +155,7 @@ pub fn review(story: &PixelStory) -> Reviewed {
         pipeline.receive_poses(made.poses, made.frame.time);
         let step = pipeline.step(&made.frame);
         told.delays_s.push(match &step.placement {
-            Placement::At { pose, .. } => crate::claims::seconds(made.frame.time, pose.pose.time),
+            Placement::At { pose, .. } => crate::time::seconds(made.frame.time, pose.pose.time),
             _ => 0.0,
         });
         told.events.extend(step.report.events.iter().cloned());

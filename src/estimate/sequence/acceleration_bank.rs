@@ -47,13 +47,13 @@ impl Axis {
 
 /// A bank of filters, one for each density, weighed by how well they foretell where the emitter is (Magill, 1965).
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Restlessness {
+pub(crate) struct AccelerationBank {
     courses: [[Axis; 2]; DENSITIES_M2_S3.len()],
     weights: [f64; DENSITIES_M2_S3.len()],
     seen_s: Option<f64>,
 }
 
-impl Default for Restlessness {
+impl Default for AccelerationBank {
     fn default() -> Self {
         let mut weights = [0.0; DENSITIES_M2_S3.len()];
         weights[0] = 1.0;
@@ -65,7 +65,7 @@ impl Default for Restlessness {
     }
 }
 
-impl Restlessness {
+impl AccelerationBank {
     /// Takes where the frame at `time_s` alone shows the emitter, m, with the variance of each coordinate, m².
     pub fn see(&mut self, place_m: [f64; 2], variance_m2: [f64; 2], time_s: f64) {
         let Some(seen_s) = self.seen_s.replace(time_s) else {
@@ -117,21 +117,21 @@ mod tests {
     use rand_chacha::ChaCha8Rng;
     use rand_distr::{Distribution, StandardNormal};
 
-    use super::Restlessness;
+    use super::AccelerationBank;
 
     /// The density found for this course, measured with these standard deviations, ten times a second for a minute.
     fn found(course: fn(f64) -> f64, std_m: fn(f64) -> f64) -> f64 {
         let mut rng = ChaCha8Rng::seed_from_u64(3);
-        let mut restlessness = Restlessness::default();
+        let mut accelerations = AccelerationBank::default();
         for k in 0..600 {
             let t = 0.1 * f64::from(k);
             let place = [0, 1].map(|_| {
                 let noise: f64 = StandardNormal.sample(&mut rng);
                 course(t) + std_m(t) * noise
             });
-            restlessness.see(place, [std_m(t).powi(2); 2], t);
+            accelerations.see(place, [std_m(t).powi(2); 2], t);
         }
-        restlessness.density_m2_s3()
+        accelerations.density_m2_s3()
     }
 
     #[test]
@@ -148,15 +148,15 @@ mod tests {
     #[test]
     fn a_turn_that_is_known_is_no_acceleration() {
         let after = |is_known: bool| {
-            let mut restlessness = Restlessness::default();
+            let mut accelerations = AccelerationBank::default();
             for k in 0..400 {
                 let t = 0.1 * f64::from(k);
                 if k == 200 && is_known {
-                    restlessness.turn();
+                    accelerations.turn();
                 }
-                restlessness.see([(t - 20.0).abs(), 0.0], [0.01; 2], t);
+                accelerations.see([(t - 20.0).abs(), 0.0], [0.01; 2], t);
             }
-            restlessness.density_m2_s3()
+            accelerations.density_m2_s3()
         };
         let (known, unknown) = (after(true), after(false));
         assert!(known < 0.1 * unknown, "{known} {unknown}");
