@@ -10,7 +10,8 @@ use crate::time::seconds;
 
 /// Claims kept per user, the newest included. Sixteen reach back sixteen seconds at 1 Hz, further than a beam's trail (6 s).
 pub(super) const HISTORY: usize = 16;
-/// Newest active claims that the pace is taken over. More average the errors of claims, fewer follow a user who sets off. Not measured.
+/// Newest active claims that the pace is taken over. More remember for longer that a user who stands drives, fewer forget sooner who has driven.
+/// Not measured.
 const PACE_CLAIMS: usize = 6;
 
 /// A user's claims by rising time. The name is stored with the newest only: a name may be a kilobyte long.
@@ -43,7 +44,7 @@ pub struct Standing<'a> {
     pub claim: &'a Claim,
     /// When the newest claim came in (the claim itself carries when it was made).
     pub came: Timestamp,
-    /// Claimed displacement per second over the history, m/s; 0 for a first claim.
+    /// The fastest way from one of the newest claims to the next, less what their own errors make, m/s; 0 for a first claim.
     pub pace_m_s: f64,
     /// Seconds between the last two claims.
     pub period_s: Option<f64>,
@@ -103,12 +104,13 @@ impl History {
 
     fn pace_m_s(&self) -> f64 {
         let is_active = |made: &Made| made.state == ClaimState::Active;
-        let mut recent = self.newest_first().filter(is_active).take(PACE_CLAIMS);
-        let (last, first) = (recent.next(), recent.last());
-        match (first, last) {
-            (Some(a), Some(b)) => (b.x_m - a.x_m).hypot(b.y_m - a.y_m) / seconds(a.time, b.time).max(0.05),
-            _ => 0.0,
-        }
+        let recent = || self.newest_first().filter(is_active).take(PACE_CLAIMS);
+        let legs = recent().zip(recent().skip(1)).map(|(b, a)| {
+            let by_error_m = a.sigma_m.unwrap_or(0.0) + b.sigma_m.unwrap_or(0.0);
+            let way_m = (b.x_m - a.x_m).hypot(b.y_m - a.y_m) - by_error_m;
+            way_m / seconds(a.time, b.time).max(0.05)
+        });
+        legs.fold(0.0, f64::max)
     }
 
     /// On the line between the two claims around `time`, else the nearest claim's place.
@@ -222,6 +224,24 @@ mod tests {
         assert_eq!(history.place(claim(40, 1.0), at(40)), Outcome::Conflicting);
         let standing = history.standing();
         assert_eq!((standing.pace_m_s, standing.period_s), (2.0, Some(2.0)));
+    }
+
+    #[test]
+    fn a_car_that_has_stopped_or_come_back_has_the_pace_of_its_fastest_leg() {
+        let mut history = History::new(claim(0, 0.0), at(0));
+        for (s, x_m) in [(3, 30.0), (6, 30.0), (9, 0.0)] {
+            history.place(claim(s, x_m), at(s));
+        }
+        assert_eq!(history.standing().pace_m_s, 10.0);
+        let unsure = |s: i64, x_m: f64| Claim {
+            sigma_m: Some(2.0),
+            ..claim(s, x_m)
+        };
+        let mut history = History::new(unsure(0, 0.0), at(0));
+        for s in 1..6 {
+            history.place(unsure(s, if s % 2 == 0 { 0.0 } else { 4.0 }), at(s));
+        }
+        assert_eq!(history.standing().pace_m_s, 0.0);
     }
 
     #[test]
