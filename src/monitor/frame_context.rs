@@ -286,8 +286,9 @@ impl FrameContext {
     pub fn update_bias(&mut self, dt: f64, period_s: f64) {
         if let Some(sight) = &self.view.sight {
             let residuals = residuals(&self.claims, &self.tracker, &self.view, self.bias.error());
-            self.bias.update(&residuals, sight.cov(), dt, period_s);
             let is_fresh = self.pose_age_s < FRESH_S;
+            let prior = is_fresh.then(|| sight.cov());
+            self.bias.update(&residuals, prior, dt, period_s);
             let shared = self.bias.shared_offset(&residuals).filter(|_| is_fresh);
             self.wander.update(shared, dt, period_s);
         }

@@ -20,6 +20,8 @@ const LEAST: [f64; 2] = [1e-12, 1e-8];
 /// The lasting error of the pose, about north, east, down (rad), then east, north, up (m).
 #[derive(Clone, Debug, Default)]
 pub struct PoseBias {
+    /// Covariance that the newest fresh pose stated.
+    prior: Option<Matrix6<f64>>,
     information: Matrix6<f64>,
     /// The same with the squares of the weights: how much the weighted sums scatter.
     scatter: Matrix6<f64>,
@@ -53,8 +55,12 @@ impl PoseBias {
     }
 
     /// Takes one frame's residuals, `dt` seconds after the last one's; each user claims every `period_s`. `prior` is the
-    /// covariance of the pose.
-    pub fn update(&mut self, residuals: &[Residual], prior: &Matrix6<f64>, dt: f64, period_s: f64) {
+    /// covariance of the pose where that is fresh: what lasts does not grow with a pose's age.
+    pub fn update(&mut self, residuals: &[Residual], prior: Option<&Matrix6<f64>>, dt: f64, period_s: f64) {
+        self.prior = prior.copied().or(self.prior);
+        let Some(prior) = self.prior else {
+            return;
+        };
         let [turn, shift] = LEAST;
         let prior = prior + Matrix6::from_diagonal(&[turn, turn, turn, shift, shift, shift].into());
         let Some(prior_information) = prior.cholesky().map(|c| c.inverse()) else {
@@ -69,7 +75,10 @@ impl PoseBias {
         let is_outside = |r: &&Residual| !(self.distance2(r) < OUTSIDE * OUTSIDE);
         if 2 * residuals.iter().filter(is_outside).count() > residuals.len() {
             // Most users are elsewhere: what was learned is of another pose.
-            *self = Self::default();
+            *self = Self {
+                prior: self.prior,
+                ..Self::default()
+            };
             self.solve(&prior_information, &prior);
         }
         for r in residuals {
@@ -153,7 +162,7 @@ mod tests {
         };
         let residuals: Vec<_> = USERS[..users].iter().enumerate().map(residual).collect();
         let mut bias = PoseBias::default();
-        (0..600).for_each(|_| bias.update(&residuals, &prior.cov(), 0.1, 1.0));
+        (0..600).for_each(|_| bias.update(&residuals, Some(&prior.cov()), 0.1, 1.0));
         bias
     }
 
@@ -191,7 +200,7 @@ mod tests {
                     variance: 0.09,
                     by_pose,
                 });
-                (0..10).for_each(|_| bias.update(&residuals, &prior.cov(), 0.1, 1.0));
+                (0..10).for_each(|_| bias.update(&residuals, Some(&prior.cov()), 0.1, 1.0));
             }
             for h in by_pose {
                 let off = h * (error - bias.error());
