@@ -43,6 +43,11 @@ impl Eligibility<'_> {
         if claim.before.track != Some(track.id) && claim.age_s > self.freshness_s(claim) {
             return false;
         }
+        let is_anothers = owner.is_some_and(|o| o.claim.user != claim.claim.user);
+        if claim.before.track != Some(track.id) && !claim.expected && (is_anothers || !self.may_have_come(claim, track))
+        {
+            return false;
+        }
         // Who claims to be where a known light is must bring a beam of their own.
         if self.of_lights.contains(&track.id) {
             return false;
@@ -50,7 +55,6 @@ impl Eligibility<'_> {
         if claim.before.is_established() {
             return true;
         }
-        let is_anothers = owner.is_some_and(|o| o.claim.user != claim.claim.user);
         if !self.crowding.is_crowded() {
             return claim.before.was_seen()
                 || !(self.has_walked_onto(claim, track) || (is_anothers && self.is_handed_on(claim, owner)));
@@ -59,6 +63,13 @@ impl Eligibility<'_> {
         let beam = track.at(claim.made).unwrap_or(track.filter.position());
         let is_alerted = self.alerts.is_open(&Cause::Track(track.id));
         !is_alerted && !is_anothers && (beam - claim.position).norm() <= self.crowding.reach_m()
+    }
+
+    /// Whether who may be out of view can be where the beam is.
+    fn may_have_come(&self, claim: &ActiveClaim, track: &Track) -> bool {
+        let sigmas_m = 3.0 * (claim.variance.sqrt() + claim.pose_variance.sqrt());
+        let reach_m = self.config.tolerated_distance_m + claim.slack_m + sigmas_m;
+        (track.filter.position() - claim.position).norm() <= reach_m
     }
 
     /// Age up to which a claim may be associated with a beam that was not its user's before, s: the longer a user is silent, the
@@ -138,6 +149,18 @@ mod tests {
     fn among_few_names_any_claim_may_be_a_beams() {
         let mut scene = scene();
         let claim = newcomer(&mut scene, 44.0);
+        assert!(allows(&scene, &claim, false));
+    }
+
+    #[test]
+    fn who_claims_to_be_out_of_view_can_have_come_only_so_far() {
+        let mut scene = scene();
+        let mut claim = newcomer(&mut scene, STRANGER[0] + 12.0);
+        claim.before = scene.claims[0].before;
+        assert!(claim.before.is_established() && allows(&scene, &claim, false));
+        claim.expected = false;
+        assert!(!allows(&scene, &claim, false));
+        claim.slack_m = 7.0;
         assert!(allows(&scene, &claim, false));
     }
 
