@@ -13,6 +13,7 @@ mod patch;
 mod pixel_maps;
 mod prepare;
 mod pupil;
+mod slope;
 mod solve;
 mod statistics;
 mod template_model;
