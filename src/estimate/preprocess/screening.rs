@@ -39,6 +39,9 @@ pub(crate) struct FlaggedPixel {
     pub is_foreign: bool,
 }
 
+/// Share of pixels at the lowest value from which on it is cut off there: of counts up to six times as coarse as the noise a fortieth at most is.
+const CLIPPED: f64 = 0.1;
+
 impl PreprocessedFrame {
     /// Checks and normalises a frame.
     pub fn load(&mut self, frame: &Frame, camera: &Camera) -> Result<(), Error> {
@@ -101,6 +104,14 @@ impl PreprocessedFrame {
         self.saturated as f64 / self.pixels.len() as f64
     }
 
+    /// Whether the camera cuts off what is darker than its black level: half of the noise then lies on the frame's lowest value.
+    pub fn is_clipped(&self) -> bool {
+        let usable = || self.pixels.iter().zip(&self.is_masked).filter(|(_, bad)| !**bad);
+        let lowest = usable().fold(f64::INFINITY, |lowest, (p, _)| lowest.min(*p));
+        let at_lowest = usable().filter(|(p, _)| **p == lowest).count();
+        at_lowest as f64 > CLIPPED * self.pixels.len() as f64
+    }
+
     /// Masks one more pixel; the caller fills it.
     pub fn mask(&mut self, x: usize, y: usize, nx: usize) {
         if !std::mem::replace(&mut self.is_masked[y * nx + x], true) {
@@ -150,5 +161,30 @@ impl PreprocessedFrame {
                 radius *= 2;
             };
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::SeedableRng;
+    use rand_chacha::ChaCha8Rng;
+    use rand_distr::{Distribution, StandardNormal};
+
+    use super::*;
+
+    #[test]
+    fn counts_that_are_cut_off_at_the_black_level_are_told_from_coarse_ones() {
+        let frame = |step: f64, least: f64| {
+            let mut rng = ChaCha8Rng::seed_from_u64(3);
+            let mut noise = || -> f64 { StandardNormal.sample(&mut rng) };
+            let pixels: Vec<f64> = (0..4096).map(|_| (noise() / step).round().max(least) * step).collect();
+            PreprocessedFrame {
+                is_masked: vec![false; pixels.len()],
+                pixels,
+                ..PreprocessedFrame::default()
+            }
+        };
+        assert!(!frame(1e-9, f64::NEG_INFINITY).is_clipped() && !frame(0.5, f64::NEG_INFINITY).is_clipped());
+        assert!(frame(0.25, 0.0).is_clipped() && frame(0.25, -4.0).is_clipped());
     }
 }

@@ -141,8 +141,8 @@ impl SequenceEstimator {
     /// remembered stays as it is.
     fn take(&mut self, time_s: f64, elapsed: f64, scale: f64, is_over: &dyn Fn() -> bool) -> Option<Estimate> {
         let mut budget = WorkBudget::new(is_over);
-        let compressed = self.single.loaded().1;
-        let is_even = compressed.variance.is_constant() && compressed.unevenness == 0.0;
+        let (_, compressed, frame) = self.single.loaded();
+        let is_even = compressed.variance.is_constant() && compressed.unevenness == 0.0 && !frame.is_clipped();
         let is_told = self.outlook.is_none() || self.window.present(time_s).len() > EXPLAINED_BY_POSE;
         if is_even && is_told && self.window.len() > 0 {
             let known = self.window.total.clone();
