@@ -1,8 +1,7 @@
 //! oapwatch: the real-time monitor of a UAV-mounted optical access point.
 //!
-//! Data flows one way: frame → heatmap → peaks → emitters → ground positions → matches → tracks →
-//! verdicts → alerts → journal → API and webhooks. The modules are that chain, and imports go down only;
-//! ARCHITECTURE.md has the map.
+//! Data flows one way, from a frame over emitters, tracks and verdicts to alerts, the journal, the API and webhooks. Imports go
+//! down only; ARCHITECTURE.md has the map.
 // frames/v4l2/sys alone allows it, for ioctls and mapped memory, with the reason at each place.
 #![deny(unsafe_code)]
 // No clock is read but where an exception says why.

@@ -2,8 +2,8 @@
 //! independent judge) and never claims (an attacker writes those).
 //!
 //! The folders are the steps of a frame's way: `preprocess` masks pixels and measures the noise, `model` predicts a frame from a
-//! hypothesis, `detect` finds starting points, `fit` is Levenberg–Marquardt, `uncertainty` is what a fit is worth, `model_order`
-//! chooses the number of emitters, and `estimators` composes them.
+//! hypothesis, `detect` finds starting points, `fit` is Levenberg–Marquardt, `model_order` chooses the number of emitters,
+//! `uncertainty` is what a fit is worth, `estimators` composes them, and `sequence` remembers the frames before.
 
 mod config;
 mod dense_linalg;

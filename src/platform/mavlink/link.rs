@@ -16,7 +16,7 @@ use crate::pose::PoseSigmas;
 /// Longest wait for bytes, so that what is due is sent in time.
 const WAIT: Duration = Duration::from_millis(20);
 /// What is read within a slot, at most: reads, and bytes. An autopilot sends some hundred messages a second, 30 kB; this allows
-/// 25,000 and 1.6 MB, and keeps a flood below a fifth of a core (`a_flood_costs_little_and_stops_nothing`).
+/// 25,600 and 1.6 MB, and keeps a flood below a fifth of a core (`a_flood_costs_little_and_stops_nothing`).
 const SLOT: Duration = Duration::from_millis(10);
 const MOST_READS: usize = 256;
 const MOST_BYTES: usize = 16_384;
