@@ -318,8 +318,8 @@ mod tests {
         let active = active(&[(10, 0.0), (12, 4.0)], ClaimState::Active, 15, 0.0, false);
         let claim = &active[0];
         assert_eq!((claim.age_s, claim.variance, claim.period_s), (3.0, 25.0, Some(2.0)));
-        // A walk of 3 m/s on top of the 2 m/s that were claimed.
-        assert_eq!(claim.slack_m, 15.0);
+        // A walk of 3 m/s: claims that may be off by a kilometre show no pace.
+        assert_eq!(claim.slack_m, 9.0);
     }
 
     #[test]
