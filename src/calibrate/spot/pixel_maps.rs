@@ -8,6 +8,7 @@ use super::learn::{Learner, Odd};
 use super::patch::Patch;
 use crate::calibrate::maps::{self, Pixels};
 use crate::optics::PixelMaps;
+use crate::stats::median;
 
 /// Pixel maps that a recording leads to.
 pub struct Found {
@@ -31,6 +32,7 @@ pub fn estimate(
     let ideal = PixelMaps::ideal(shape);
     let own = learner.camera.pixels.as_deref().unwrap_or(&ideal);
     let frames = expected(learner, odd);
+    let unknown = unknown(learner, &frames);
     let from = |frames: Vec<Pixels>| maps::estimate_from(shape, learner.noise_j, frames.into_iter());
     let indexed = frames.iter().enumerate();
     let others = indexed.filter(|(k, _)| !is_held(*k)).map(|(_, f)| f.clone()).collect();
@@ -41,6 +43,12 @@ pub fn estimate(
         };
     };
     let nx = learner.camera.x.n;
+    for (p, light) in &unknown {
+        let is_neighbour = |q: &usize| (q % nx).abs_diff(p % nx) <= 2 && (q / nx).abs_diff(p / nx) <= 2;
+        let lights = unknown.iter().filter(|(q, _)| is_neighbour(q)).map(|(_, light)| *light);
+        let most = lights.fold(OUTLIER * learner.noise_j, f64::max);
+        found.bad[(p / nx, p % nx)] = *light > HALF * most;
+    }
     hot.iter().for_each(|p| found.bad[(p / nx, p % nx)] = true);
     found.bad.zip_mut_with(&own.bad, |new, old| *new |= *old);
 
@@ -73,6 +81,16 @@ pub fn estimate(
         maps: (found != ideal).then_some(found),
         are_better,
     }
+}
+
+/// Pixels around what is odd in every frame, such as two hot ones that are taken for a spot, and their median light, J: of most nothing is
+/// known, the brightest are the reason.
+fn unknown(learner: &Learner, frames: &[Pixels]) -> Vec<(usize, f64)> {
+    let pixels = 0..frames.first().map_or(0, |f| f.used.len());
+    let usable = |p: usize| learner.images.iter().filter(move |i| i.weight[p] > 0.0);
+    let light = |p: usize| median(usable(p).map(|i| i.pixels[p] - i.level).collect());
+    let is_unknown = |p: &usize| !frames.iter().any(|f| f.used[*p]);
+    pixels.filter(is_unknown).filter_map(|p| Some((p, light(p)?))).collect()
 }
 
 /// What each frame would be if all pixels were alike; pixels around odd spots are not used.
@@ -111,6 +129,8 @@ fn expected<'a>(learner: &'a Learner, odd: &[Odd]) -> Vec<Pixels<'a>> {
 const OUTLIER: f64 = 6.0;
 const OUTLIER_SHARE: f64 = 0.1;
 const FEW: f64 = 0.1;
+/// Share of the light of the brightest neighbour from which on a pixel that nothing is known of is bad too.
+const HALF: f64 = 0.5;
 
 fn leave_out_flashes(learner: &Learner, frames: &mut [Pixels]) {
     for p in 0..frames.first().map_or(0, |f| f.used.len()) {
