@@ -193,11 +193,9 @@ impl AlertLifecycle {
                 // Who was sent it is sent what follows.
                 let before = alert.webhooks.take();
                 content.webhooks = before.zip(content.webhooks).map(|(mut names, more)| {
-                    names.extend(
-                        more.into_iter()
-                            .filter(|name| !names.contains(name))
-                            .collect::<Vec<_>>(),
-                    );
+                    names.extend(more);
+                    names.sort_unstable();
+                    names.dedup();
                     names
                 });
             }
