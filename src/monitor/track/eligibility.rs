@@ -44,8 +44,7 @@ impl Eligibility<'_> {
             return false;
         }
         let is_anothers = owner.is_some_and(|o| o.claim.user != claim.claim.user);
-        if claim.before.track != Some(track.id) && !claim.expected && (is_anothers || !self.may_have_come(claim, track))
-        {
+        if claim.before.track != Some(track.id) && !claim.expected && !self.may_have_come(claim, track, owner) {
             return false;
         }
         // Who claims to be where a known light is must bring a beam of their own.
@@ -65,11 +64,12 @@ impl Eligibility<'_> {
         !is_alerted && !is_anothers && (beam - claim.position).norm() <= self.crowding.reach_m()
     }
 
-    /// Whether who may be out of view can be where the beam is.
-    fn may_have_come(&self, claim: &ActiveClaim, track: &Track) -> bool {
+    /// Whether who may be out of view can be where the beam is, nearer to it than whose it was.
+    fn may_have_come(&self, claim: &ActiveClaim, track: &Track, owner: Option<&ActiveClaim>) -> bool {
+        let away_m = |from: &ActiveClaim| (track.filter.position() - from.position).norm();
         let sigmas_m = 3.0 * (claim.variance.sqrt() + claim.pose_variance.sqrt());
         let reach_m = self.config.tolerated_distance_m + claim.slack_m + sigmas_m;
-        (track.filter.position() - claim.position).norm() <= reach_m
+        away_m(claim) <= owner.map_or(reach_m, |owner| reach_m.min(away_m(owner)))
     }
 
     /// Age up to which a claim may be associated with a beam that was not its user's before, s: the longer a user is silent, the
