@@ -39,7 +39,8 @@ pub(crate) struct FlaggedPixel {
     pub is_foreign: bool,
 }
 
-/// Share of pixels at the lowest value from which on it is cut off there: of counts up to six times as coarse as the noise a fortieth at most is.
+/// Share of pixels at the lowest value from which on it is cut off there: of counts up to six times as coarse as the noise a fortieth
+/// at most is.
 const CLIPPED: f64 = 0.1;
 
 impl PreprocessedFrame {
