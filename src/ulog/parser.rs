@@ -215,3 +215,18 @@ fn local(data: &Data, time_us: u64) -> Place {
         sigma_m: [data.get("eph"), data.get("epv")],
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn nested_formats_without_a_field_are_refused_at_once() {
+        let mut parser = Parser::default();
+        for format in ["vehicle_attitude:b[65535] x;", "b:c[65535] y;", "c:"] {
+            parser.message(b'F', format.as_bytes()).unwrap();
+        }
+        let refused = parser.message(b'A', b"\0\x01\0vehicle_attitude").unwrap_err();
+        assert_eq!(refused, "format c: no fields");
+    }
+}

@@ -175,6 +175,26 @@ mod tests {
     }
 
     #[test]
+    fn what_lasts_keeps_the_covariance_of_the_last_fresh_pose() {
+        let error = Vector6::new(0.003, -0.002, 0.02, 0.5, -0.4, 0.3);
+        let mut old = found(6, 0, &error);
+        let before = *old.cov();
+        // Without claims only the prior is left.
+        (0..3000).for_each(|_| old.update(&[], None, 0.1, 1.0));
+        let stated = PoseSigmas {
+            attitude_rad: 0.02,
+            position_m: 1.0,
+        };
+        for k in 0..6 {
+            let ratio = old.cov()[(k, k)] / stated.cov()[(k, k)];
+            assert!(
+                (0.99..1.01).contains(&ratio) && before[(k, k)] < old.cov()[(k, k)],
+                "{k}: {ratio}"
+            );
+        }
+    }
+
+    #[test]
     fn the_covariance_is_what_claims_scatter_by() {
         let pose = Pose::level(Timestamp::UNIX_EPOCH, [5.0, -8.0, 300.0]);
         let sight = Sight::new(&pose, &Mount::default());
