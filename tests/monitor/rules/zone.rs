@@ -143,25 +143,30 @@ fn a_watched_zone_has_its_own_tolerance_severity_and_webhooks() {
     }
 }
 
-#[test]
-fn maintenance_keeps_alerts_from_the_webhooks_until_it_ends() {
-    let mut actors = crowd();
-    actors.push(Actor::intruder(|t| (t < 12.0).then_some([30.0, 5.0])));
-    actors.push(Actor::intruder(|t| (t >= 8.0).then_some([60.0, 5.0])));
-    let mut story = Story::new(4, actors);
-    story.operator = Box::new(|t, monitor, _| {
-        if t == 0.0 {
+/// A maintenance window that is set when it begins, s.
+fn maintained(from: f64, until: f64) -> impl Fn(f64, &mut Monitor, &[AlertEvent]) + 'static {
+    move |t, monitor, _| {
+        if t == from {
             let window = Window {
                 id: "mast".into(),
-                from: at(0.0),
-                until: at(20.0),
+                from: at(from),
+                until: at(until),
                 by: "K. Novak".into(),
                 note: None,
                 is_fixed: false,
             };
             monitor.add_maintenance(window).unwrap();
         }
-    });
+    }
+}
+
+#[test]
+fn maintenance_keeps_alerts_from_the_webhooks_until_it_ends() {
+    let mut actors = crowd();
+    actors.push(Actor::intruder(|t| (t < 12.0).then_some([30.0, 5.0])));
+    actors.push(Actor::intruder(|t| (t >= 8.0).then_some([60.0, 5.0])));
+    let mut story = Story::new(4, actors);
+    story.operator = Box::new(maintained(0.0, 20.0));
     let told = tell(&story);
     let second = &told.events.last().unwrap().alert;
     for event in &told.events {
@@ -180,19 +185,7 @@ fn an_alert_that_was_sent_is_cleared_during_maintenance_as_well() {
     let mut actors = crowd();
     actors.push(Actor::intruder(|t| (t < 12.0).then_some([30.0, 5.0])));
     let mut story = Story::new(4, actors);
-    story.operator = Box::new(|t, monitor, _| {
-        if t == 8.0 {
-            let window = Window {
-                id: "mast".into(),
-                from: at(8.0),
-                until: at(60.0),
-                by: "K. Novak".into(),
-                note: None,
-                is_fixed: false,
-            };
-            monitor.add_maintenance(window).unwrap();
-        }
-    });
+    story.operator = Box::new(maintained(8.0, 60.0));
     let told = tell(&story);
     assert_eq!((told.raised().len(), told.cleared().len()), (1, 1));
     let cleared = &told.events.last().unwrap().alert;
