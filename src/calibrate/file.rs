@@ -68,6 +68,7 @@ struct Spot {
 #[serde(deny_unknown_fields)]
 struct Noise {
     std_j: f64,
+    quantum_j: Option<f64>,
 }
 
 #[derive(Deserialize)]
@@ -107,6 +108,7 @@ pub fn read(path: &Path) -> Result<Calibration, Error> {
         spot_shape: shape.map(Arc::new),
         spot_error: layout.spot.error,
         noise_std_j: layout.noise.std_j,
+        quantum_j: layout.noise.quantum_j,
         pixels: pixels.map(Arc::new),
     })
 }
@@ -172,6 +174,12 @@ pub fn render(calibration: &Calibration, remarks: &[String]) -> String {
         );
     }
     let _ = write!(out, "\n[noise]\nstd_j = {:e}\n", calibration.noise_std_j);
+    if let Some(quantum) = calibration.quantum_j {
+        let _ = write!(
+            out,
+            "# Growth of a pixel's variance with a spot's light: shot noise.\nquantum_j = {quantum:e}\n"
+        );
+    }
     if let Some(shape) = &calibration.spot_shape {
         let _ = write!(
             out,
@@ -291,6 +299,7 @@ mod tests {
             spot_shape: Some(Arc::new(shape())),
             spot_error: Some(0.004),
             noise_std_j: 1.02e-6,
+            quantum_j: Some(4.8e-8),
             pixels: Some(Arc::new(maps)),
         }
     }

@@ -22,6 +22,8 @@ pub struct Calibration {
     /// Measured share of a spot's light by which it differs from its model.
     pub spot_error: Option<f64>,
     pub noise_std_j: f64,
+    /// Growth of the variance with the light, J.
+    pub quantum_j: Option<f64>,
     pub pixels: Option<Arc<PixelMaps>>,
 }
 
@@ -35,6 +37,7 @@ impl Calibration {
             spot_shape: camera.spot_shape.clone(),
             spot_error: Some(camera.spot_error.least()).filter(|share| *share > 0.0),
             noise_std_j: camera.noise_std_j,
+            quantum_j: camera.quantum_j,
             pixels: camera.pixels.clone(),
         }
     }
@@ -59,6 +62,7 @@ impl Calibration {
             spot_shape,
             spot_error,
             noise_std_j: self.noise_std_j,
+            quantum_j: self.quantum_j,
             pixels: self.pixels.clone(),
             ..camera.clone()
         })
@@ -98,6 +102,8 @@ impl Calibration {
             self.noise_std_j,
             self.noise_std_j > 0.0,
         )?;
+        let quantum = self.quantum_j.unwrap_or_default();
+        within("quantum_j", "a positive number", quantum, quantum >= 0.0)?;
         // Emitters are also fitted a little outside the sensor; how the lens bends far out there is a guess anyway.
         let corner = |k: usize| {
             let half = [camera.x.half_width(), camera.y.half_width()][k];

@@ -58,6 +58,8 @@ pub struct Camera {
     pub spot_error: SpotError,
     /// Standard deviation of the additive noise of one pixel.
     pub noise_std_j: f64,
+    /// Growth of that noise's variance with a spot's light, J²/J, where a calibration measured it: the light's quantum q of shot noise.
+    pub quantum_j: Option<f64>,
     pub joules_per_count: Option<f64>,
     pub saturation_j: Option<f64>,
     /// The lens's departure from a pinhole.
@@ -94,6 +96,11 @@ impl Camera {
     /// A pixel at or above this, J, is saturated; infinite where no level is known.
     pub fn saturation_limit_j(&self) -> f64 {
         self.saturation_j.unwrap_or(f64::INFINITY)
+    }
+
+    /// Growth of the noise's variance with the light, both in units of the noise.
+    pub fn quantum(&self) -> Option<f64> {
+        Some(self.quantum_j? / self.noise_std_j)
     }
 
     /// Ground metres per sensor metre near the optical axis, h_u/z.

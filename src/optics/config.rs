@@ -193,6 +193,7 @@ impl Config {
             y: axis(1)?,
             spot_sigma_m,
             noise_std_j: positive("noise_std_j", self.noise_std_j)?,
+            quantum_j: None,
             joules_per_count: self.joules_per_count,
             saturation_j: self.saturation_j,
             spot_growth: 0.0,

@@ -126,6 +126,7 @@ impl Plan {
             spot_shape: None,
             spot_error: None,
             noise_std_j: self.detector.noise_std_j().unwrap_or(lens.noise_std_j),
+            quantum_j: None,
             pixels: self.detector.maps(lens.shape()).map(Arc::new),
         }
     }

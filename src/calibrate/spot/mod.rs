@@ -263,6 +263,7 @@ pub fn learn(
         },
         spot_error: Some(spot_error),
         noise_std_j: variance.read_noise_j,
+        quantum_j: variance.gain_j,
         pixels: maps.clone().map(Arc::new),
         ..Calibration::of(camera)
     };

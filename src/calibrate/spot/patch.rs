@@ -302,6 +302,20 @@ impl Linearised {
             .for_each(|(v, w)| *v -= background * w);
     }
 
+    /// The weighted Jacobian J by places, energies and background, and (JᵀJ)⁻¹Jᵀ.
+    pub fn jacobian_and_inverse(&self, patch: &Patch) -> (Mat<f64>, Mat<f64>) {
+        let columns = PER_SOURCE * self.own.len() + 1;
+        let mut jacobian = Mat::<f64>::zeros(patch.pixels(), columns);
+        for (i, (own, bands)) in self.own.iter().zip(&self.bands).enumerate() {
+            for (k, column) in own.iter().enumerate() {
+                patch.place(bands, column, 1.0, jacobian.col_as_slice_mut(PER_SOURCE * i + k));
+            }
+        }
+        jacobian.col_as_slice_mut(columns - 1).copy_from_slice(&self.weight);
+        let inverse = self.solver.solve_many(&jacobian.transpose().to_owned());
+        (jacobian, inverse)
+    }
+
     /// Weighted change of the pixels when the template's coefficients change.
     pub fn template_change(
         &self,

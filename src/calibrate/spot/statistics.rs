@@ -27,15 +27,17 @@ pub struct Variance {
     pub spot_error: f64,
 }
 
+/// A squared residual, and what of each cause a fit leaves in it.
 struct Pixel {
     squared: f64,
+    read: f64,
     light: f64,
     halo2: f64,
     /// Of the nearest spot, σ.
     distance: f64,
 }
 
-/// Regresses r² = σ² + g·E + (s·H)², H = E·‖spot‖/(1 + (d/3σ)²) over the pixels in use.
+/// Regresses r² = σ² + g·E + (s·H)², H = E·‖spot‖/(1 + (d/3σ)²) over the pixels in use, each less what the spots' own parameters absorb.
 pub fn variance(learner: &Learner) -> Variance {
     let pixels = pixels(learner);
     let noise2 = learner.noise_j.powi(2);
@@ -51,7 +53,7 @@ pub fn variance(learner: &Learner) -> Variance {
         let mut h = Mat::<f64>::zeros(3, 3);
         let mut g = vec![0.0; 3];
         for p in &pixels {
-            let row = [1.0, p.light / scale[1], p.halo2 / scale[2]];
+            let row = [p.read, p.light / scale[1], p.halo2 / scale[2]];
             let expected = row.iter().zip(&now).map(|(a, b)| a * b).sum::<f64>().max(0.2 * now[0]);
             let squared = p.squared / noise2;
             if squared > OUTLIER * OUTLIER * expected {
@@ -89,7 +91,7 @@ fn spot_error(pixels: &[Pixel], read2: f64, gain: f64) -> f64 {
     let rings = RINGS.windows(2).map(|ring| {
         let (mut excess, mut halo2, mut var) = (0.0, 0.0, 0.0);
         for p in pixels.iter().filter(|p| (ring[0]..ring[1]).contains(&p.distance)) {
-            let noise2 = read2 + gain * p.light.max(0.0);
+            let noise2 = p.read * read2 + gain * p.light;
             if p.squared > OUTLIER * OUTLIER * (noise2 + (LARGEST_ERROR * LARGEST_ERROR) * p.halo2) {
                 continue;
             }
@@ -113,25 +115,56 @@ fn pixels(learner: &Learner) -> Vec<Pixel> {
     let norm = norm(camera, &learner.model);
     let mut out = Vec::new();
     for patch in &learner.patches {
+        let Some(linearised) = patch.linearise(camera, &learner.model) else {
+            continue;
+        };
         let expected = patch.expected(camera, &learner.model);
-        for (k, e) in expected.iter().enumerate().filter(|(k, _)| patch.weight[*k] > 0.0) {
-            let x = camera.x.centre(patch.x.start + k % patch.x.len());
-            let y = camera.y.centre(patch.y.start + k / patch.x.len());
-            let (mut halo, mut nearest) = (0.0, f64::INFINITY);
-            for s in &patch.sources {
-                let d = (s.at[0] - x).hypot(s.at[1] - y) / sigma;
-                halo += s.energy_j * norm / (1.0 + (d / HALO).powi(2));
-                nearest = nearest.min(d);
-            }
+        let (causes, distances): (Vec<[f64; 3]>, Vec<f64>) = (expected.iter().enumerate())
+            .map(|(k, e)| {
+                let x = camera.x.centre(patch.x.start + k % patch.x.len());
+                let y = camera.y.centre(patch.y.start + k / patch.x.len());
+                let (mut halo, mut nearest) = (0.0, f64::INFINITY);
+                for s in &patch.sources {
+                    let d = (s.at[0] - x).hypot(s.at[1] - y) / sigma;
+                    halo += s.energy_j * norm / (1.0 + (d / HALO).powi(2));
+                    nearest = nearest.min(d);
+                }
+                ([1.0, (e - patch.background).max(0.0), halo * halo], nearest)
+            })
+            .unzip();
+        let left = residual_squares(linearised.jacobian_and_inverse(patch), &causes);
+        for (k, [read, light, halo2]) in left.into_iter().enumerate().filter(|(k, _)| patch.weight[*k] > 0.0) {
             out.push(Pixel {
-                squared: (patch.data[k] - e).powi(2),
-                light: e - patch.background,
-                halo2: halo * halo,
-                distance: nearest,
+                squared: (patch.data[k] - expected[k]).powi(2),
+                read,
+                light,
+                halo2,
+                distance: distances[k],
             });
         }
     }
     out
+}
+
+/// Expected squares of the residuals of a fit of this Jacobian and its inverse where the data's independent errors have each of `variances`: the
+/// diagonal of M·diag(v)·M, M = I − H (Hartley, Rao and Kiefer, 1969).
+fn residual_squares<const N: usize>(
+    (jacobian, inverse): (Mat<f64>, Mat<f64>),
+    variances: &[[f64; N]],
+) -> Vec<[f64; N]> {
+    let shares: [Mat<f64>; N] = std::array::from_fn(|n| {
+        let weighted = |k: usize, c: usize| jacobian[(k, c)] * variances[k][n];
+        let inner = jacobian.transpose() * Mat::from_fn(jacobian.nrows(), jacobian.ncols(), weighted);
+        inner * &inverse
+    });
+    let column_product =
+        |a: &Mat<f64>, b: &Mat<f64>, k: usize| (0..a.nrows()).map(|c| a[(c, k)] * b[(c, k)]).sum::<f64>();
+    let transposed = jacobian.transpose().to_owned();
+    let of = |k: usize| {
+        let leverage = column_product(&inverse, &transposed, k);
+        std::array::from_fn(|n| variances[k][n] * (1.0 - 2.0 * leverage) + column_product(&inverse, &shares[n], k))
+    };
+    (0..jacobian.nrows()).map(of).collect()
 }
 
 /// Half-width of [`mean_residual`], σ.

@@ -82,7 +82,7 @@ impl AnalyticEstimator {
     /// Validates and compresses a frame; returns the measured noise in units of the configured noise.
     pub fn load(&mut self, frame: &Frame) -> Result<f64, Error> {
         self.search.frame.load(frame, &self.camera)?;
-        Ok(self.search.inspect())
+        Ok(self.search.inspect(self.camera.quantum()))
     }
 
     /// Says where the next window is: its middle on the whole sensor, m, and the emitters beyond it that cast a halo into it.
@@ -108,7 +108,7 @@ impl AnalyticEstimator {
         exclude(&mut |x, y| screened.exclude(x, y, nx));
         self.search.compressed.spare_excess = spare_excess;
         self.search.reweighting.compressed.spare_excess = spare_excess;
-        self.search.inspect();
+        self.search.inspect(self.camera.quantum());
         let mut sums = PixelSums::default();
         let PreprocessedFrame { pixels, is_masked, .. } = &self.search.frame;
         for (p, _) in pixels.iter().zip(is_masked).filter(|(_, is_masked)| !**is_masked) {

@@ -1,5 +1,6 @@
 //! The searches of a frame: by an estimator's method, anew where the spots differ from the PSF, and anew where the noise grows with the light.
 
+use crate::estimate::dense_linalg::largest;
 use crate::estimate::estimators::budgets::Budgets;
 use crate::estimate::estimators::list::{EstimatorSpec, Method};
 use crate::estimate::estimators::network_start::NetworkStart;
@@ -32,6 +33,8 @@ const TRY_WORK: f64 = 0.03;
 const KEPT_OUTLIERS_WORK: f64 = 0.1;
 /// Share of a frame's work after which it is asked whether the spots differ from the PSF: hardly a frame that can be explained takes more.
 const MISFIT_WORK: f64 = 0.1;
+/// Variance of the brightest pixel, in units of the noise's, from which on the noise counts as growing with the light.
+const NOTICEABLE_GROWTH: f64 = 1.1;
 /// Passes over a frame for isolated outliers.
 const OUTLIER_PASSES: usize = 3;
 
@@ -118,8 +121,22 @@ impl FrameSearch {
         }
     }
 
-    /// Loads the frame into the search's bases; returns the measured noise in units of the configured noise.
-    pub fn inspect(&mut self) -> f64 {
+    /// Loads the frame into the search's bases; returns the measured noise in units of the configured noise. `quantum`: growth of the variance
+    /// with the light, in the same units, where it is known.
+    pub fn inspect(&mut self, quantum: Option<f64>) -> f64 {
+        let scale = self.load();
+        let calibrated = quantum.map(|quantum| VarianceFunction::of_quantum(quantum / scale));
+        let variance = calibrated.unwrap_or(self.compressed.variance);
+        let brightest = largest(0.0, &self.frame.pixels);
+        self.frame.variance = if variance.at(brightest) > NOTICEABLE_GROWTH {
+            variance
+        } else {
+            VarianceFunction::default()
+        };
+        scale
+    }
+
+    fn load(&mut self) -> f64 {
         let Self { space, compressed, .. } = self;
         let (bx, by) = (&space.bases.x, &space.bases.y);
         if !self.spec.chooses_order() {
@@ -170,9 +187,9 @@ impl FrameSearch {
         if !is_simpler {
             self.remember_shape(&mut found, budgets);
         }
-        let compressed = self.compressed_of(found.kind);
-        let variance = suspected.or((!compressed.variance.is_constant()).then_some(compressed.variance));
-        let is_noise_in_doubt = variance.is_some() || !compressed.is_explained_by(&found.hypothesis);
+        let variance = suspected.or(Some(self.frame.variance).filter(|variance| !variance.is_constant()));
+        let is_noise_in_doubt =
+            variance.is_some() || !self.compressed_of(found.kind).is_explained_by(&found.hypothesis);
         let is_weighted = found.spot_error > 0.0
             || is_simpler
             || self.rules.reweighting

@@ -102,7 +102,7 @@ impl FrameSearch {
             _ => {}
         }
         if known > 0.0 {
-            keep_weighted(space, compressed, frame, known, &found.hypothesis.sources);
+            keep_weighted(space, compressed, frame, known, &found.hypothesis);
         }
         false
     }
@@ -120,7 +120,7 @@ impl FrameSearch {
         let is_shown = shown > known.least();
         if is_shown {
             self.history.iter_mut().for_each(|history| history.push(shown));
-            load_weighted(space, compressed, frame, error, &found.hypothesis.sources);
+            load_weighted(space, compressed, frame, error, &found.hypothesis);
         }
         (found, is_shown)
     }
@@ -129,8 +129,8 @@ impl FrameSearch {
     pub fn keep_fewer(&mut self, found: &mut Found, remembered: Found) {
         if remembered.hypothesis.sources.len() < found.hypothesis.sources.len() {
             let Reweighting { space, compressed } = &mut self.reweighting;
-            let (error, sources) = (remembered.spot_error, &remembered.hypothesis.sources);
-            load_weighted(space, compressed, &self.frame, error, sources);
+            let error = remembered.spot_error;
+            load_weighted(space, compressed, &self.frame, error, &remembered.hypothesis);
             *found = remembered;
         }
     }
@@ -180,7 +180,7 @@ impl FrameSearch {
             found.hypothesis = search_with_spot_error(space, compressed, frame, error, bright, budget);
             found.spot_error = error;
         } else if known > 0.0 {
-            keep_weighted(space, compressed, frame, known, &found.hypothesis.sources);
+            keep_weighted(space, compressed, frame, known, &found.hypothesis);
         }
     }
 }

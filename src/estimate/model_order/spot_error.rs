@@ -1,6 +1,7 @@
 //! The search where spots may differ from the PSF: every pixel's variance is raised by the spots' halo, so that no hypothesis explains a
-//! lens's rings, tails and ghosts by emitters.
+//! lens's rings, tails and ghosts by emitters, and by their shot noise where that is known.
 
+use crate::estimate::fit::levenberg_marquardt::evaluate;
 use crate::estimate::fit::work_budget::WorkBudget;
 use crate::estimate::model::bases::Bases;
 use crate::estimate::model::compressed_frame::CompressedFrame;
@@ -220,7 +221,7 @@ pub(crate) fn search_with_spot_error(
     let bright = start.sources.clone();
     let mut candidate = Candidate::from(start);
     for _ in 0..PASSES {
-        set_weights(space, compressed, frame, spot_error, &candidate.sources);
+        set_weights(space, compressed, frame, spot_error, &candidate);
         let mut search = space.search(compressed, frame, budget);
         search.fit_trial(&mut candidate);
         if split_all(&mut search, &mut candidate) {
@@ -241,7 +242,7 @@ pub(crate) fn search_with_spot_error(
         }
         candidate.sources.extend(added);
     }
-    set_weights(space, compressed, frame, spot_error, &candidate.sources);
+    set_weights(space, compressed, frame, spot_error, &candidate);
     let mut search = space.search(compressed, frame, budget);
     let mut refined = Candidate::from(refit_reweighted(
         &mut search,
@@ -280,47 +281,69 @@ pub(crate) fn drop_halo(bases: &Bases, spot_error: f64, penalty: f64, sources: &
     *sources = kept;
 }
 
-/// Loads a frame with weights that allow for the halo of `sources`.
+/// Loads a frame with weights that allow for the halo of what was found.
 pub(crate) fn load_weighted(
-    space: &SearchSpace,
+    space: &mut SearchSpace,
     compressed: &mut CompressedFrame,
     frame: &PreprocessedFrame,
     spot_error: f64,
-    sources: &[PointSource],
+    found: &Hypothesis,
 ) {
     compressed.load(frame, &space.bases.x, &space.bases.y);
-    set_weights(space, compressed, frame, spot_error, sources);
+    set_weights(space, compressed, frame, spot_error, found);
 }
 
 /// The same unless the frame has such weights.
 pub(crate) fn keep_weighted(
-    space: &SearchSpace,
+    space: &mut SearchSpace,
     compressed: &mut CompressedFrame,
     frame: &PreprocessedFrame,
     spot_error: f64,
-    sources: &[PointSource],
+    found: &Hypothesis,
 ) {
     if !compressed.has_spot_error() {
-        load_weighted(space, compressed, frame, spot_error, sources);
+        load_weighted(space, compressed, frame, spot_error, found);
     }
 }
 
-/// Weights that allow for the halo of `sources`, and the variances that their positions are reported with.
+/// Weights that allow for the halo and the shot noise of what was found, and the variances that positions are reported with.
 fn set_weights(
-    space: &SearchSpace,
+    space: &mut SearchSpace,
     compressed: &mut CompressedFrame,
     frame: &PreprocessedFrame,
     spot_error: f64,
-    sources: &[PointSource],
+    found: &Hypothesis,
 ) {
-    let halo = Halo::new(&space.bases, &[sources, &frame.beyond].concat(), spot_error);
-    compressed.set_weights(frame, space.bases.axes(), |k| 1.0 + halo.variance[k]);
-    let nx = space.bases.x.n;
-    let mx = compressed.mx;
+    let (nx, mx) = (space.bases.x.n, compressed.mx);
+    let at = |k: usize| k / nx * mx + k % nx;
+    let light = match frame.variance.is_constant() {
+        true => None,
+        false => Some(light_of_sources(space, compressed, frame, found)),
+    };
+    let noise = |k: usize| light.as_ref().map_or(1.0, |light| frame.variance.at(light[at(k)]));
+    let halo = Halo::new(&space.bases, &[&found.sources, &frame.beyond[..]].concat(), spot_error);
+    compressed.set_weights(frame, space.bases.axes(), |k| noise(k) + halo.variance[k]);
     let mut position_weights = compressed.weights.clone();
     for (k, others) in halo.variance_of_others.iter().enumerate() {
-        let w = &mut position_weights[k / nx * mx + k % nx];
-        *w = w.powi(2) * (1.0 + POSITION_SHARE * others);
+        let w = &mut position_weights[at(k)];
+        *w = w.powi(2) * (noise(k) + POSITION_SHARE * others);
     }
     compressed.position_weights = position_weights;
+}
+
+/// The light that the sources of a hypothesis cast on the pixels, (my, mx).
+fn light_of_sources(
+    space: &mut SearchSpace,
+    compressed: &CompressedFrame,
+    frame: &PreprocessedFrame,
+    hypothesis: &Hypothesis,
+) -> Vec<f64> {
+    let mut budget = WorkBudget::new(&|| false);
+    let mut search = space.search(compressed, frame, &mut budget);
+    let model = &evaluate(&mut search.context, &mut hypothesis.clone()).model;
+    let mut light = vec![0.0; compressed.coefficients.len()];
+    for i in 0..model.sources.len() {
+        model.accumulate(i, 0, 0, model.amplitude(i), &mut light);
+    }
+    light
 }

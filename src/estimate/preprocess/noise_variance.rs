@@ -30,6 +30,14 @@ impl VarianceFunction {
     /// Least gain in −2 ln likelihood for which the noise is taken to depend on the light.
     pub const PENALTY: f64 = 10.0;
 
+    /// Shot noise of light whose quantum is `quantum` in units of the noise.
+    pub fn of_quantum(quantum: f64) -> Self {
+        Self {
+            linear: quantum,
+            ..Self::default()
+        }
+    }
+
     pub fn at(self, signal: f64) -> f64 {
         let s = signal.max(0.0);
         self.floor + s * (self.linear + s * self.square)

@@ -2,6 +2,7 @@
 
 use crate::estimate::error::Error;
 use crate::estimate::model::hypothesis::PointSource;
+use crate::estimate::preprocess::noise_variance::VarianceFunction;
 use crate::frame::Frame;
 use crate::optics::{Camera, DisplacedSpots};
 
@@ -23,6 +24,8 @@ pub(crate) struct PreprocessedFrame {
     pub flagged: Vec<FlaggedPixel>,
     pub is_masked: Vec<bool>,
     pub saturated: usize,
+    /// How the noise grows with the light, where that is known before the frame is searched.
+    pub variance: VarianceFunction,
     /// How spots are smeared by motion, for the frames that are loaded from now on.
     pub smear: Option<DisplacedSpots>,
     /// Emitters beyond the frame that cast a halo into it, for the frames that are loaded from now on.

@@ -142,7 +142,7 @@ impl SequenceEstimator {
     fn take(&mut self, time_s: f64, elapsed: f64, scale: f64, is_over: &dyn Fn() -> bool) -> Option<Estimate> {
         let mut budget = WorkBudget::new(is_over);
         let (_, compressed, frame) = self.single.loaded();
-        let is_even = compressed.variance.is_constant() && compressed.unevenness == 0.0 && !frame.is_clipped();
+        let is_even = frame.variance.is_constant() && compressed.unevenness == 0.0 && !frame.is_clipped();
         let is_told = self.outlook.is_none() || self.window.present(time_s).len() > EXPLAINED_BY_POSE;
         if is_even && is_told && self.window.len() > 0 {
             let known = self.window.total.clone();
