@@ -41,10 +41,15 @@ impl Witness {
     }
 }
 
-/// Witnesses of all users whose beam is expected; only of those that have been seen, where there are enough.
+/// Witnesses of all users whose beam is expected, or followed where a wrong pose says that it is out of view; only of those that have been
+/// seen, where there are enough.
 pub fn witnesses(claims: &[ActiveClaim], tracker: &Tracker) -> Vec<Witness> {
-    let (known, new): (Vec<&ActiveClaim>, Vec<&ActiveClaim>) =
-        claims.iter().filter(|a| a.expected).partition(|a| a.before.was_seen());
+    let is_followed = |a: &ActiveClaim| {
+        let track = a.before.current().and_then(|id| tracker.get(id));
+        !a.ended && track.is_some_and(|t| t.hit && t.confirmed)
+    };
+    let heard = claims.iter().filter(|a| a.expected || is_followed(a));
+    let (known, new): (Vec<&ActiveClaim>, Vec<&ActiveClaim>) = heard.partition(|a| a.before.was_seen());
     let heard = if known.len() >= MIN_KNOWN {
         known
     } else {
@@ -83,6 +88,7 @@ mod tests {
     use jiff::Timestamp;
 
     use super::*;
+    use crate::monitor::fixture::Scene;
     use crate::monitor::input::claim_state::fixture::active_claim;
 
     #[test]
@@ -109,5 +115,16 @@ mod tests {
             }
             assert_eq!(witnesses(&claims, &Tracker::new(50.0)).len(), heard);
         }
+    }
+
+    #[test]
+    fn a_user_whose_beam_is_followed_is_a_witness_though_a_wrong_pose_says_out_of_view() {
+        let places = [[0.0, 0.0], [50.0, 0.0], [0.0, 50.0]];
+        let mut scene = Scene::of_users(&places);
+        scene.claims[1].expected = false;
+        scene.show(&places);
+        assert_eq!(witnesses(&scene.claims, &scene.tracker).len(), 3);
+        scene.show(&[places[0], places[2]]);
+        assert_eq!(witnesses(&scene.claims, &scene.tracker).len(), 2);
     }
 }
