@@ -177,7 +177,7 @@ fn test_variance_growth(
     let evaluation = candidate.evaluation(&mut search.context);
     let (residual, signal) = (evaluation.residual.clone(), evaluation.expected_light());
     let variance = VarianceFunction::fit(
-        frame,
+        &frame.is_masked,
         [compressed.rank[0], compressed.mx],
         &residual,
         &signal,

@@ -89,5 +89,11 @@ fn fit_variance(
     signal: &[f64],
     sources: usize,
 ) -> VarianceFunction {
-    VarianceFunction::fit(frame, [compressed.rank[0], compressed.mx], residual, signal, sources)
+    VarianceFunction::fit(
+        &frame.is_masked,
+        [compressed.rank[0], compressed.mx],
+        residual,
+        signal,
+        sources,
+    )
 }

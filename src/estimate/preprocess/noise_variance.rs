@@ -1,7 +1,5 @@
 //! The variance of a pixel's noise as a function of its expected light.
 
-use crate::estimate::preprocess::screening::PreprocessedFrame;
-
 /// Largest share of a pixel's noise that a fit is taken to have absorbed (a bright spot of one pixel would divide by zero), and Fisher
 /// scoring steps of the fit, which converges quadratically.
 const LEVERAGE: f64 = 0.6;
@@ -46,17 +44,11 @@ impl VarianceFunction {
     /// Maximum-likelihood fit to the residual of a model of `sources` emitters (Fisher scoring for a variance that is linear in
     /// its parameters), shot noise or gain scatter, whichever explains more. `residual` and `signal` are rows of `nx` pixels,
     /// `stride` numbers apart.
-    pub fn fit(
-        frame: &PreprocessedFrame,
-        [nx, stride]: [usize; 2],
-        residual: &[f64],
-        signal: &[f64],
-        sources: usize,
-    ) -> Self {
+    pub fn fit(is_masked: &[bool], [nx, stride]: [usize; 2], residual: &[f64], signal: &[f64], sources: usize) -> Self {
         let total: f64 = signal.iter().map(|s| s.max(0.0)).sum();
         let brightest = signal.iter().fold(0.0, |a: f64, &s| a.max(s));
-        let mut points = Vec::with_capacity(frame.pixels.len());
-        for (k, _) in frame.is_masked.iter().enumerate().filter(|(_, bad)| !**bad) {
+        let mut points = Vec::with_capacity(is_masked.len());
+        for (k, _) in is_masked.iter().enumerate().filter(|(_, bad)| !**bad) {
             let at = k / nx * stride + k % nx;
             let s = signal[at].max(0.0);
             // The share of the noise that the fit's own parameters absorb there.
