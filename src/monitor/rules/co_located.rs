@@ -25,7 +25,7 @@ use crate::time::seconds;
 const MIN_OTHERS: usize = 2;
 /// Share of the threshold from which a beam's present is no longer added to its past: smaller starves the past of an unsteady
 /// beam, larger lets a second beam become a habit. Not measured.
-const SUSPECT_SHARE: f64 = 0.2;
+pub const SUSPECT_SHARE: f64 = 0.2;
 /// Resolutions within which one beam's light disturbs another's, and where it is lost may have become part of it. Not measured.
 const BESIDE_RESOLUTIONS: f64 = 3.0;
 

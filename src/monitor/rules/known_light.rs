@@ -17,8 +17,6 @@ use crate::monitor::stats::gaussian::neg_log_p_outside;
 use crate::monitor::track::beam_track::Track;
 use crate::time::seconds;
 
-/// Share of the threshold from which the present is no evidence of what a light is usually like, as for users' spots.
-const SUSPECT_SHARE: f64 = 0.2;
 /// Tests of each light: its spot, energy, scintillation and place.
 const TESTS: f64 = 4.0;
 
@@ -118,7 +116,7 @@ fn evaluate_light(
         away_m: (track.filter.position() - state.expected).norm(),
     };
     let surprise = evidence.neg_log_p();
-    let is_suspect = surprise > SUSPECT_SHARE * threshold;
+    let is_suspect = surprise > co_located::SUSPECT_SHARE * threshold;
     let suspected_since = is_suspect.then(|| state.suspected_since.unwrap_or(frame.now));
     memory.observed.push(Observed {
         id: id.clone(),

@@ -2,15 +2,13 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use super::beam_track::Track;
+use super::beam_track::{GATE, Track};
 use super::eligibility::Eligibility;
 use super::tracker::Tracker;
 use crate::assign::assign;
 use crate::monitor::input::claim_state::ActiveClaim;
 use crate::monitor::stats::gaussian::mahalanobis2;
 
-/// Squared Mahalanobis distance within which a beam can be associated with a claim: χ² of two degrees exceeds it 4 times in 10⁶.
-const GATE: f64 = 25.0;
 /// What an assignment must gain in squared Mahalanobis distance before a claim changes its beam. Larger keeps a wrong pair for
 /// longer, smaller swaps users who pass each other. Not measured.
 const INCUMBENCY: f64 = 4.0;

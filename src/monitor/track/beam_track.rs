@@ -10,6 +10,9 @@ use super::manoeuvring::ManoeuvringFilter;
 use crate::monitor::stats::gaussian::largest_eigenvalue;
 use crate::time::seconds;
 
+/// Squared Mahalanobis distance within which a detection can be a track's and a track a claim's: χ² of two degrees exceeds it 4 times in
+/// 10⁶. Larger lets neighbours swap, smaller loses one to an error of its covariance.
+pub const GATE: f64 = 25.0;
 /// Added to the gate per axis, m: a beam may turn between two frames faster than the motion model allows. Not measured.
 pub const GATE_FLOOR_M: f64 = 0.4;
 /// A track is confirmed by M hits of its last N frames. More hits delay every alert by a frame each; fewer confirm clutter.

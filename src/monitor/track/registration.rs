@@ -7,13 +7,11 @@
 
 use nalgebra::{Matrix2, Matrix6, Vector2, Vector6};
 
-use super::beam_track::{GATE_FLOOR_M, Track};
+use super::beam_track::{GATE, GATE_FLOOR_M, Track};
 use super::detection::Detection;
 use crate::assign::assign;
 use crate::monitor::stats::gaussian::mahalanobis2;
 
-/// Squared Mahalanobis gate for a detection to speak for its track's place.
-const GATE: f64 = 25.0;
 /// Standard deviation by which a beam may leave its track's course between two frames, m: a walker who turns does by 0.1 m.
 /// Larger takes less of the common error out, smaller takes a turning user for it.
 const COURSE_M: f64 = 0.1;

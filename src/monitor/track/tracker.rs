@@ -3,15 +3,12 @@
 use jiff::Timestamp;
 use nalgebra::Matrix2;
 
-use super::beam_track::{GATE_FLOOR_M, Track};
+use super::beam_track::{GATE, GATE_FLOOR_M, Track};
 use super::detection::Detection;
 use crate::assign::assign;
 use crate::monitor::stats::gaussian::mahalanobis2;
 use crate::time::seconds;
 
-/// Squared Mahalanobis gate of the association: χ² of two degrees exceeds it 4 times in 10⁶. Larger lets neighbours swap, smaller
-/// loses a track to an error of its covariance.
-const GATE: f64 = 25.0;
 /// Handicap, in squared Mahalanobis distance, of a track whose measurement was merged into another's: a spot that two beams share
 /// stays with the track that it was followed by. Not measured.
 const MERGED_HANDICAP: f64 = 4.0;
