@@ -4,7 +4,7 @@ use super::clock::Relation;
 use super::frame::{self, Found, Kind};
 use super::refusal::Refusal;
 use super::signing::Signing;
-use super::vehicle::{Moment, Sample, Update, Vehicle};
+use super::vehicle::{AUTOPILOT_INVALID, Moment, Sample, Update, Vehicle};
 use crate::pose::PoseSigmas;
 
 /// Our component id: an on-board computer, the last of the four.
@@ -12,7 +12,6 @@ const OUR_COMPONENT: u8 = 194;
 /// Our system id as long as no autopilot has been heard.
 const OUR_SYSTEM: u8 = 255;
 const TYPE_ONBOARD_CONTROLLER: u8 = 18;
-const AUTOPILOT_INVALID: u8 = 8;
 const STATE_ACTIVE: u8 = 4;
 const SET_MESSAGE_INTERVAL: u16 = 511;
 

@@ -20,7 +20,7 @@ const FARTHEST_M: f64 = 1e6;
 /// A variance beyond this says that nothing is known (1 rad; 1 km).
 const LARGEST_VARIANCE: [f64; 2] = [1.0, 1e6];
 
-const AUTOPILOT_INVALID: u8 = 8;
+pub(super) const AUTOPILOT_INVALID: u8 = 8;
 const FRAME_LOCAL_NED: u8 = 1;
 const FRAME_BODY_FRD: u8 = 12;
 const GPS_FIX_3D: u8 = 3;
