@@ -103,7 +103,7 @@ impl Calibration {
             self.noise_std_j > 0.0,
         )?;
         let quantum = self.quantum_j.unwrap_or_default();
-        within("quantum_j", "a positive number", quantum, quantum >= 0.0)?;
+        within("quantum_j", "0 or more", quantum, quantum >= 0.0)?;
         // Emitters are also fitted a little outside the sensor; how the lens bends far out there is a guess anyway.
         let corner = |k: usize| {
             let half = [camera.x.half_width(), camera.y.half_width()][k];

@@ -183,9 +183,8 @@ fn errors(told: &Reviewed) -> (Vec<f64>, Vec<f64>) {
     (metres, normalised)
 }
 
-fn median(mut values: Vec<f64>) -> f64 {
-    values.sort_by(f64::total_cmp);
-    values.get(values.len() / 2).copied().unwrap_or(f64::NAN)
+fn median(values: Vec<f64>) -> f64 {
+    crate::stats::median(values).unwrap_or(f64::NAN)
 }
 
 fn mean(values: &[f64]) -> f64 {
