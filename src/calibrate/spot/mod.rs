@@ -182,14 +182,8 @@ pub fn learn(
     prepared.scale_noise(factor);
     let noise_j = prepared.noise_j;
 
-    // Pixel maps, from all frames with the shape held fixed.
-    let everything = every(&prepared.images);
-    let mut all = Learner::with_model(camera, &everything, noise_j, &model, misfit);
-    let odd = all.mask_odd();
-    all.fit(6);
-    let pixels = pixel_maps::estimate(&all, &odd, &prepared.hot, is_held, BETTER);
+    let pixels = pixel_maps::of_frames(camera, &mut prepared, &model, misfit, is_held, BETTER);
     let maps = pixels.maps;
-    drop(all);
     let images = match &maps {
         Some(maps) => prepare::corrected(prepared.images, maps),
         None => prepared.images,

@@ -4,10 +4,13 @@ use ndarray::Array2;
 use rayon::prelude::*;
 
 use super::band::pixels_within;
+use super::grouping::Image;
 use super::learn::{Learner, Odd};
 use super::patch::Patch;
+use super::prepare::Prepared;
+use super::template_model::TemplateModel;
 use crate::calibrate::maps::{self, Pixels};
-use crate::optics::PixelMaps;
+use crate::optics::{Camera, PixelMaps};
 use crate::stats::median;
 
 /// Pixel maps that a recording leads to.
@@ -18,10 +21,39 @@ pub struct Found {
     pub are_better: bool,
 }
 
+/// Passes over the frames: two show what a bad pixel that was taken for a spot has hidden, more what those around it have.
+const PASSES: usize = 3;
+
+/// The maps of all frames with the spots' shape held fixed, `misfit` being what it leaves of them; anew where bad pixels were taken for spots.
+pub fn of_frames(
+    camera: &Camera,
+    prepared: &mut Prepared,
+    model: &TemplateModel,
+    misfit: f64,
+    is_held: impl Fn(usize) -> bool + Sync,
+    better: f64,
+) -> Found {
+    let once = |prepared: &Prepared| {
+        let images: Vec<&Image> = prepared.images.iter().collect();
+        let mut learner = Learner::with_model(camera, &images, prepared.noise_j, model, misfit);
+        let odd = learner.mask_odd();
+        learner.fit(6);
+        estimate(&learner, &odd, &prepared.hot, &is_held, better)
+    };
+    let mut found = once(prepared);
+    for _ in 1..PASSES {
+        if !prepared.mask_bad(found.maps.as_ref()) {
+            break;
+        }
+        found = once(prepared);
+    }
+    found
+}
+
 /// The camera's maps with what is better: gains and dark levels are replaced where those of the other frames lower the χ² of the
 /// held-out ones by more than `better`. `odd` are spots that the learner's template does not explain: what it leaves there says
 /// nothing about the pixels. `hot` are pixels known to be bad.
-pub fn estimate(
+fn estimate(
     learner: &Learner,
     odd: &[Odd],
     hot: &[usize],

@@ -36,6 +36,18 @@ impl Prepared {
         flashes.iter().for_each(|(k, p)| self.images[*k].weight[*p] = 0.0);
     }
 
+    /// Takes bad pixels out of use in all images. Returns whether any was in use.
+    pub fn mask_bad(&mut self, maps: Option<&PixelMaps>) -> bool {
+        let bad = maps.into_iter().flat_map(|maps| maps.bad.iter().enumerate());
+        let is_used = |p: &usize| self.images.iter().any(|image| image.weight[*p] > 0.0);
+        let new: Vec<usize> = bad.filter(|(_, bad)| **bad).map(|(p, _)| p).filter(is_used).collect();
+        for p in &new {
+            self.images.iter_mut().for_each(|image| image.weight[*p] = 0.0);
+        }
+        self.hot.extend(&new);
+        !new.is_empty()
+    }
+
     /// Replaces the noise by `factor` times what it was taken for.
     pub fn scale_noise(&mut self, factor: f64) {
         self.noise_j *= factor;
