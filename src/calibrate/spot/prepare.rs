@@ -164,3 +164,35 @@ pub fn corrected(mut images: Vec<Image>, maps: &PixelMaps) -> Vec<Image> {
     }
     images
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_bad_pixel_is_taken_out_of_all_images_once() {
+        let image = Image {
+            pixels: vec![0.0; 6],
+            weight: vec![1.0; 6],
+            level: 0.0,
+        };
+        let mut prepared = Prepared {
+            images: vec![image; 3],
+            noise_j: 1.0,
+            saturation_j: None,
+            saturated_frames: 0,
+            hot: Vec::new(),
+            flashes: 0,
+        };
+        let mut maps = PixelMaps::ideal((2, 3));
+        assert!(!prepared.mask_bad(None) && !prepared.mask_bad(Some(&maps)));
+        maps.bad[(1, 0)] = true;
+        assert!(prepared.mask_bad(Some(&maps)) && !prepared.mask_bad(Some(&maps)));
+        assert_eq!(prepared.hot, [3]);
+        let used = prepared
+            .images
+            .iter()
+            .map(|i| i.weight.iter().filter(|w| **w > 0.0).count());
+        assert_eq!(used.collect::<Vec<_>>(), [5, 5, 5]);
+    }
+}
