@@ -6,4 +6,5 @@ mod lens;
 mod lens_memory;
 mod moving;
 mod sequence;
+mod shot_noise;
 mod windows;
