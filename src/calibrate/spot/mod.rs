@@ -71,7 +71,7 @@ pub struct Learned {
     pub wavefront: Option<Wavefront>,
     /// Noise of a pixel, J, and its growth with the light where it shows, J.
     pub noise_std_j: f64,
-    pub gain_j: Option<f64>,
+    pub quantum_j: Option<f64>,
     pub bad_pixels: usize,
     /// Whether the pixel maps explain the held-out frames better than the camera's, or name bad pixels that those do not.
     pub are_pixels_better: bool,
@@ -257,7 +257,7 @@ pub fn learn(
         },
         spot_error: Some(spot_error),
         noise_std_j: variance.read_noise_j,
-        quantum_j: variance.gain_j,
+        quantum_j: variance.quantum_j,
         pixels: maps.clone().map(Arc::new),
         ..Calibration::of(camera)
     };
@@ -272,7 +272,7 @@ pub fn learn(
         field_degree: last.model.degree,
         wavefront: last.model.pupil.map(|pupil| pupil.wavefront()),
         noise_std_j: variance.read_noise_j,
-        gain_j: variance.gain_j,
+        quantum_j: variance.quantum_j,
         bad_pixels: maps
             .as_ref()
             .map_or(0, |m: &PixelMaps| m.bad.iter().filter(|b| **b).count()),

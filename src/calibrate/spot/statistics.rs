@@ -22,7 +22,7 @@ pub struct Variance {
     /// Noise of a pixel without light, J.
     pub read_noise_j: f64,
     /// Growth of the variance with the expected energy, J; none where it does not show.
-    pub gain_j: Option<f64>,
+    pub quantum_j: Option<f64>,
     /// Share of a spot's light by which it differs from the template, anywhere in its halo.
     pub spot_error: f64,
 }
@@ -77,12 +77,12 @@ pub fn variance(learner: &Learner) -> Variance {
     }
     let gain = now[1] * noise2 / scale[1];
     let is_shot = now[1] > SIGNIFICANT * covariance[(1, 1)].max(0.0).sqrt();
-    let gain_j = is_shot.then_some(gain).filter(|g| *g > 0.0);
+    let quantum_j = is_shot.then_some(gain).filter(|g| *g > 0.0);
     let read2 = now[0] * noise2;
     Variance {
         read_noise_j: read2.sqrt(),
-        gain_j,
-        spot_error: spot_error(&pixels, read2, gain_j.unwrap_or(0.0)),
+        quantum_j,
+        spot_error: spot_error(&pixels, read2, quantum_j.unwrap_or(0.0)),
     }
 }
 

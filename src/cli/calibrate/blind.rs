@@ -187,7 +187,7 @@ fn report(camera: &Camera, l: &Learned) -> Vec<String> {
     lines.push(format!(
         "spot error {error:.2e}: the share of a spot's light that the shape leaves unexplained{beyond}"
     ));
-    let gain = l.gain_j.map_or_else(String::new, |g| {
+    let gain = l.quantum_j.map_or_else(String::new, |g| {
         let counts = camera
             .joules_per_count
             .map_or_else(String::new, |c| format!(" ({:.4} counts)", g / c));
@@ -237,7 +237,7 @@ fn object(args: &Args, camera: &Camera, l: &Learned) -> serde_json::Value {
         },
         "spot_error": l.calibration.spot_error,
         "noise_std_j": l.noise_std_j,
-        "gain_j": l.gain_j,
+        "gain_j": l.quantum_j,
         "gain_scatter": l.gain_scatter,
         "bad_pixels": l.bad_pixels,
         "flashes": l.flashes,
