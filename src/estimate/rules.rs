@@ -83,6 +83,8 @@ rules! {
     /// What the bright spots of recent frames have in common, too faint for a single frame, is taken for the lens's. Needed where a faint ghost
     /// stands beside every user (`oapwatch study lens-alerts --only ghost`).
     stack_misfits,
+    /// The spot's shape is learned where frames show that spots differ from the PSF.
+    learn_spots,
     /// A rotated elliptical PSF is tried in the place of more sources. Needed with the condition `ellipse`.
     rotated_ellipse,
     /// Sources that do not exceed the misfit around them are removed. No cell of the trade-off needs it; the scene `hazy-noon` does: without

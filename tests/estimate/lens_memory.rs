@@ -5,7 +5,7 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::frames::{estimator, frame, places};
-use crate::lens::{FIVE, SIGMA_M, camera, render_density};
+use crate::lens::{FIVE, SIGMA_M, camera, moffat, render_density};
 
 /// A round spot, and its reflection of 2 % beside it.
 fn ghost(x: f64, y: f64) -> f64 {
@@ -66,7 +66,6 @@ fn a_lens_that_most_frames_do_not_show_hides_no_user() {
     let mut ml = estimator(None, &camera);
     let lens = frame(render_density(&camera, &ghost, &FIVE.map(|at| (at, 300.0)), &mut rng));
     assert!(ml.estimate(&lens).unwrap().spot_error > 0.0);
-    let gaussian = |x: f64, y: f64| (-0.5 * (x * x + y * y) / (SIGMA_M * SIGMA_M)).exp();
     let mut spots: Vec<_> = FIVE.map(|at| (at, 300.0)).into();
     spots.push((FIVE[2].map(|v| v + 3e-3), 5.0));
     let stranger = frame(render_density(&camera, &gaussian, &spots, &mut rng));
@@ -101,10 +100,77 @@ fn what_is_too_faint_for_a_frame_is_the_lens_s_where_all_frames_show_it() {
     let together = right(&later_numbers(Rules::default(), &ghost, &spots));
     assert!(alone < 90 && together == 100, "{alone} and {together} of 100");
     spots.push(([FIVE[2][0] + 4.3e-3, FIVE[2][1] - 2.9e-3], 4.0));
-    let gaussian = |x: f64, y: f64| (-0.5 * (x * x + y * y) / (SIGMA_M * SIGMA_M)).exp();
     let with_stranger = later_numbers(Rules::default(), &gaussian, &spots);
     assert!(
         with_stranger.iter().all(|n| *n >= 6),
         "a stranger beside one user is none of the lens's"
     );
+}
+
+fn gaussian(x: f64, y: f64) -> f64 {
+    (-0.5 * (x * x + y * y) / (SIGMA_M * SIGMA_M)).exp()
+}
+
+/// Of eight frames of three pairs 2 σ apart through a halo, after a first one: how many have six emitters, and how many of 48 spots have an emitter
+/// whose ellipse holds them.
+fn pairs_through_a_halo(rules: Rules) -> (usize, usize) {
+    let camera = camera();
+    let config = Config {
+        rules,
+        ..Default::default()
+    };
+    let mut ml = build(&config, &camera).unwrap();
+    let mut rng = ChaCha8Rng::seed_from_u64(32);
+    let (mut right, mut held) = (0, 0);
+    for index in 0..9 {
+        let pairs = [FIVE[0], FIVE[1], FIVE[3]].map(|at| {
+            let (sin, cos) = rng.random_range(0.0..std::f64::consts::PI).sin_cos();
+            [-SIGMA_M, SIGMA_M].map(|d| (([at[0] + d * cos, at[1] + d * sin]), 300.0))
+        });
+        let spots = pairs.as_flattened();
+        let frame = frame(render_density(&camera, &moffat(SIGMA_M), spots, &mut rng));
+        let estimate = ml.estimate(&frame).unwrap();
+        if index == 0 {
+            continue;
+        }
+        right += usize::from(estimate.emitters.len() == 6);
+        let is_held = |place: [f64; 2]| {
+            estimate.emitters.iter().any(|e| {
+                let [dx, dy] = [e.x_m - place[0], e.y_m - place[1]];
+                let [[a, b], [_, c]] = e.cov_m2;
+                (c * dx * dx - 2.0 * b * dx * dy + a * dy * dy) / (a * c - b * b) < 5.99
+            })
+        };
+        held += spots.iter().filter(|(at, _)| is_held(camera.to_ground(*at))).count();
+    }
+    (right, held)
+}
+
+#[test]
+fn a_halo_is_learned_from_pairs_that_overlap() {
+    let (right, held) = pairs_through_a_halo(Rules::default());
+    assert!(right == 8 && held >= 42, "{right} of 8 frames, {held} of 48 spots");
+    let (_, held) = pairs_through_a_halo(Rules::without("learn_spots").unwrap());
+    assert!(held < 24, "{held} of 48 spots");
+}
+
+#[test]
+fn a_spot_that_was_learned_is_learned_anew_after_the_lens_was_focused() {
+    let camera = camera();
+    let mut ml = estimator(None, &camera);
+    let mut rng = ChaCha8Rng::seed_from_u64(33);
+    let spots = FIVE.map(|at| (at, 300.0));
+    let mut shown = |spot: &dyn Fn(f64, f64) -> f64| {
+        let estimate = ml
+            .estimate(&frame(render_density(&camera, spot, &spots, &mut rng)))
+            .unwrap();
+        assert_eq!(estimate.emitters.len(), 5, "{:?}", places(&estimate));
+        (estimate.spot_error, estimate.reduced_chi2)
+    };
+    for _ in 0..20 {
+        shown(&moffat(SIGMA_M));
+    }
+    let focused: Vec<_> = (0..20).map(|_| shown(&gaussian)).collect();
+    let (error, chi2) = focused[19];
+    assert!(error < 2e-3 && (0.7..1.1).contains(&chi2), "{focused:?}");
 }

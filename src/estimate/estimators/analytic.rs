@@ -9,6 +9,7 @@ use crate::estimate::estimators::budgets::Budgets;
 use crate::estimate::estimators::frame_search::{Found, FrameSearch};
 use crate::estimate::estimators::list::{EstimatorSpec, Method};
 use crate::estimate::estimators::search_bases::bases;
+use crate::estimate::estimators::spot_learner::{Lesson, SpotLearner};
 use crate::estimate::fit::work_budget::WorkBudget;
 use crate::estimate::model::compressed_frame::CompressedFrame;
 use crate::estimate::model::hypothesis::{Hypothesis, Nuisances, PointSource};
@@ -29,6 +30,10 @@ pub(crate) struct AnalyticEstimator {
     spec: &'static EstimatorSpec,
     camera: Camera,
     search: FrameSearch,
+    /// Where the spot's shape may be learned.
+    learner: Option<SpotLearner>,
+    /// While a learned shape is used: the search and camera without it.
+    configured: Option<(FrameSearch, Camera)>,
     prior: Option<PowerPrior>,
     rules: Rules,
 }
@@ -36,10 +41,13 @@ pub(crate) struct AnalyticEstimator {
 impl AnalyticEstimator {
     pub fn new(spec: &'static EstimatorSpec, camera: &Camera, known: Option<&KnownPower>, rules: Rules) -> Self {
         let known = known.filter(|_| spec.method == Method::MaximumPosterior);
+        let search = FrameSearch::new(spec, camera, rules, bases(camera));
         Self {
             spec,
             camera: camera.clone(),
-            search: FrameSearch::new(spec, camera, rules, bases(camera)),
+            configured: None,
+            learner: SpotLearner::new(camera).filter(|_| rules.learn_spots && search.history.is_some()),
+            search,
             prior: known.map(|k| PowerPrior::new(k, camera)),
             rules,
         }
@@ -57,6 +65,8 @@ impl AnalyticEstimator {
             spec,
             camera: camera.clone(),
             search,
+            learner: None,
+            configured: None,
             prior: None,
             rules,
         }
@@ -120,7 +130,7 @@ impl AnalyticEstimator {
 
     /// Whether recent frames showed that spots differ from the PSF.
     pub fn remembers_spot_error(&self) -> bool {
-        self.search.shown_by_recent_frames().is_some()
+        self.configured.is_some() || self.search.shown_by_recent_frames().is_some()
     }
 
     /// Whether the loaded window shows anything that may be an emitter.
@@ -142,6 +152,31 @@ impl AnalyticEstimator {
         (&mut self.search.space, &self.search.compressed, &self.search.frame)
     }
 
+    /// What explains the loaded frame, searched again where it shows another spot than was searched for.
+    fn find(&mut self, budgets: &mut Budgets) -> Found {
+        let found = self.search.run(budgets);
+        let learner = self.learner.as_mut();
+        match learner.map_or(Lesson::Nothing, |l| l.learn(&mut self.search, &found, budgets)) {
+            Lesson::Nothing => return found,
+            Lesson::Better(camera) => {
+                let search = self.search.of_shape(&camera);
+                let last = std::mem::replace(&mut self.search, search);
+                let last_camera = std::mem::replace(&mut self.camera, *camera);
+                self.configured.get_or_insert((last, last_camera));
+            }
+            Lesson::Wrong => {
+                if let Some((configured, camera)) = self.configured.take() {
+                    let last = std::mem::replace(&mut self.search, configured);
+                    self.camera = camera;
+                    self.search.take_frame(last.frame, &self.camera);
+                }
+            }
+        }
+        budgets.search.restart();
+        budgets.reweighting.restart();
+        self.search.run(budgets)
+    }
+
     /// The emitters of the loaded frame, whose noise is `scale` times the configured noise.
     pub fn estimate_loaded(&mut self, scale: f64, is_over: &dyn Fn() -> bool) -> Estimate {
         let mut budgets = Budgets::new(is_over);
@@ -150,7 +185,7 @@ impl AnalyticEstimator {
             kind,
             spot_error,
             ..
-        } = self.search.run(&mut budgets);
+        } = self.find(&mut budgets);
         let noise_j = scale * self.camera.noise_std_j;
         let mut search = self.search.again(kind, &mut budgets);
         let mut moments = None;

@@ -2,6 +2,7 @@
 
 use crate::estimate::estimators::budgets::Budgets;
 use crate::estimate::estimators::frame_search::{Found, FrameSearch, SearchKind};
+use crate::estimate::estimators::search_bases::bases;
 use crate::estimate::model::hypothesis::Hypothesis;
 use crate::estimate::model_order::bright_spots::bright_spots;
 use crate::estimate::model_order::candidate::Candidate;
@@ -13,12 +14,26 @@ use crate::estimate::model_order::spot_error::{
     Shape, drop_halo, inspect_shape, keep_weighted, load_weighted, search_with_spot_error, shown_spot_error,
     try_spot_error, without_halo_of,
 };
-use crate::optics::SpotError;
+use crate::estimate::preprocess::screening::PreprocessedFrame;
+use crate::optics::{Camera, SpotError};
 
 /// Share of a frame's work for a try with the ellipse that recent frames showed: spots that overlap are split one after another.
 const USUAL_ELLIPSE_WORK: f64 = 0.4;
 
 impl FrameSearch {
+    /// A search of the same frame for the spots of another shape.
+    pub fn of_shape(&self, camera: &Camera) -> Self {
+        let mut search = Self::new(self.spec, camera, self.space.rules, bases(camera));
+        search.take_frame(self.frame.clone(), camera);
+        search
+    }
+
+    /// Takes a frame that another search was loaded with.
+    pub fn take_frame(&mut self, frame: PreprocessedFrame, camera: &Camera) {
+        self.frame = frame;
+        self.inspect(camera.quantum());
+    }
+
     /// The emitters as elongated as recent frames showed, if that explains a frame which round ones do not. Not where spots melt: there
     /// emitters explain an ellipse, and an ellipse emitters.
     pub fn find_with_usual_ellipse(&mut self, budgets: &mut Budgets) -> Option<Found> {

@@ -10,4 +10,5 @@ pub mod network;
 pub mod network_start;
 pub mod pixel_correction;
 pub mod search_bases;
+pub mod spot_learner;
 pub mod windowed;

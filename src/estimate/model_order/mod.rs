@@ -7,6 +7,7 @@ pub mod criterion;
 pub mod ellipse_history;
 pub mod evidence;
 pub mod initialise;
+pub mod learned_spot;
 pub mod map_search;
 pub mod maximum_likelihood;
 pub mod nuisance_proposals;

@@ -196,7 +196,8 @@ pub(crate) fn shown_spot_error(
     common_misfit(&mut search, &mut candidate, least, is_explained, Agreement::OF_FRAMES)
 }
 
-fn with_known_width(hypothesis: &Hypothesis) -> Hypothesis {
+/// The hypothesis with spots of the known width, to be fitted.
+pub(crate) fn with_known_width(hypothesis: &Hypothesis) -> Hypothesis {
     Hypothesis {
         nuisances: Nuisances {
             width: Width::Known,

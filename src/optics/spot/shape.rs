@@ -177,7 +177,13 @@ impl SpotShape {
             });
             (needed.map_or(0, |k| k + 1)) as f64 * knot
         };
-        places.into_iter().map(core).fold(0.0, f64::max).min(self.radius_m())
+        let count = if self.is_uniform() { 1 } else { places.len() };
+        places
+            .into_iter()
+            .take(count)
+            .map(core)
+            .fold(0.0, f64::max)
+            .min(self.radius_m())
     }
 
     /// Width of the Gaussian with the same noise-equivalent area 1/∫∫S² = 4πσ² (King, 1983), m, averaged over the sensor.

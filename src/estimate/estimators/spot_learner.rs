@@ -1,0 +1,194 @@
+//! When the spot's shape is learned from the frames that are searched, and while what was learned is used.
+
+use std::sync::Arc;
+
+use crate::estimate::estimators::budgets::Budgets;
+use crate::estimate::estimators::frame_search::{Found, FrameSearch, SearchKind};
+use crate::estimate::model_order::candidate::Candidate;
+use crate::estimate::model_order::learned_spot::LearnedSpot;
+use crate::estimate::model_order::spot_error::with_known_width;
+use crate::optics::{Camera, SpotError};
+
+/// Most alternations of learning the shape and fitting the sources, and the excess of one over the last's from which on they end.
+const MOST_PASSES: usize = 8;
+const STALLED: f64 = 0.9;
+/// Excess up to which a shape explains a frame, as what was learned from others is not exact, and up to which share of the excess without it, as the
+/// tails of bright spots are not learned in full.
+const EXPLAINED: f64 = 5.0;
+const MOST_LEFT: f64 = 0.002;
+/// Share of the excess that a shape must do away with to be used first.
+const LEAST_GAIN: f64 = 0.5;
+/// One frame in so many is learned from at least.
+const ONE_IN: u32 = 16;
+/// Most frames until the next try, which are doubled by each that failed.
+const LONGEST_REST: u32 = 128;
+
+/// The spot's shape as frames show it.
+pub(crate) struct SpotLearner {
+    /// A camera whose spot nobody has measured.
+    camera: Camera,
+    learned: Option<Learned>,
+    misfit: Misfit,
+    /// Frames since the shape that is used was learned first.
+    frames: u32,
+    /// Frames one after another that show more than was learned.
+    misfits: u32,
+    /// Tries that failed one after another, and frames until the next.
+    failed: u32,
+    rest: u32,
+}
+
+/// A shape that explains frames.
+struct Learned {
+    spot: LearnedSpot,
+    camera: Camera,
+    excess: f64,
+}
+
+/// What the first frame showed without a learned shape, and what frames since left with it.
+#[derive(Clone, Copy)]
+struct Misfit {
+    spot_error: f64,
+    before: f64,
+    left: f64,
+    frames: f64,
+}
+
+impl Misfit {
+    /// The spot error that is left: a misfit's deviance grows with its square.
+    fn rest(&self) -> f64 {
+        let left = self.left / self.frames + 1.0 / self.frames.sqrt();
+        self.spot_error * (left.max(0.0) / self.before).sqrt().min(1.0)
+    }
+}
+
+/// What a frame says of the shape that it was searched with.
+pub(crate) enum Lesson {
+    Nothing,
+    /// To be searched again for spots of this camera.
+    Better(Box<Camera>),
+    /// What was learned does not explain it.
+    Wrong,
+}
+
+impl SpotLearner {
+    pub fn new(camera: &Camera) -> Option<Self> {
+        let is_unknown = camera.spot_shape.is_none() && !camera.spot_error.is_fixed();
+        is_unknown.then(|| Self {
+            camera: camera.clone(),
+            learned: None,
+            misfit: Misfit {
+                spot_error: 0.0,
+                before: 1.0,
+                left: 0.0,
+                frames: 0.0,
+            },
+            frames: 0,
+            misfits: 0,
+            failed: 0,
+            rest: 0,
+        })
+    }
+
+    /// Learns from a frame that was searched.
+    pub fn learn(&mut self, search: &mut FrameSearch, found: &Found, budgets: &mut Budgets) -> Lesson {
+        let is_shown = found.spot_error > search.least_spot_error();
+        if found.hypothesis.sources.is_empty() || search.frame.smear.is_some() {
+            return Lesson::Nothing;
+        }
+        if self.learned.is_none() {
+            self.rest = self.rest.saturating_sub(1);
+            if !is_shown || self.rest > 0 {
+                return Lesson::Nothing;
+            }
+            (self.frames, self.misfits) = (0, 0);
+        }
+        self.frames += 1;
+        self.misfits = if is_shown { self.misfits + 1 } else { 0 };
+        let is_due =
+            self.misfits.is_power_of_two() || self.frames.is_power_of_two() || self.frames.is_multiple_of(ONE_IN);
+        if !is_due {
+            return Lesson::Nothing;
+        }
+        budgets.search.restart();
+        let mut candidate = Candidate::from(with_known_width(&found.hypothesis));
+        let before = excess_with(search, &mut candidate, budgets);
+        if self.learned.is_none() && before < EXPLAINED {
+            return Lesson::Nothing;
+        }
+        let most = EXPLAINED.max(MOST_LEFT * before);
+        let known = self.learned.take();
+        let was_used = known.is_some();
+        self.learned = known
+            .and_then(|known| self.fitted(&known.spot, search, found, budgets))
+            .filter(|learned| learned.excess < most);
+        if self.learned.is_none() {
+            let anew = LearnedSpot::new(&search.reweighting.space.bases);
+            self.learned = self
+                .fitted(&anew, search, found, budgets)
+                .filter(|learned| learned.excess < most.min(LEAST_GAIN * before));
+            self.misfit = Misfit {
+                spot_error: found.spot_error,
+                before,
+                left: 0.0,
+                frames: 0.0,
+            };
+        }
+        let Some(learned) = &mut self.learned else {
+            self.failed += 1;
+            self.rest = LONGEST_REST.min(1 << self.failed.min(8) >> 1);
+            return if was_used { Lesson::Wrong } else { Lesson::Nothing };
+        };
+        if self.frames.is_multiple_of(ONE_IN) {
+            self.failed = 0;
+        }
+        self.misfit.left += learned.excess;
+        self.misfit.frames += 1.0;
+        let error = learned.camera.spot_error.least().max(self.misfit.rest());
+        learned.camera.spot_error = SpotError::AtLeast(error);
+        Lesson::Better(Box::new(learned.camera.clone()))
+    }
+
+    /// Alternates the shape, from what was known and the frame, with the places and energies of the frame's sources.
+    fn fitted(
+        &self,
+        known: &LearnedSpot,
+        search: &FrameSearch,
+        found: &Found,
+        budgets: &mut Budgets,
+    ) -> Option<Learned> {
+        let mut candidate = Candidate::from(with_known_width(&found.hypothesis));
+        let mut best: Option<Learned> = None;
+        let mut at = known.clone();
+        for _ in 0..MOST_PASSES {
+            let mut spot = known.at(&at);
+            spot.add(&search.reweighting.space.bases, &search.frame, &candidate.sources);
+            let (shape, error) = spot.shape(&self.camera)?;
+            let camera = Camera {
+                spot_shape: Some(Arc::new(shape)),
+                spot_error: SpotError::AtLeast(error.max(self.camera.spot_error.least())),
+                ..self.camera.clone()
+            };
+            let mut shaped = search.of_shape(&camera);
+            let excess = excess_with(&mut shaped, &mut candidate, budgets);
+            let is_explained = excess < shaped.compressed.most_excess();
+            let last = best.as_ref().map_or(f64::INFINITY, |best| best.excess);
+            at = spot.clone();
+            if excess < last {
+                best = Some(Learned { spot, camera, excess });
+            }
+            if excess > STALLED * last || is_explained || budgets.search.is_exhausted() {
+                break;
+            }
+        }
+        best
+    }
+}
+
+/// The excess of a hypothesis that is fitted in the main space of a search.
+fn excess_with(search: &mut FrameSearch, candidate: &mut Candidate, budgets: &mut Budgets) -> f64 {
+    candidate.converged = false;
+    let mut fit = search.again(SearchKind::Main, budgets);
+    fit.fit_trial(candidate);
+    fit.compressed().excess(candidate)
+}
