@@ -9,6 +9,8 @@ use crate::estimate::model_order::learned_spot::LearnedSpot;
 use crate::estimate::model_order::spot_error::with_known_width;
 use crate::optics::{Camera, SpotError};
 
+/// Pixel pitch, σ, from which on pixels do not tell a spot's shape.
+const COARSEST: f64 = 2.0;
 /// Most alternations of learning the shape and fitting the sources, and the excess of one over the last's from which on they end.
 const MOST_PASSES: usize = 8;
 const STALLED: f64 = 0.9;
@@ -74,7 +76,8 @@ pub(crate) enum Lesson {
 impl SpotLearner {
     pub fn new(camera: &Camera) -> Option<Self> {
         let is_unknown = camera.spot_shape.is_none() && !camera.spot_error.is_fixed();
-        is_unknown.then(|| Self {
+        let pitch = camera.x.pitch_m.max(camera.y.pitch_m);
+        (is_unknown && pitch < COARSEST * camera.spot_sigma_m).then(|| Self {
             camera: camera.clone(),
             learned: None,
             misfit: Misfit {
