@@ -1,6 +1,6 @@
 //! Lenses whose spots differ from the PSF, as frame after frame shows them.
 
-use oapwatch::estimate::{Config, Estimate, Rules, build};
+use oapwatch::estimate::{Config, Emitter, Estimate, Rules, build};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
@@ -173,4 +173,35 @@ fn a_spot_that_was_learned_is_learned_anew_after_the_lens_was_focused() {
     let focused: Vec<_> = (0..20).map(|_| shown(&gaussian)).collect();
     let (error, chi2) = focused[19];
     assert!(error < 2e-3 && (0.7..1.1).contains(&chi2), "{focused:?}");
+}
+
+/// Of eight frames of five users through a halo, after four without: how many show a stranger of 3 % of their light, 3 σ beside one of them.
+fn strangers_beside_a_user(rules: Rules) -> usize {
+    let camera = camera();
+    let config = Config {
+        rules,
+        ..Default::default()
+    };
+    let mut ml = build(&config, &camera).unwrap();
+    let mut rng = ChaCha8Rng::seed_from_u64(34);
+    let stranger = [FIVE[2][0] + 3.0 * SIGMA_M, FIVE[2][1]];
+    let users = FIVE.map(|at| (at, 300.0));
+    let with_stranger = [&users[..], &[(stranger, 9.0)]].concat();
+    let mut emitters = |spots: &[([f64; 2], f64)]| {
+        let frame = frame(render_density(&camera, &moffat(SIGMA_M), spots, &mut rng));
+        ml.estimate(&frame).unwrap().emitters
+    };
+    for _ in 0..4 {
+        assert_eq!(emitters(&users).len(), 5);
+    }
+    let is_near = |e: &Emitter| (e.sensor_m[0] - stranger[0]).hypot(e.sensor_m[1] - stranger[1]) < SIGMA_M;
+    let is_seen = |emitters: Vec<Emitter>| emitters.len() == 6 && emitters.iter().any(is_near);
+    (0..8).filter(|_| is_seen(emitters(&with_stranger))).count()
+}
+
+#[test]
+fn a_learned_halo_hides_fewer_strangers() {
+    let learned = strangers_beside_a_user(Rules::default());
+    let assumed = strangers_beside_a_user(Rules::without("learn_spots").unwrap());
+    assert!(learned == 8 && assumed == 0, "{learned} and {assumed} of 8 frames");
 }
