@@ -116,7 +116,7 @@ impl SpotLearner {
         budgets.search.restart();
         let mut candidate = Candidate::from(with_known_width(&found.hypothesis));
         let before = excess_with(search, &mut candidate, budgets);
-        if self.learned.is_none() && before < search.compressed.most_excess() {
+        if self.learned.is_none() && before < EXPLAINED {
             return Lesson::Nothing;
         }
         let most = EXPLAINED.max(MOST_LEFT * before);
