@@ -101,7 +101,7 @@ impl SpotLearner {
         }
         if self.learned.is_none() {
             self.rest = self.rest.saturating_sub(1);
-            if !is_shown || self.rest > 0 {
+            if !is_shown || search.shown_by_recent_frames().is_none() || self.rest > 0 {
                 return Lesson::Nothing;
             }
             (self.frames, self.misfits) = (0, 0);
@@ -116,7 +116,7 @@ impl SpotLearner {
         budgets.search.restart();
         let mut candidate = Candidate::from(with_known_width(&found.hypothesis));
         let before = excess_with(search, &mut candidate, budgets);
-        if self.learned.is_none() && before < EXPLAINED {
+        if self.learned.is_none() && before < search.compressed.most_excess() {
             return Lesson::Nothing;
         }
         let most = EXPLAINED.max(MOST_LEFT * before);
