@@ -1,11 +1,20 @@
 //! Lenses whose spots differ from the PSF, as frame after frame shows them.
 
-use oapwatch::estimate::{Config, Emitter, Estimate, Rules, build};
+use oapwatch::estimate::{Config, Emitter, Estimate, Estimator, Rules, build};
+use oapwatch::optics::Camera;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::frames::{estimator, frame, places};
 use crate::lens::{FIVE, SIGMA_M, camera, moffat, render_density};
+
+fn with_rules(rules: Rules, camera: &Camera) -> Box<dyn Estimator> {
+    let config = Config {
+        rules,
+        ..Default::default()
+    };
+    build(&config, camera).unwrap()
+}
 
 /// A round spot, and its reflection of 2 % beside it.
 fn ghost(x: f64, y: f64) -> f64 {
@@ -78,11 +87,7 @@ fn a_lens_that_most_frames_do_not_show_hides_no_user() {
 /// The numbers of emitters of the later half of so many frames through `spot`, in turns.
 fn later_numbers(rules: Rules, spot: &dyn Fn(f64, f64) -> f64, spots: &[([f64; 2], f64)]) -> Vec<usize> {
     let camera = camera();
-    let config = Config {
-        rules,
-        ..Default::default()
-    };
-    let mut ml = build(&config, &camera).unwrap();
+    let mut ml = with_rules(rules, &camera);
     let mut rng = ChaCha8Rng::seed_from_u64(31);
     let mut count = |_| {
         let frame = frame(render_density(&camera, &spot, spots, &mut rng));
@@ -95,11 +100,7 @@ fn later_numbers(rules: Rules, spot: &dyn Fn(f64, f64) -> f64, spots: &[([f64; 2
 fn what_is_too_faint_for_a_frame_is_the_lens_s_where_all_frames_show_it() {
     let mut spots: Vec<_> = FIVE.map(|at| (at, 40.0)).into();
     let right = |numbers: &[usize]| numbers.iter().filter(|n| **n == 5).count();
-    let without = Rules {
-        stack_misfits: false,
-        learn_spots: false,
-        ..Rules::default()
-    };
+    let without = Rules::without("stack_misfits").unwrap();
     let alone = right(&later_numbers(without, &ghost, &spots));
     let together = right(&later_numbers(Rules::default(), &ghost, &spots));
     assert!(alone < 90 && together == 100, "{alone} and {together} of 100");
@@ -119,11 +120,7 @@ fn gaussian(x: f64, y: f64) -> f64 {
 /// whose ellipse holds them.
 fn pairs_through_a_halo(rules: Rules) -> (usize, usize) {
     let camera = camera();
-    let config = Config {
-        rules,
-        ..Default::default()
-    };
-    let mut ml = build(&config, &camera).unwrap();
+    let mut ml = with_rules(rules, &camera);
     let mut rng = ChaCha8Rng::seed_from_u64(32);
     let (mut right, mut held) = (0, 0);
     for index in 0..9 {
@@ -182,11 +179,7 @@ fn a_spot_that_was_learned_is_learned_anew_after_the_lens_was_focused() {
 /// Of eight frames of five users through a halo, after four without: how many show a stranger of 3 % of their light, 3 σ beside one of them.
 fn strangers_beside_a_user(rules: Rules) -> usize {
     let camera = camera();
-    let config = Config {
-        rules,
-        ..Default::default()
-    };
-    let mut ml = build(&config, &camera).unwrap();
+    let mut ml = with_rules(rules, &camera);
     let mut rng = ChaCha8Rng::seed_from_u64(34);
     let stranger = [FIVE[2][0] + 3.0 * SIGMA_M, FIVE[2][1]];
     let users = FIVE.map(|at| (at, 300.0));

@@ -32,8 +32,8 @@ pub(crate) struct AnalyticEstimator {
     search: FrameSearch,
     /// Where the spot's shape may be learned.
     learner: Option<SpotLearner>,
-    /// While a learned shape is used: the search and camera without it.
-    configured: Option<(FrameSearch, Camera)>,
+    /// While a learned shape is used: the search without it.
+    configured: Option<FrameSearch>,
     prior: Option<PowerPrior>,
     rules: Rules,
 }
@@ -161,15 +161,15 @@ impl AnalyticEstimator {
             Lesson::Better(camera) => {
                 let search = self.search.of_shape(&camera);
                 let last = std::mem::replace(&mut self.search, search);
-                let last_camera = std::mem::replace(&mut self.camera, *camera);
-                self.configured.get_or_insert((last, last_camera));
+                self.configured.get_or_insert(last);
+                self.camera = *camera;
             }
-            Lesson::Wrong => {
-                if let Some((configured, camera)) = self.configured.take() {
+            Lesson::Wrong(camera) => {
+                if let Some(configured) = self.configured.take() {
                     let last = std::mem::replace(&mut self.search, configured);
-                    self.camera = camera;
-                    self.search.take_frame(last.frame, &self.camera);
+                    self.search.take_frame(last.frame, &camera);
                 }
+                self.camera = *camera;
             }
         }
         budgets.search.restart();

@@ -48,7 +48,7 @@ struct Learned {
 }
 
 /// What the first frame showed without a learned shape, and what frames since left with it.
-#[derive(Clone, Copy)]
+#[derive(Default)]
 struct Misfit {
     spot_error: f64,
     before: f64,
@@ -69,8 +69,8 @@ pub(crate) enum Lesson {
     Nothing,
     /// To be searched again for spots of this camera.
     Better(Box<Camera>),
-    /// What was learned does not explain it.
-    Wrong,
+    /// What was learned does not explain it: to be searched for the spots of this camera, as it was configured.
+    Wrong(Box<Camera>),
 }
 
 impl SpotLearner {
@@ -80,12 +80,7 @@ impl SpotLearner {
         (is_unknown && pitch < COARSEST * camera.spot_sigma_m).then(|| Self {
             camera: camera.clone(),
             learned: None,
-            misfit: Misfit {
-                spot_error: 0.0,
-                before: 1.0,
-                left: 0.0,
-                frames: 0.0,
-            },
+            misfit: Misfit::default(),
             frames: 0,
             misfits: 0,
             failed: 0,
@@ -133,14 +128,16 @@ impl SpotLearner {
             self.misfit = Misfit {
                 spot_error: found.spot_error,
                 before,
-                left: 0.0,
-                frames: 0.0,
+                ..Misfit::default()
             };
         }
         let Some(learned) = &mut self.learned else {
             self.failed += 1;
             self.rest = LONGEST_REST.min(1 << self.failed.min(8) >> 1);
-            return if was_used { Lesson::Wrong } else { Lesson::Nothing };
+            return match was_used {
+                true => Lesson::Wrong(Box::new(self.camera.clone())),
+                false => Lesson::Nothing,
+            };
         };
         if self.frames.is_multiple_of(ONE_IN) {
             self.failed = 0;
