@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use nalgebra::{Matrix2, Matrix2x3, Matrix2x6, Matrix3, Matrix6, Vector2, Vector3};
+use nalgebra::{Matrix2, Matrix2x3, Matrix2x6, Matrix3, Matrix6, Rotation3, Vector2, Vector3, Vector6};
 
 use super::terrain::{Ground, Terrain};
 use crate::optics::Camera;
@@ -81,11 +81,11 @@ impl Sight {
 
     /// The same with the pose corrected by a rotation vector (north, east, down) and a shift (east, north, up), which are then
     /// known to `cov`.
-    pub fn corrected(&self, by: &nalgebra::Vector6<f64>, cov: Matrix6<f64>) -> Self {
+    pub fn corrected(&self, by: &Vector6<f64>, cov: Matrix6<f64>) -> Self {
         let turn = swap_ned_enu(by.fixed_rows::<3>(0).into());
         Self {
             lens_m: self.lens_m + by.fixed_rows::<3>(3),
-            to_world: nalgebra::Rotation3::from_scaled_axis(turn) * self.to_world,
+            to_world: Rotation3::from_scaled_axis(turn) * self.to_world,
             cov,
             terrain: self.terrain.clone(),
         }
@@ -118,6 +118,16 @@ impl Sight {
         let z_m = other.ground_below(place_m)?.z_m;
         let ray = other.to_world.transpose() * (Vector3::new(x, y, z_m) - other.lens_m);
         self.meet(self.to_world * ray)
+    }
+
+    /// The ground that a beam from the ground at a place, east and north, m, appears to come from, where the pose is off by `error`, as
+    /// [`Sight::corrected`] has it.
+    pub fn seen_with_error(&self, place_m: [f64; 2], error: &Vector6<f64>) -> Option<GroundPoint> {
+        let [x, y] = place_m;
+        let z_m = self.ground_below(place_m)?.z_m;
+        let turn = swap_ned_enu(error.fixed_rows::<3>(0).into());
+        let ray = Vector3::new(x, y, z_m) - self.lens_m + error.fixed_rows::<3>(3);
+        self.meet(Rotation3::from_scaled_axis(turn) * ray)
     }
 
     /// The sensor position, m, of a place in the world; `None` behind the camera.
@@ -223,7 +233,7 @@ impl GroundPoint {
 #[cfg(test)]
 mod tests {
     use jiff::Timestamp;
-    use nalgebra::{UnitQuaternion, Vector6};
+    use nalgebra::UnitQuaternion;
 
     use super::*;
 

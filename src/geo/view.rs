@@ -166,8 +166,7 @@ impl View {
         let Some(sight) = &self.sight else {
             return p;
         };
-        let truth = sight.corrected(&-error, *sight.cov());
-        let seen = sight.ground_seen_by(&truth, p.into());
+        let seen = sight.seen_with_error(p.into(), error);
         seen.map_or(p, |point| point.horizontal_m())
     }
 

@@ -118,7 +118,10 @@ impl PoseBuffer {
             return Outcome::Restarted;
         }
         self.jumps = 0;
-        let place = self.poses.partition_point(|p| p.time < pose.time);
+        let place = match ahead_s > 0.0 {
+            true => self.poses.len(),
+            false => self.poses.partition_point(|p| p.time < pose.time),
+        };
         let mut nearest = self
             .poses
             .range(place.saturating_sub(1)..self.poses.len().min(place + 1));

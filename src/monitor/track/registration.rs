@@ -102,10 +102,11 @@ fn pairs(tracks: &[Track], detections: &[Detection], prior: &Matrix6<f64>) -> Ve
         .filter(|t| t.confirmed && t.unresolved_from.is_none())
         .collect();
     let floor = Matrix2::identity() * GATE_FLOOR_M.powi(2);
+    let spread = |d: &Detection| d.cov + floor + d.by_pose * prior * d.by_pose.transpose();
+    let spreads: Vec<_> = detections.iter().map(spread).collect();
     let matching = assign(known.len(), detections.len(), GATE, |i, j| {
-        let d = &detections[j];
-        let cov = known[i].filter.position_cov() + d.cov + floor + d.by_pose * prior * d.by_pose.transpose();
-        mahalanobis2(d.position - known[i].filter.position(), cov)
+        let cov = known[i].filter.position_cov() + spreads[j];
+        mahalanobis2(detections[j].position - known[i].filter.position(), cov)
     });
     let pair = |(i, j): (usize, usize)| {
         let d = &detections[j];
