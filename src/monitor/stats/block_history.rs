@@ -72,17 +72,19 @@ impl<B: Default> BlockHistory<B> {
         }
     }
 
-    /// Adds a frame by `add` to the block that is being filled.
-    pub fn push(&mut self, add: impl FnOnce(&mut B)) {
+    /// Adds a frame by `add` to the block that is being filled; says whether that is then full.
+    pub fn push(&mut self, add: impl FnOnce(&mut B)) -> bool {
         add(&mut self.filling);
         self.filled += 1;
-        if self.filled == BLOCK_FRAMES {
+        let is_full = self.filled == BLOCK_FRAMES;
+        if is_full {
             self.blocks.push_back(std::mem::take(&mut self.filling));
             self.filled = 0;
             if self.blocks.len() > MAX_BLOCKS {
                 self.blocks.pop_front();
             }
         }
+        is_full
     }
 
     /// Full blocks, oldest first.

@@ -40,10 +40,38 @@ const DIRECTIONS: usize = 16;
 pub struct SecondMomentTest {
     recent: Recent<MomentScore>,
     past: BlockHistory<MomentScore>,
+    /// Of the full blocks of the past.
+    blocks: Blocks,
     /// Mean squared Mahalanobis distance of a frame from those before, over its expectation, and the frames it is of.
     dispersion: f64,
     dispersion_frames: f64,
     windows: [Option<WindowEstimate>; WINDOWS.len()],
+}
+
+/// The blocks' sum, and how their means scatter: the sum of squares over one less than their number, and the trace of a mean's own covariance.
+/// The latter two are only of enough blocks.
+#[derive(Clone, Copy, Debug, Default)]
+struct Blocks {
+    sum: MomentScore,
+    scatter: Option<(f64, f64)>,
+}
+
+impl Blocks {
+    fn of<'a>(blocks: impl Iterator<Item = &'a MomentScore> + Clone) -> Self {
+        let mut sum = MomentScore::default();
+        blocks.clone().for_each(|block| sum.add(block));
+        let means: Vec<_> = blocks.filter_map(MomentScore::solved).collect();
+        let n = means.len() as f64;
+        let scatter = (means.len() >= MIN_DRIFT_BLOCKS).then(|| {
+            let middle = means.iter().map(|(m, _)| m).sum::<Vector3<f64>>() / n;
+            let squares: f64 = means.iter().map(|(m, _)| (m - middle).norm_squared()).sum();
+            (
+                squares / (n - 1.0),
+                means.iter().map(|(_, cov)| cov.trace()).sum::<f64>() / n,
+            )
+        });
+        Self { sum, scatter }
+    }
 }
 
 /// Moments of a window, and their rise over what came before it, each with its covariance.
@@ -80,8 +108,10 @@ impl SecondMomentTest {
         let old = self.recent.push(frame);
         if learn {
             self.learn_dispersion(expected);
-            if let Some(old) = old {
-                self.past.push(|block| block.add(&old));
+            if let Some(old) = old
+                && self.past.push(|block| block.add(&old))
+            {
+                self.blocks = Blocks::of(self.past.blocks());
             }
         }
         self.update_windows();
@@ -99,11 +129,9 @@ impl SecondMomentTest {
     fn sum_before(&self, n: usize) -> Option<MomentScore> {
         let old = self.recent.len().checked_sub(n)?;
         (self.past.frames() + old as u32 >= MIN_FRAMES_BEFORE).then(|| {
-            let mut sum = *self.past.filling();
-            self.past
-                .blocks()
-                .chain(self.recent.iter().take(old))
-                .for_each(|m| sum.add(m));
+            let mut sum = self.blocks.sum;
+            sum.add(self.past.filling());
+            self.recent.iter().take(old).for_each(|m| sum.add(m));
             sum
         })
     }
@@ -121,15 +149,10 @@ impl SecondMomentTest {
 
     /// Standard deviation of the blocks' means beyond their noise.
     fn drift(&self) -> f64 {
-        let means: Vec<_> = self.past.blocks().filter_map(|b| b.solved()).collect();
-        if means.len() < MIN_DRIFT_BLOCKS {
-            return ASSUMED_DRIFT;
-        }
-        let n = means.len() as f64;
-        let middle = means.iter().map(|(m, _)| m).sum::<Vector3<f64>>() / n;
-        let squares: f64 = means.iter().map(|(m, _)| (m - middle).norm_squared()).sum();
-        let noise: f64 = means.iter().map(|(_, cov)| cov.trace()).sum::<f64>() * self.dispersion.max(1.0) / n;
-        (((squares / (n - 1.0) - noise) / 3.0).max(0.0)).sqrt().max(MIN_DRIFT)
+        self.blocks.scatter.map_or(ASSUMED_DRIFT, |(square, noise)| {
+            let beyond = square - noise * self.dispersion.max(1.0);
+            (beyond / 3.0).max(0.0).sqrt().max(MIN_DRIFT)
+        })
     }
 
     fn update_windows(&mut self) {
@@ -157,13 +180,14 @@ impl SecondMomentTest {
             let level = Some(((window.level.0, window.level.1 + lens), common.level));
             let rise = window.rise.map(|rise| (rise, common.rise));
             for ((own, cov), (shared, shared_cov)) in level.into_iter().chain(rise) {
-                let of = |off, cov: Matrix3<f64>| cov.try_inverse().map(|inverse| widening(off, inverse));
-                let (Some(less), Some(whole)) = (of(own - shared, cov + shared_cov), of(own, cov)) else {
-                    continue;
+                let more = |off, cov: Matrix3<f64>| {
+                    let found = cov.try_inverse().map(|inverse| widening(off, inverse));
+                    found.filter(|found| found.neg_log_p > most.neg_log_p)
                 };
-                let found = if less.neg_log_p < whole.neg_log_p { less } else { whole };
-                if found.neg_log_p > most.neg_log_p {
-                    most = found;
+                if let Some(whole) = more(own, cov)
+                    && let Some(less) = more(own - shared, cov + shared_cov)
+                {
+                    most = if less.neg_log_p < whole.neg_log_p { less } else { whole };
                 }
             }
         }
