@@ -272,8 +272,9 @@ impl Worker {
             let status = &mut lane.status;
             status.state = match (lane.queue.is_disabled(), lane.queue.is_failing()) {
                 (true, _) => EndpointState::Disabled,
-                (false, true) => EndpointState::Failing,
-                (false, false) => EndpointState::Working,
+                // After a start the first request of a queue goes alone, though nothing has failed.
+                (false, true) if status.last_error.is_some() => EndpointState::Failing,
+                (false, _) => EndpointState::Working,
             };
             status.queued = (lane.queue.len() + lane.cool_down.len()) as u64;
             status.oldest_queued = lane.queue.oldest();
