@@ -4,6 +4,7 @@
 //! JetStream until the server has stored them; the rest is latest-wins and lost while the link is down. It hears the claims that an
 //! access network publishes.
 
+mod claimed_height;
 mod claims;
 mod config;
 mod connection;

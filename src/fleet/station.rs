@@ -9,15 +9,17 @@ use jiff::Timestamp;
 use metrics::{counter, gauge};
 use tokio::time::MissedTickBehavior;
 
+use super::claimed_height::at_claimed_height;
 use super::claims::{self, Intake};
 use super::config::{Config, ConfigError};
 use super::connection::{self, Error};
 use super::message::{AlertMessage, HealthMessage, PoseMessage, PositionsMessage, VERSION};
 use super::subject::{Subject, Topic};
 use crate::api::{Feed, Published};
+use crate::claim::Claim;
 use crate::journal::{Attempt, Journal, Outcome, Subscription, Waiting};
 use crate::metric;
-use crate::monitor::StationName;
+use crate::monitor::{StationName, TrackedPosition};
 use crate::platform::Kind as PlatformKind;
 
 /// The fleet's name in the journal's outbox.
@@ -194,14 +196,19 @@ impl Station {
     fn positions_of(&self, latest: &Published) -> PositionsMessage {
         let report = &latest.snapshot.report;
         let view = latest.snapshot.status.view.as_ref();
+        let claims: Vec<&Claim> = latest.claims_in_view().collect();
+        let raised = |beam: &TrackedPosition| match view {
+            Some(view) => at_claimed_height(beam.clone(), &claims, [view.nadir_m[0], view.nadir_m[1], view.z_m]),
+            None => beam.clone(),
+        };
         PositionsMessage {
             version: VERSION,
             name: self.name.clone(),
             time: report.time,
             frame: report.frame,
-            emitters: report.emitters.clone(),
+            emitters: report.emitters.iter().map(raised).collect(),
             unseen: report.unseen.clone(),
-            claims: latest.claims_in_view().cloned().collect(),
+            claims: claims.into_iter().cloned().collect(),
             field_of_view_m: latest.snapshot.status.field_of_view_m,
             footprint_m: view.map(|view| view.footprint_m.clone()).unwrap_or_default(),
         }
