@@ -1,5 +1,6 @@
 //! What a fit is worth: covariance, bound, score test, posterior moments, and positions on the ground.
 
+pub mod confidence;
 pub mod covariance;
 pub mod cramer_rao;
 pub mod ill_determined;
