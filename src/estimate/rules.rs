@@ -77,6 +77,9 @@ rules! {
     /// A frame that another width or an elongated spot explains is searched from there, before it is asked whether its lens is another. Needed
     /// most in E2/64 with the condition `ellipse`.
     explain_by_width,
+    /// Where emitters explain the frame: a close pair that another width of all spots, or an ellipse, explains as well is one spot. Needed where spots
+    /// are wider than configured by less than a plain fit shows.
+    width_for_pairs,
     /// A frame that round spots do not explain is searched with the ellipse that most recent frames showed. Needed where spots overlap through
     /// a lens with astigmatism (`oapwatch study lens`).
     remember_ellipse,

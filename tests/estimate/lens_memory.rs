@@ -97,6 +97,29 @@ fn later_numbers(rules: Rules, spot: &dyn Fn(f64, f64) -> f64, spots: &[([f64; 2
 }
 
 #[test]
+fn a_width_that_is_off_by_a_percent_makes_no_pairs() {
+    let spots = FIVE.map(|at| (at, 140.0));
+    let wider = |x: f64, y: f64| gaussian(x / 1.01, y / 1.01);
+    let wrong = |rules: Rules| {
+        let numbers = later_numbers(rules, &wider, &spots);
+        numbers.iter().filter(|n| **n != 5).count()
+    };
+    let (with, without) = (
+        wrong(Rules::default()),
+        wrong(Rules::without("width_for_pairs").unwrap()),
+    );
+    assert!(with == 0 && without > 5, "{with} and {without} of 100");
+}
+
+#[test]
+fn a_beam_beside_one_user_is_no_width() {
+    let mut spots: Vec<_> = FIVE.map(|at| (at, 140.0)).into();
+    spots.push(([FIVE[2][0] + 0.9e-3, FIVE[2][1] + 0.3e-3], 40.0));
+    let numbers = later_numbers(Rules::default(), &gaussian, &spots);
+    assert!(numbers.iter().all(|n| *n == 6), "{numbers:?}");
+}
+
+#[test]
 fn what_is_too_faint_for_a_frame_is_the_lens_s_where_all_frames_show_it() {
     let mut spots: Vec<_> = FIVE.map(|at| (at, 40.0)).into();
     let right = |numbers: &[usize]| numbers.iter().filter(|n| **n == 5).count();

@@ -6,7 +6,7 @@ use crate::estimate::model_order::initialise::add_residual_peaks;
 use crate::estimate::model_order::nuisance_proposals::{BACKGROUND_AND_WIDTH, drop_nuisances, with_more_nuisances};
 use crate::estimate::model_order::nuisance_selection::{
     EARLY_ROUNDS, ROUNDS, has_paired_sources, has_unequal_energies, nuisances_can_replace_sources, select_nuisances,
-    try_rotated_ellipse,
+    try_rotated_ellipse, try_width_for_pairs,
 };
 use crate::estimate::model_order::pruning::prune_spurious;
 use crate::estimate::model_order::refine::refine;
@@ -35,6 +35,9 @@ pub(crate) fn maximum_likelihood(search: &mut Search, initial: Hypothesis) -> Hy
     let mut is_settled = search.is_explained_by(&candidate);
     if is_settled {
         refine(search, &mut candidate, ROUNDS);
+        if rules.width_for_pairs && search.pencil.is_none() && !search.is_measured() {
+            try_width_for_pairs(search, &mut candidate);
+        }
     } else {
         reinitialise(search, &mut candidate);
     }

@@ -27,6 +27,8 @@ const ELLIPSE_GAIN: f64 = 0.02;
 /// Sources within this distance, σ, may be one source with an elliptical PSF: a plain fit puts a pair in the place of a spot 5 % longer
 /// than wide; users so near each other are rare where spots stand apart.
 const CLOSE_PAIR_DISTANCE: f64 = 1.5;
+/// Spots that tell another width from a pair: with fewer nothing does.
+const LEAST_SPOTS: usize = 3;
 /// Wald statistic, in source penalties, below which a source may be an artefact of a background or a width; larger costs a fit with
 /// nuisances in more frames.
 const DOUBTFUL: f64 = 4.0;
@@ -126,6 +128,21 @@ pub(crate) fn try_rotated_ellipse(search: &mut Search, first: Hypothesis, candid
         search.keep_better(candidate, next);
     }
     search.context.budget.restore_limit(limit);
+}
+
+/// Another width or an elongated spot in the place of close pairs, if all spots together are likelier so. Spots that are a little wider than the PSF
+/// show it first in the brightest, which two sources explain as well.
+pub(crate) fn try_width_for_pairs(search: &mut Search, candidate: &mut Candidate) {
+    let pairs = disjoint_close_pairs(candidate, CLOSE_PAIR_DISTANCE);
+    if pairs.is_empty() || candidate.sources.len() < LEAST_SPOTS + pairs.len() {
+        return;
+    }
+    let merged = merge_pairs(candidate, &pairs);
+    for width in [Width::Common, Width::PerAxis, Width::RotatedEllipse] {
+        let mut next = merged.clone();
+        next.nuisances.width = width;
+        search.try_accept(candidate, next);
+    }
 }
 
 /// Whether overlapping sources differ so much in energy that some may be an artefact of a background or another width.

@@ -1,4 +1,4 @@
-//! Spots of seven lenses, as densities in pixels.
+//! Spots of eight lenses, as densities in pixels.
 
 use std::f64::consts::TAU;
 
@@ -20,8 +20,9 @@ pub const AIRY: Lens = uniform("Airy disc", |x, y, _| {
     (2.0 * libm::j1(r) / r).powi(2)
 });
 
-pub const LENSES: [Lens; 7] = [
+pub const LENSES: [Lens; 8] = [
     uniform("Gaussian", |x, y, _| gaussian(x, y, SIGMA)),
+    uniform("1 % wider", |x, y, _| gaussian(x, y, 1.01 * SIGMA)),
     AIRY,
     uniform("Moffat, β 2.5", |x, y, _| {
         (1.0 + (x * x + y * y) / (2.05 * SIGMA).powi(2)).powf(-2.5)
