@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use crate::estimate::estimators::budgets::Budgets;
 use crate::estimate::estimators::frame_search::{Found, FrameSearch, SearchKind};
+use crate::estimate::model::hypothesis::PointSource;
 use crate::estimate::model_order::candidate::Candidate;
 use crate::estimate::model_order::learned_spot::LearnedSpot;
 use crate::estimate::model_order::spot_error::with_known_width;
@@ -20,6 +21,8 @@ const EXPLAINED: f64 = 5.0;
 const MOST_LEFT: f64 = 0.002;
 /// Share of the excess that a shape must do away with to be used first.
 const LEAST_GAIN: f64 = 0.5;
+/// Sources for each that may stand in the spots' halo unseen, as somebody who was there before the halo was known.
+const FOR_ONE_UNSEEN: usize = 3;
 /// One frame in so many is learned from at least.
 const ONE_IN: u32 = 16;
 /// Most frames until the next try, which are doubled by each that failed.
@@ -160,6 +163,7 @@ impl SpotLearner {
         let mut candidate = Candidate::from(with_known_width(&found.hypothesis));
         let mut best: Option<Learned> = None;
         let mut at = known.clone();
+        let mut are_unseen_added = false;
         for _ in 0..MOST_PASSES {
             let mut spot = known.at(&at);
             spot.add(&search.reweighting.space.bases, &search.frame, &candidate.sources);
@@ -174,11 +178,17 @@ impl SpotLearner {
             let is_explained = excess < shaped.compressed.most_excess();
             let last = best.as_ref().map_or(f64::INFINITY, |best| best.excess);
             at = spot.clone();
-            if excess < last {
+            if excess < last && (is_explained || !are_unseen_added) {
                 best = Some(Learned { spot, camera, excess });
             }
-            if excess > STALLED * last || is_explained || budgets.search.is_exhausted() {
+            if is_explained || budgets.search.is_exhausted() {
                 break;
+            }
+            if excess > STALLED * last {
+                if are_unseen_added || !add_unseen(&mut shaped, &mut candidate, budgets) {
+                    break;
+                }
+                are_unseen_added = true;
             }
         }
         best
@@ -191,4 +201,14 @@ fn excess_with(search: &mut FrameSearch, candidate: &mut Candidate, budgets: &mu
     let mut fit = search.again(SearchKind::Main, budgets);
     fit.fit_trial(candidate);
     fit.compressed().excess(candidate)
+}
+
+/// Adds the strongest peaks of what a hypothesis leaves, a few for so many sources. Returns whether there are any.
+fn add_unseen(search: &mut FrameSearch, candidate: &mut Candidate, budgets: &mut Budgets) -> bool {
+    let most = candidate.sources.len() / FOR_ONE_UNSEEN;
+    let peaks = search.again(SearchKind::Main, budgets).residual_peaks(candidate);
+    let unseen = peaks.iter().take(most).map(|peak| PointSource::new(peak.u, peak.a));
+    let before = candidate.sources.len();
+    candidate.sources.extend(unseen);
+    candidate.sources.len() > before
 }
