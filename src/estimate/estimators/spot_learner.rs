@@ -23,6 +23,8 @@ const MOST_LEFT: f64 = 0.002;
 const LEAST_GAIN: f64 = 0.5;
 /// Sources for each that may stand in the spots' halo unseen, as somebody who was there before the halo was known.
 const FOR_ONE_UNSEEN: usize = 3;
+/// Excess of frames, two in a row, from which on the shape in use is wrong though they show no spot error: spots that have changed make emitters.
+const LOST: f64 = 100.0;
 /// One frame in so many is learned from at least.
 const ONE_IN: u32 = 16;
 /// Most frames until the next try, which are doubled by each that failed.
@@ -105,9 +107,10 @@ impl SpotLearner {
             (self.frames, self.misfits) = (0, 0);
         }
         self.frames += 1;
-        self.misfits = if is_shown { self.misfits + 1 } else { 0 };
-        let is_due =
-            self.misfits.is_power_of_two() || self.frames.is_power_of_two() || self.frames.is_multiple_of(ONE_IN);
+        let is_lost = || search.compressed_of(found.kind).excess(&found.hypothesis) > LOST;
+        self.misfits = if is_shown || is_lost() { self.misfits + 1 } else { 0 };
+        let is_again = self.misfits.is_power_of_two() && (is_shown || self.misfits > 1);
+        let is_due = is_again || self.frames.is_power_of_two() || self.frames.is_multiple_of(ONE_IN);
         if !is_due {
             return Lesson::Nothing;
         }
