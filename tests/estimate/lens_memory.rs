@@ -231,3 +231,25 @@ fn a_learned_halo_hides_fewer_strangers() {
 fn a_stranger_who_was_there_first_does_not_keep_a_halo_from_being_learned() {
     assert!(strangers_beside_a_user(Rules::default(), 0, 0.1) >= 7);
 }
+
+#[test]
+fn a_lens_that_is_refocused_is_learned_anew_within_three_frames() {
+    let camera = camera();
+    let mut ml = with_rules(Rules::default(), &camera);
+    let mut rng = ChaCha8Rng::seed_from_u64(35);
+    let mut number = |size: f64| {
+        let disc = |x: f64, y: f64| 1.0 / (1.0 + ((x.hypot(y) / SIGMA_M - 1.8 * size) / 0.24).exp());
+        let spots = FIVE.map(|at| {
+            (
+                at.map(|x| x + rng.random_range(-1e-3..1e-3)),
+                rng.random_range(300.0..1000.0),
+            )
+        });
+        let frame = frame(render_density(&camera, &disc, &spots, &mut rng));
+        ml.estimate(&frame).unwrap().emitters.len()
+    };
+    let focused: Vec<_> = (0..40).map(|_| number(1.0)).collect();
+    let refocused: Vec<_> = (0..7).map(|_| number(1.3)).collect();
+    assert!(focused[8..].iter().all(|n| *n == 5), "{focused:?}");
+    assert!(refocused[3..].iter().all(|n| *n == 5), "{refocused:?}");
+}
