@@ -4,7 +4,9 @@ use std::sync::Arc;
 
 use crate::estimate::estimators::budgets::Budgets;
 use crate::estimate::estimators::frame_search::{Found, FrameSearch, SearchKind};
-use crate::estimate::model::hypothesis::PointSource;
+use crate::estimate::fit::source_groups::linked;
+use crate::estimate::model::hypothesis::{Hypothesis, PointSource};
+use crate::estimate::model_order::bright_spots::CORE;
 use crate::estimate::model_order::candidate::Candidate;
 use crate::estimate::model_order::learned_spot::LearnedSpot;
 use crate::estimate::model_order::spot_error::with_known_width;
@@ -23,8 +25,9 @@ const MOST_LEFT: f64 = 0.002;
 const LEAST_GAIN: f64 = 0.5;
 /// Sources for each that may stand in the spots' halo unseen, as somebody who was there before the halo was known.
 const FOR_ONE_UNSEEN: usize = 3;
-/// Excess of frames, two in a row, from which on the shape in use is wrong though they show no spot error: spots that have changed make emitters.
-const LOST: f64 = 100.0;
+/// Fewest groups of sources that may be the spots of another shape, and their sources in the mean: a crowd is not round everywhere, and pairs are users.
+const LEAST_GROUPS: usize = 3;
+const CROWDED: usize = 3;
 /// One frame in so many is learned from at least.
 const ONE_IN: u32 = 16;
 /// Most frames until the next try, which are doubled by each that failed.
@@ -95,48 +98,35 @@ impl SpotLearner {
 
     /// Learns from a frame that was searched.
     pub fn learn(&mut self, search: &mut FrameSearch, found: &Found, budgets: &mut Budgets) -> Lesson {
-        let is_shown = found.spot_error > search.least_spot_error();
         if found.hypothesis.sources.is_empty() || search.frame.smear.is_some() {
             return Lesson::Nothing;
         }
+        let groups = groups_as_spots(&found.hypothesis);
+        let is_shown = found.spot_error > search.least_spot_error();
         if self.learned.is_none() {
             self.rest = self.rest.saturating_sub(1);
-            if !is_shown || search.shown_by_recent_frames().is_none() || self.rest > 0 {
+            let is_misfit = is_shown && search.shown_by_recent_frames().is_some() || groups.is_some();
+            if !is_misfit || self.rest > 0 {
                 return Lesson::Nothing;
             }
             (self.frames, self.misfits) = (0, 0);
         }
         self.frames += 1;
-        let is_lost = || search.compressed_of(found.kind).excess(&found.hypothesis) > LOST;
-        self.misfits = if is_shown || is_lost() { self.misfits + 1 } else { 0 };
-        let is_again = self.misfits.is_power_of_two() && (is_shown || self.misfits > 1);
-        let is_due = is_again || self.frames.is_power_of_two() || self.frames.is_multiple_of(ONE_IN);
+        self.misfits = if is_shown || groups.is_some() {
+            self.misfits + 1
+        } else {
+            0
+        };
+        let is_due =
+            self.misfits.is_power_of_two() || self.frames.is_power_of_two() || self.frames.is_multiple_of(ONE_IN);
         if !is_due {
             return Lesson::Nothing;
         }
         budgets.search.restart();
-        let mut candidate = Candidate::from(with_known_width(&found.hypothesis));
-        let before = excess_with(search, &mut candidate, budgets);
-        if self.learned.is_none() && before < search.compressed.most_excess() {
-            return Lesson::Nothing;
-        }
-        let most = EXPLAINED.max(MOST_LEFT * before);
-        let known = self.learned.take();
-        let was_used = known.is_some();
-        self.learned = known
-            .and_then(|known| self.fitted(&known.spot, search, found, budgets))
-            .filter(|learned| learned.excess < most);
-        if self.learned.is_none() {
-            let anew = LearnedSpot::new(&search.reweighting.space.bases);
-            self.learned = self
-                .fitted(&anew, search, found, budgets)
-                .filter(|learned| learned.excess < most.min(LEAST_GAIN * before));
-            self.misfit = Misfit {
-                spot_error: found.spot_error,
-                before,
-                ..Misfit::default()
-            };
-        }
+        let was_used = self.learned.is_some();
+        self.learned = groups
+            .and_then(|spots| self.of_groups(&spots, search, budgets))
+            .or_else(|| self.of_sources(search, found, budgets));
         let Some(learned) = &mut self.learned else {
             self.failed += 1;
             self.rest = LONGEST_REST.min(1 << self.failed.min(8) >> 1);
@@ -155,15 +145,47 @@ impl SpotLearner {
         Lesson::Better(Box::new(learned.camera.clone()))
     }
 
-    /// Alternates the shape, from what was known and the frame, with the places and energies of the frame's sources.
+    /// The shape of which groups of sources are single spots.
+    fn of_groups(&mut self, spots: &Hypothesis, search: &FrameSearch, budgets: &mut Budgets) -> Option<Learned> {
+        let anew = LearnedSpot::new(&search.reweighting.space.bases);
+        let learned = self.fitted(&anew, search, spots, budgets)?;
+        self.misfit = Misfit::default();
+        (learned.excess < EXPLAINED).then_some(learned)
+    }
+
+    /// The shape of a frame's sources: refined where one is known and explains it.
+    fn of_sources(&mut self, search: &mut FrameSearch, found: &Found, budgets: &mut Budgets) -> Option<Learned> {
+        let hypothesis = with_known_width(&found.hypothesis);
+        let before = excess_with(search, &mut Candidate::from(hypothesis.clone()), budgets);
+        let most = EXPLAINED.max(MOST_LEFT * before);
+        if let Some(known) = self.learned.take() {
+            let refined = self.fitted(&known.spot, search, &hypothesis, budgets);
+            let refined = refined.filter(|learned| learned.excess < most);
+            if refined.is_some() {
+                return refined;
+            }
+        } else if before < search.compressed.most_excess() {
+            return None;
+        }
+        self.misfit = Misfit {
+            spot_error: found.spot_error,
+            before,
+            ..Misfit::default()
+        };
+        let anew = LearnedSpot::new(&search.reweighting.space.bases);
+        let learned = self.fitted(&anew, search, &hypothesis, budgets)?;
+        (learned.excess < most.min(LEAST_GAIN * before)).then_some(learned)
+    }
+
+    /// Alternates the shape, from what was known and the frame, with the places and energies of sources.
     fn fitted(
         &self,
         known: &LearnedSpot,
         search: &FrameSearch,
-        found: &Found,
+        start: &Hypothesis,
         budgets: &mut Budgets,
     ) -> Option<Learned> {
-        let mut candidate = Candidate::from(with_known_width(&found.hypothesis));
+        let mut candidate = Candidate::from(start.clone());
         let mut best: Option<Learned> = None;
         let mut at = known.clone();
         let mut are_unseen_added = false;
@@ -196,6 +218,22 @@ impl SpotLearner {
         }
         best
     }
+}
+
+/// Each group of close sources as one, where these groups are few enough to be the spots of another shape.
+fn groups_as_spots(hypothesis: &Hypothesis) -> Option<Hypothesis> {
+    let sources = &hypothesis.sources;
+    let groups = linked(sources, CORE);
+    let as_spot = |group: &Vec<usize>| {
+        let light: f64 = group.iter().map(|&i| sources[i].a).sum();
+        let u = [0, 1].map(|k| group.iter().map(|&i| sources[i].a * sources[i].u[k]).sum::<f64>() / light);
+        PointSource::new(u, light)
+    };
+    let are_crowded = groups.len() >= LEAST_GROUPS && CROWDED * groups.len() <= sources.len();
+    are_crowded.then(|| Hypothesis {
+        sources: groups.iter().map(as_spot).collect(),
+        ..with_known_width(hypothesis)
+    })
 }
 
 /// The excess of a hypothesis that is fitted in the main space of a search.

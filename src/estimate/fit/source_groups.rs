@@ -4,7 +4,7 @@ use crate::estimate::fit::damped_step::Step;
 use crate::estimate::fit::normal_equations::NormalEquations;
 use crate::estimate::model::bases::Bases;
 use crate::estimate::model::compressed_frame::CompressedFrame;
-use crate::estimate::model::hypothesis::{Hypothesis, INDEPENDENT, Nuisances};
+use crate::estimate::model::hypothesis::{Hypothesis, INDEPENDENT, Nuisances, PointSource};
 use crate::estimate::model::separable_model::SeparableModel;
 
 /// A source is at rest when its squared step over the step's variance is below this: a tenth of a standard deviation, which the joint fit
@@ -22,9 +22,15 @@ pub(crate) fn source_groups(hypothesis: &Hypothesis) -> Option<Vec<Vec<usize>>> 
     {
         return None;
     }
+    let groups = linked(sources, INDEPENDENT);
+    (groups.len() > 1).then_some(groups)
+}
+
+/// The sources in groups of which each is nearer than this, σ, to another of its group.
+pub(crate) fn linked(sources: &[PointSource], distance: f64) -> Vec<Vec<usize>> {
     let is_linked = |i: usize, j: usize| {
         let d = [0, 1].map(|k| sources[i].u[k] - sources[j].u[k]);
-        d[0].hypot(d[1]) < INDEPENDENT
+        d[0].hypot(d[1]) < distance
     };
     let mut groups: Vec<Vec<usize>> = Vec::new();
     for i in 0..sources.len() {
@@ -36,7 +42,7 @@ pub(crate) fn source_groups(hypothesis: &Hypothesis) -> Option<Vec<Vec<usize>>> 
         apart.push(group);
         groups = apart;
     }
-    (groups.len() > 1).then_some(groups)
+    groups
 }
 
 /// The sources of groups that a step moved; `None` where that is none, and where they are more than half of all. Only without nuisances.
