@@ -2,6 +2,7 @@
 //! and returns findings; none of them changes an alert, a track or another rule's memory.
 
 pub(super) mod co_located;
+pub(super) mod flashes;
 pub(super) mod inputs;
 pub(super) mod known_light;
 pub(super) mod mismatch;
