@@ -21,8 +21,8 @@ const OUTLIER: f64 = 6.0;
 const PASSES: usize = 14;
 /// One pass rejects pixels of at least this share of the worst one's deviation: the worst hide the rest.
 const SHARE: f64 = 0.5;
-/// Pixels wider than this, σ, can be lit alone by a spot and are not tested for isolation.
-const WIDEST_PIXEL: f64 = 0.5;
+/// Pixels wider than this, σ, can be lit alone by a spot's misfit (of its width, from 0.9 on) and are not tested for isolation.
+const WIDEST_PIXEL: f64 = 0.8;
 /// Signal levels at which the noise is measured: each holds half the pixels of the one before, the brightest 1/128.
 const LEVELS: usize = 8;
 
@@ -34,6 +34,11 @@ pub(crate) struct NoiseInspection {
     squares: Vec<(f64, f64)>,
     /// Whether the part outside the basis is white noise of the configured variance.
     pub is_white: bool,
+}
+
+/// Whether enough of the frame is outside the basis for single pixels to show there: a spot explains a hot pixel's part inside.
+pub(crate) fn is_measured(compressed: &CompressedFrame) -> bool {
+    compressed.outside.1 >= FEWEST
 }
 
 impl NoiseInspection {
@@ -48,7 +53,7 @@ impl NoiseInspection {
     ) -> f64 {
         let z = |compressed: &CompressedFrame| (compressed.outside.0 - 1.0) * (compressed.outside.1 / 2.0).sqrt();
         self.is_white = z(compressed).abs() < DIFFERENT;
-        if self.is_white || compressed.outside.1 < FEWEST {
+        if self.is_white || !is_measured(compressed) {
             return 1.0;
         }
         for _ in 0..PASSES {
