@@ -2,6 +2,7 @@
 
 mod bound;
 mod frames;
+mod hot_pixels;
 mod lens;
 mod lens_memory;
 mod moving;
