@@ -6,7 +6,7 @@ use nalgebra::{Matrix2, Matrix6, Vector2, Vector6};
 use super::alert_lifecycle::AlertLifecycle;
 use super::ambiguity;
 use super::config::{Config, Source};
-use super::input::claim_state::ActiveClaim;
+use super::input::claim_state::{ActiveClaim, is_near_view};
 use super::input::claim_timing::ClaimTiming;
 use super::input::crowding::Crowding;
 use super::input::overload::Overload;
@@ -232,11 +232,14 @@ impl FrameContext {
         self.time = Some(self.time.map_or(now, |t| t.max(now)));
     }
 
-    /// Active users whose beam was seen a moment ago, or just before the sensor went blind.
+    /// Active users whose beam was seen a moment ago, or just before the sensor went blind, and where it is is in view still.
     pub fn visible_users(&self) -> usize {
         let within_s = VISIBLE_S + self.sensor.blind_s(self.now);
+        let track = |a: &ActiveClaim| self.tracker.get(a.before.track?);
+        let place = |a: &ActiveClaim| track(a).map_or(a.position, |track| track.filter.position());
         let active = self.claims.iter().filter(|a| !a.ended);
         active
+            .filter(|a| is_near_view(&self.view, place(a), 0.0))
             .filter_map(|a| a.before.last_seen)
             .filter(|t| seconds(*t, self.now) < within_s)
             .count()

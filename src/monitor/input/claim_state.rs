@@ -213,7 +213,8 @@ impl ActiveClaim {
     }
 }
 
-fn is_near_view(view: &View, p: Vector2<f64>, margin_m: f64) -> bool {
+/// Whether a place is in view, or beyond its edge by less than this.
+pub fn is_near_view(view: &View, p: Vector2<f64>, margin_m: f64) -> bool {
     let camera = &view.camera;
     let [x, y] = view.to_sensor([p.x, p.y]);
     let margin = margin_m / view.ground_scale();

@@ -154,6 +154,19 @@ mod tests {
     }
 
     #[test]
+    fn beams_that_have_left_the_view_are_not_lost_with_the_sensor() {
+        // The view reaches 125 m.
+        let places = [[0.0, 0.0], [100.0, 0.0], [140.0, 0.0]];
+        let mut scene = Scene::of_users(&places);
+        let now = scene.now;
+        for (k, claim) in scene.frame.claims.iter_mut().enumerate() {
+            claim.before.track = Some(k as u64 + 1);
+            claim.before.last_seen = Some(now);
+        }
+        assert_eq!(scene.visible_users(), 2);
+    }
+
+    #[test]
     fn a_quiet_log_is_stale_if_there_is_anybody_to_claim() {
         let mut scene = Scene::of_users(&[[0.0, 0.0]]);
         // Five seconds, by arrival or by the claims' own times.
