@@ -21,8 +21,9 @@ const OUTLIER: f64 = 6.0;
 const PASSES: usize = 14;
 /// One pass rejects pixels of at least this share of the worst one's deviation: the worst hide the rest.
 const SHARE: f64 = 0.5;
-/// Pixels wider than this, σ, can be lit alone by a spot's misfit (of its width, from 0.9 on) and are not tested for isolation.
-const WIDEST_PIXEL: f64 = 0.8;
+/// Pixels wider than the first, σ, can be lit alone by a spot's misfit, which is less than its light, and wider than the second by a spot; these
+/// are not tested for isolation.
+const WIDEST_PIXEL: [f64; 2] = [0.5, 0.8];
 /// Signal levels at which the noise is measured: each holds half the pixels of the one before, the brightest 1/128.
 const LEVELS: usize = 8;
 
@@ -116,7 +117,9 @@ impl NoiseInspection {
         bx: &Basis,
         by: &Basis,
     ) -> bool {
-        if bx.pitch().max(by.pitch()) > WIDEST_PIXEL {
+        let pitch = bx.pitch().max(by.pitch());
+        let [wide, widest] = WIDEST_PIXEL;
+        if pitch > widest {
             return false;
         }
         let (nx, ny) = (bx.n, by.n);
@@ -141,7 +144,8 @@ impl NoiseInspection {
                 let noise = compressed.variance.at(self.smooth[k]).sqrt();
                 // The mean of four neighbours adds a quarter of their variance.
                 let is_alone = beyond > 0.8 * left[k].abs() && left[k].abs() > 0.6 * beyond.max(most);
-                if is_alone && beyond > OUTLIER * noise * 1.12 {
+                let is_misfit = pitch > wide && left[k].abs() < self.smooth[k];
+                if is_alone && !is_misfit && beyond > OUTLIER * noise * 1.12 {
                     found.push((x, y));
                 }
             }
