@@ -172,6 +172,7 @@ impl Pipeline {
                 age_s: pose.age_s,
                 is_lost: *is_lost,
                 delay_s: self.platform.delay_s(),
+                by_delay: pose.rates * self.platform.delay_std_s(),
             },
             Placement::Unknown { waited_s, is_lost } => Look::Unknown {
                 waited_s: *waited_s,

@@ -23,7 +23,7 @@ use super::stats::error_budget::{ErrorBudget, TestFamily};
 use super::stats::gaussian::largest_eigenvalue;
 use super::track::association::Association;
 use super::track::beam_track::Track;
-use super::track::common_course::{CommonCourse, Pull};
+use super::track::common_course::{AtNadir, CommonCourse, Pull};
 use super::track::detection::{Detection, OVERLAP, spot_m};
 use super::track::registration::register;
 use super::track::tracker::Tracker;
@@ -183,14 +183,22 @@ impl FrameContext {
             Look::From { age_s, is_lost, .. } => (true, is_lost.then_some(age_s)),
             Look::Unknown { waited_s, is_lost } => (false, is_lost.then_some(waited_s)),
         };
-        if let Look::From { delay_s, .. } = look {
-            self.course.take_delay(delay_s);
-        }
         self.pose_error = None;
         self.view.sight = match look {
             Look::From { sight, .. } => Some(sight.clone()),
             _ => None,
         };
+        if let Look::From {
+            sight,
+            delay_s,
+            by_delay,
+            ..
+        } = look
+        {
+            let nadir = sight.ground_at(self.view.nadir_m().into());
+            let off = nadir.map_or_else(Vector2::zeros, |p| p.by_pose * by_delay);
+            self.course.take_delay(delay_s, off.norm());
+        }
     }
 
     /// Takes the pose error that all detections share out of them and out of the view. How far off the tracks themselves may be
@@ -223,7 +231,11 @@ impl FrameContext {
             _ => *sight.cov(),
         };
         self.track_frame_cov = Some(cov);
-        self.pose_error = Some(self.course.take(&found.error, pull, dt));
+        let at_nadir = nadir.as_ref().map_or_else(AtNadir::default, |p| AtNadir {
+            error: p.by_pose * found.error,
+            own_m2: p.pose_cov(&found.cov).trace(),
+        });
+        self.pose_error = Some(self.course.take(&found.error, at_nadir, pull, dt));
         self.view.sight = Some(sight.corrected(&(-found.error * (1.0 - pull.position)), cov));
     }
 

@@ -1,6 +1,7 @@
 //! The input of one step of the monitor and its output.
 
 use jiff::Timestamp;
+use nalgebra::Vector6;
 use serde::{Deserialize, Serialize};
 
 use crate::claims::Claim;
@@ -34,6 +35,8 @@ pub enum Look<'a> {
         is_lost: bool,
         /// Pose stamps minus frame stamps, s, by which it was taken.
         delay_s: f64,
+        /// How far off the pose may be as that is not known exactly, one standard deviation.
+        by_delay: Vector6<f64>,
     },
     /// Not known: no pose has come yet, for `waited_s` seconds.
     Unknown { waited_s: f64, is_lost: bool },

@@ -221,6 +221,11 @@ impl Platform {
         self.delay_s.unwrap_or(self.learned.delay_s())
     }
 
+    /// How exactly that is known, s.
+    pub fn delay_std_s(&self) -> f64 {
+        self.delay_s.map_or(self.learned.std_s(), |_| 0.0)
+    }
+
     /// Learns the delay from the pose error that the beams of a frame share, where it is not configured. `pose` is that of the
     /// frame.
     pub fn learn(&mut self, error: &Vector6<f64>, pose: &PoseAt) {
@@ -288,9 +293,8 @@ impl Platform {
                 is_lost: waited_s > self.lost_s,
             };
         };
-        if self.delay_s.is_none() {
-            pose.pose.cov += pose.rates * pose.rates.transpose() * self.learned.std_s().powi(2);
-        }
+        let by_delay = pose.rates * self.delay_std_s();
+        pose.pose.cov += by_delay * by_delay.transpose();
         let is_lost = pose.age_s > self.lost_s;
         Placement::At {
             sight: Sight::new(&pose.pose, &self.mount).over(self.terrain.clone()),

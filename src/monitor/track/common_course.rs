@@ -1,17 +1,30 @@
 //! How fast all tracks together follow the poses. What the beams of a frame share is taken out of it as a pose error, so that only
 //! this tells the tracks where they are, and at what speed all of them move.
 
-use nalgebra::{Matrix6, Vector6};
+use nalgebra::{Matrix6, Vector2, Vector6};
 
-/// Time over which a straight line is fitted to the error that tracks and poses share, s. Longer lets a dragged position be
-/// noticed later, shorter has tracks follow a pose that is late to and fro.
+/// Longest and shortest time over which a straight line is fitted to the error that tracks and poses share, s. Longer lets a dragged
+/// position be noticed later and tracks go astray with users who turn together, shorter has tracks follow a pose that is late to and fro and
+/// what is wrong with single poses.
 const MEMORY_S: f64 = 6.0;
+const LEAST_MEMORY_S: f64 = 0.5;
+/// Time between two errors that are compared, s: those of single poses have nothing to do with each other, those of turning users do.
+/// Longer takes fast turns for noise, shorter the noise of poses that are interpolated for a turn. Not measured.
+const APART_S: f64 = 0.5;
+/// How far the delay of the poses may have them be off, m, for the errors that last to be the tracks'. Not measured.
+const ON_TIME_M: f64 = 0.2;
 
 /// Change of the delay of the poses, s, with which what tracks have followed is of another time: a sway of 8° in 8 s turns by 0.6 mrad
 /// within it. Smaller has noise move the tracks, larger leaves them swinging.
 const RETIMED_S: f64 = 6e-3;
 /// What is left of the memory then, s. Longer swings on, shorter follows the noise of single poses.
 const RETIMED_MEMORY_S: f64 = 2.0;
+
+/// Time over which it is learned whether errors last, s. Longer is more exact, shorter follows users who begin to turn. Not measured.
+const AVERAGED_S: f64 = 20.0;
+
+/// Variance of the mean of white errors over that of the same mean of what is left of them against tracks that follow it.
+const FOLLOWED: f64 = 1.4;
 
 /// A straight line through the shared error by least squares, over the time since the tracks began or the memory (an α-β filter;
 /// Bar-Shalom, Li and Kirubarajan, 2001, section 6.5).
@@ -22,9 +35,29 @@ pub struct CommonCourse {
     /// How far the tracks have been moved since they began, and how fast that makes them move, as errors of the pose.
     moved: Vector6<f64>,
     velocity: Vector6<f64>,
-    /// Mean product of the errors, and what of it is in the end of the line.
-    scatter: Matrix6<f64>,
+    /// The mean of the errors that are newest, the mean of its square, and what of that the tracks' own errors do not explain.
+    newest: Vector6<f64>,
+    newest_square: Matrix6<f64>,
     cov: Matrix6<f64>,
+    /// At the nadir: that mean, m, that of its square, and the variance by the tracks' own errors, m².
+    newest_at_nadir: Vector2<f64>,
+    newest_square_m2: f64,
+    own_m2: f64,
+    averaged_s: f64,
+    /// Since when the poses are on time, s, the error of a moment ago at the nadir, m, how long ago, s, and the mean squares of such errors
+    /// and of half their changes, m².
+    on_time_s: f64,
+    earlier: Vector2<f64>,
+    since_s: f64,
+    square: f64,
+    change: f64,
+}
+
+/// What the error of a frame's pose makes at the nadir, m, and its variance there by the tracks' own errors, m².
+#[derive(Clone, Copy, Debug, Default)]
+pub struct AtNadir {
+    pub error: Vector2<f64>,
+    pub own_m2: f64,
 }
 
 /// Shares of a frame's error that go into all tracks.
@@ -37,11 +70,13 @@ pub struct Pull {
 }
 
 impl Pull {
-    /// Variance of a position that is pulled so every `dt` seconds, over that of the errors that pull it (Bar-Shalom, Li and
-    /// Kirubarajan, 2001, section 6.5).
-    fn variance_ratio(&self, dt: f64) -> f64 {
+    /// Share of the newest error in an exponential mean whose variance is that of a position that is pulled so every `dt` seconds, if errors
+    /// have nothing to do with each other (Bar-Shalom, Li and Kirubarajan, 2001, section 6.5). Errors that last, as of users who turn
+    /// together, are in that mean as they are in the position.
+    fn share_of_newest(&self, dt: f64) -> f64 {
         let (a, b) = (self.position, self.velocity * dt);
-        (2.0 * a * a + b * (2.0 - 3.0 * a)) / (a * (4.0 - 2.0 * a - b))
+        let ratio = (2.0 * a * a + b * (2.0 - 3.0 * a)) / (a * (4.0 - 2.0 * a - b));
+        2.0 * ratio / (1.0 + ratio)
     }
 }
 
@@ -51,8 +86,12 @@ impl CommonCourse {
         *self = Self::default();
     }
 
-    /// The poses are taken `delay_s` late: where that has been learned meanwhile, tracks have followed a platform that swayed otherwise.
-    pub fn take_delay(&mut self, delay_s: f64) {
+    /// The poses are taken `delay_s` late, and are `off_m` off as that is not known exactly. Where it has been learned meanwhile, tracks
+    /// have followed a platform that swayed otherwise.
+    pub fn take_delay(&mut self, delay_s: f64, off_m: f64) {
+        if off_m > ON_TIME_M {
+            self.on_time_s = 0.0;
+        }
         if (delay_s - self.delay_s).abs() > RETIMED_S {
             self.delay_s = delay_s;
             self.seen_s = self.seen_s.min(RETIMED_MEMORY_S);
@@ -60,21 +99,45 @@ impl CommonCourse {
     }
 
     /// The error of a frame's pose against where the tracks began, `error` being that against the tracks, which take `pull` of it.
-    pub fn take(&mut self, error: &Vector6<f64>, pull: Pull, dt: f64) -> Vector6<f64> {
+    pub fn take(&mut self, error: &Vector6<f64>, there: AtNadir, pull: Pull, dt: f64) -> Vector6<f64> {
+        let at_nadir = there.error;
+        self.since_s += dt;
+        if self.since_s >= APART_S {
+            let share = (self.since_s / self.averaged_s.max(self.since_s)).min(1.0);
+            self.square += (at_nadir.norm_squared() - self.square) * share;
+            self.change += (0.5 * (at_nadir - self.earlier).norm_squared() - self.change) * share;
+            (self.earlier, self.since_s) = (at_nadir, 0.0);
+        }
         self.moved += self.velocity * dt;
         let since_began = error + self.moved;
         self.moved += error * pull.position;
         self.velocity += error * pull.velocity;
         if pull.position > 0.0 {
-            self.scatter += (error * error.transpose() - self.scatter) * (dt / self.seen_s).min(1.0);
-            self.cov = self.scatter * pull.variance_ratio(dt);
+            self.averaged_s = (self.averaged_s + dt).min(AVERAGED_S);
+            let of_mean = (dt / self.averaged_s.min(MEMORY_S)).min(1.0);
+            let of_newest = pull.share_of_newest(dt);
+            self.newest += (error - self.newest) * of_newest;
+            self.newest_square += (self.newest * self.newest.transpose() - self.newest_square) * of_mean;
+            self.newest_at_nadir += (at_nadir - self.newest_at_nadir) * of_newest;
+            self.newest_square_m2 += (self.newest_at_nadir.norm_squared() - self.newest_square_m2) * of_mean;
+            self.own_m2 += (there.own_m2 - self.own_m2) * of_mean;
+            let unexplained = 1.0 - self.own_m2 / self.newest_square_m2.max(self.own_m2).max(f64::MIN_POSITIVE);
+            self.cov = self.newest_square * (FOLLOWED * unexplained);
         }
         since_began
     }
 
-    /// Covariance of the end of the line: what the errors of single poses leave in all tracks.
+    /// Covariance of the end of the line: what the errors of single poses, and users who turn together, leave in all tracks.
     pub fn cov(&self) -> &Matrix6<f64> {
         &self.cov
+    }
+
+    /// How long errors are averaged: as long as it is single poses that make them. What lasts is the tracks' own, as users turn together.
+    fn memory_s(&self) -> f64 {
+        if self.on_time_s < MEMORY_S || !(self.change < self.square) {
+            return MEMORY_S;
+        }
+        (MEMORY_S * self.change / self.square).max(LEAST_MEMORY_S)
     }
 
     /// The pull of a frame that comes `dt` seconds after the last one.
@@ -82,7 +145,8 @@ impl CommonCourse {
         if !(dt > 0.0) {
             return Pull::default();
         }
-        self.seen_s = (self.seen_s + dt).min(MEMORY_S);
+        self.on_time_s += dt;
+        self.seen_s = (self.seen_s + dt).min(self.memory_s());
         let n = (self.seen_s / dt).max(1.0);
         let of_both = 2.0 / ((n + 1.0) * (n + 2.0));
         Pull {
@@ -100,19 +164,29 @@ mod tests {
 
     use super::*;
 
-    /// The largest error after half a minute of a common course of tracks that began with 1 m/s too much, where poses are
-    /// `late(t)` off.
-    fn left(late: impl Fn(f64) -> f64) -> f64 {
+    fn at_nadir(x: f64) -> AtNadir {
+        AtNadir {
+            error: Vector2::new(x, 0.0),
+            own_m2: 0.0,
+        }
+    }
+
+    /// The largest error after half a minute of a common course of tracks that began with 1 m/s too much and move at `turning(t)` m/s, where
+    /// poses are `late(t)` off and their delay may have them be `off_m` off.
+    fn left(late: impl Fn(f64) -> f64, turning: impl Fn(f64) -> f64, off_m: f64) -> f64 {
         let mut course = CommonCourse::default();
         let (mut x, mut v, mut largest) = (0.0, 1.0, 0.0f64);
         for k in 0..600 {
             let (dt, t) = (0.1, 0.1 * f64::from(k));
-            x += v * dt;
+            x += (v + turning(t)) * dt;
+            course.take_delay(0.0, off_m);
             let error = late(t) - x;
             let pull = course.pull(dt);
-            let since_began = course.take(&Vector6::new(0.0, 0.0, 0.0, error, 0.0, 0.0), pull, dt);
-            // All but the velocity that the tracks began with.
-            assert!((since_began[3] - (late(t) - (t + dt))).abs() < 1e-9);
+            let since_began = course.take(&Vector6::new(0.0, 0.0, 0.0, error, 0.0, 0.0), at_nadir(error), pull, dt);
+            if turning(t) == 0.0 {
+                // All but the velocity that the tracks began with.
+                assert!((since_began[3] - (late(t) - (t + dt))).abs() < 1e-9);
+            }
             x += pull.position * error;
             v += pull.velocity * error;
             if k >= 300 {
@@ -132,7 +206,12 @@ mod tests {
             let noise: f64 = StandardNormal.sample(&mut rng);
             let error = 0.15 * noise - x;
             let pull = course.pull(0.1);
-            course.take(&Vector6::new(0.0, 0.0, 0.0, error, 0.0, 0.0), pull, 0.1);
+            course.take(
+                &Vector6::new(0.0, 0.0, 0.0, error, 0.0, 0.0),
+                at_nadir(error),
+                pull,
+                0.1,
+            );
             x += pull.position * error;
             v += pull.velocity * error;
             if k > 100 {
@@ -148,7 +227,7 @@ mod tests {
         let pull = |delays: [f64; 2]| {
             let mut course = CommonCourse::default();
             for k in 0..100 {
-                course.take_delay(delays[k / 99]);
+                course.take_delay(delays[k / 99], 0.0);
                 course.pull(0.1);
             }
             course.pull(0.1).position
@@ -159,9 +238,18 @@ mod tests {
 
     #[test]
     fn tracks_lose_a_common_velocity_and_do_not_swing() {
-        assert!(left(|_| 0.0) < 1e-3, "{}", left(|_| 0.0));
+        for off_m in [0.0, 1.0] {
+            let lost = left(|_| 0.0, |_| 0.0, off_m);
+            assert!(lost < 1e-3, "{lost}");
+        }
         // A sway of 8 s that is seen 1 m off: less of it in the tracks.
-        let swayed = left(|t| (0.785 * t).sin());
+        let swayed = left(|t| (0.785 * t).sin(), |_| 0.0, 1.0);
         assert!(swayed < 0.8, "{swayed}");
+    }
+
+    #[test]
+    fn users_who_turn_together_do_not_take_the_tracks_with_them() {
+        let [on_time, late] = [0.0, 1.0].map(|off_m| left(|_| 0.0, |t| 0.5 * (0.8 * t).cos(), off_m));
+        assert!(on_time < 0.5 * late, "{on_time} and {late}");
     }
 }
