@@ -149,8 +149,10 @@ impl SpotLearner {
     fn of_groups(&mut self, spots: &Hypothesis, search: &FrameSearch, budgets: &mut Budgets) -> Option<Learned> {
         let anew = LearnedSpot::new(&search.reweighting.space.bases);
         let learned = self.fitted(&anew, search, spots, budgets)?;
-        self.misfit = Misfit::default();
-        (learned.excess < EXPLAINED).then_some(learned)
+        (learned.excess < EXPLAINED).then(|| {
+            self.misfit = Misfit::default();
+            learned
+        })
     }
 
     /// The shape of a frame's sources: refined where one is known and explains it.
