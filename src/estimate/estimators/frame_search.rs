@@ -21,7 +21,7 @@ use crate::estimate::model_order::search::{Search, SearchSpace};
 use crate::estimate::model_order::spot_error::{Shape, explained_by_width, inspect_shape};
 use crate::estimate::model_order::spot_error_history::SpotErrorHistory;
 use crate::estimate::preprocess::noise_variance::VarianceFunction;
-use crate::estimate::preprocess::outliers::{NoiseInspection, is_measured};
+use crate::estimate::preprocess::outliers::{NoiseInspection, may_hide_outliers};
 use crate::estimate::preprocess::screening::PreprocessedFrame;
 use crate::estimate::rules::Rules;
 use crate::optics::{Camera, SpotError};
@@ -379,7 +379,8 @@ impl FrameSearch {
     /// The initial hypothesis after masking isolated outliers.
     fn mask_outliers(&mut self, mut initial: Hypothesis, budget: &mut WorkBudget) -> Hypothesis {
         for _ in 0..OUTLIER_PASSES {
-            if is_measured(&self.compressed) && self.compressed.is_explained_by(&initial) {
+            let may_hide = may_hide_outliers(&self.compressed, self.space.bases.axes());
+            if !may_hide && self.compressed.is_explained_by(&initial) {
                 break;
             }
             let mut search = self.search(budget);

@@ -37,9 +37,9 @@ pub(crate) struct NoiseInspection {
     pub is_white: bool,
 }
 
-/// Whether enough of the frame is outside the basis for single pixels to show there: a spot explains a hot pixel's part inside.
-pub(crate) fn is_measured(compressed: &CompressedFrame) -> bool {
-    compressed.outside.1 >= FEWEST
+/// Whether a spot may explain a hot pixel: too little of the frame is outside the basis to show single pixels, and their neighbours can.
+pub(crate) fn may_hide_outliers(compressed: &CompressedFrame, [bx, by]: [&Basis; 2]) -> bool {
+    compressed.outside.1 < FEWEST && bx.pitch().max(by.pitch()) <= WIDEST_PIXEL[1]
 }
 
 impl NoiseInspection {
@@ -54,7 +54,7 @@ impl NoiseInspection {
     ) -> f64 {
         let z = |compressed: &CompressedFrame| (compressed.outside.0 - 1.0) * (compressed.outside.1 / 2.0).sqrt();
         self.is_white = z(compressed).abs() < DIFFERENT;
-        if self.is_white || !is_measured(compressed) {
+        if self.is_white || compressed.outside.1 < FEWEST {
             return 1.0;
         }
         for _ in 0..PASSES {
