@@ -1,7 +1,7 @@
 //! What rules may read: one frame's claims, tracks and their association, our pose, and the alerts as they stand.
 
 use jiff::Timestamp;
-use nalgebra::{Matrix2, Matrix6, Vector2, Vector6};
+use nalgebra::{Matrix2, Matrix2x6, Matrix6, Vector2, Vector6};
 
 use super::alert_lifecycle::AlertLifecycle;
 use super::ambiguity;
@@ -23,7 +23,7 @@ use super::stats::error_budget::{ErrorBudget, TestFamily};
 use super::stats::gaussian::largest_eigenvalue;
 use super::track::association::Association;
 use super::track::beam_track::Track;
-use super::track::common_course::{AtNadir, CommonCourse, Pull};
+use super::track::common_course::{CommonCourse, Pull};
 use super::track::detection::{Detection, OVERLAP, spot_m};
 use super::track::registration::register;
 use super::track::tracker::Tracker;
@@ -231,11 +231,8 @@ impl FrameContext {
             _ => *sight.cov(),
         };
         self.track_frame_cov = Some(cov);
-        let at_nadir = nadir.as_ref().map_or_else(AtNadir::default, |p| AtNadir {
-            error: p.by_pose * found.error,
-            own_m2: p.pose_cov(&found.cov).trace(),
-        });
-        self.pose_error = Some(self.course.take(&found.error, at_nadir, pull, dt));
+        let by_pose = nadir.as_ref().map_or_else(Matrix2x6::zeros, |p| p.by_pose);
+        self.pose_error = Some(self.course.take(&found, &by_pose, pull, dt));
         self.view.sight = Some(sight.corrected(&(-found.error * (1.0 - pull.position)), cov));
     }
 

@@ -1,7 +1,9 @@
 //! How fast all tracks together follow the poses. What the beams of a frame share is taken out of it as a pose error, so that only
 //! this tells the tracks where they are, and at what speed all of them move.
 
-use nalgebra::{Matrix6, Vector2, Vector6};
+use nalgebra::{Matrix2x6, Matrix6, Vector2, Vector6};
+
+use super::registration::Registration;
 
 /// Longest and shortest time over which a straight line is fitted to the error that tracks and poses share, s. Longer lets a dragged
 /// position be noticed later and tracks go astray with users who turn together, shorter has tracks follow a pose that is late to and fro and
@@ -39,25 +41,43 @@ pub struct CommonCourse {
     newest: Vector6<f64>,
     newest_square: Matrix6<f64>,
     cov: Matrix6<f64>,
-    /// At the nadir: that mean, m, that of its square, and the variance by the tracks' own errors, m².
-    newest_at_nadir: Vector2<f64>,
-    newest_square_m2: f64,
-    own_m2: f64,
     averaged_s: f64,
-    /// Since when the poses are on time, s, the error of a moment ago at the nadir, m, how long ago, s, and the mean squares of such errors
-    /// and of half their changes, m².
+    /// Since when the poses are on time, s.
     on_time_s: f64,
+    lasting: Lasting,
+}
+
+/// Whether errors last.
+#[derive(Clone, Copy, Debug, Default)]
+struct Lasting {
+    /// That of a moment ago, m, and how long ago, s.
     earlier: Vector2<f64>,
     since_s: f64,
+    /// Mean squares of errors and of half their changes, m².
     square: f64,
     change: f64,
 }
 
-/// What the error of a frame's pose makes at the nadir, m, and its variance there by the tracks' own errors, m².
-#[derive(Clone, Copy, Debug, Default)]
-pub struct AtNadir {
-    pub error: Vector2<f64>,
-    pub own_m2: f64,
+impl Lasting {
+    /// Takes a frame's error, m, `dt` seconds after the last one's, into means over `over_s`.
+    fn take(&mut self, error: Vector2<f64>, dt: f64, over_s: f64) {
+        self.since_s += dt;
+        if self.since_s >= APART_S {
+            let share = (self.since_s / over_s.max(self.since_s)).min(1.0);
+            self.square += (error.norm_squared() - self.square) * share;
+            self.change += (0.5 * (error - self.earlier).norm_squared() - self.change) * share;
+            (self.earlier, self.since_s) = (error, 0.0);
+        }
+    }
+
+    /// 1 where errors have nothing to do with those a moment before, 0 where they are the same.
+    fn share_of_single(&self) -> f64 {
+        if self.change < self.square {
+            self.change / self.square
+        } else {
+            1.0
+        }
+    }
 }
 
 /// Shares of a frame's error that go into all tracks.
@@ -98,16 +118,11 @@ impl CommonCourse {
         }
     }
 
-    /// The error of a frame's pose against where the tracks began, `error` being that against the tracks, which take `pull` of it.
-    pub fn take(&mut self, error: &Vector6<f64>, there: AtNadir, pull: Pull, dt: f64) -> Vector6<f64> {
-        let at_nadir = there.error;
-        self.since_s += dt;
-        if self.since_s >= APART_S {
-            let share = (self.since_s / self.averaged_s.max(self.since_s)).min(1.0);
-            self.square += (at_nadir.norm_squared() - self.square) * share;
-            self.change += (0.5 * (at_nadir - self.earlier).norm_squared() - self.change) * share;
-            (self.earlier, self.since_s) = (at_nadir, 0.0);
-        }
+    /// The error of a frame's pose against where the tracks began, `found` being that against the tracks, which take `pull` of it;
+    /// `by_pose`: how the pose moves the place below.
+    pub fn take(&mut self, found: &Registration, by_pose: &Matrix2x6<f64>, pull: Pull, dt: f64) -> Vector6<f64> {
+        let Registration { error, cov: own } = found;
+        self.lasting.take(by_pose * error, dt, self.averaged_s);
         self.moved += self.velocity * dt;
         let since_began = error + self.moved;
         self.moved += error * pull.position;
@@ -115,14 +130,14 @@ impl CommonCourse {
         if pull.position > 0.0 {
             self.averaged_s = (self.averaged_s + dt).min(AVERAGED_S);
             let of_mean = (dt / self.averaged_s.min(MEMORY_S)).min(1.0);
-            let of_newest = pull.share_of_newest(dt);
-            self.newest += (error - self.newest) * of_newest;
+            self.newest += (error - self.newest) * pull.share_of_newest(dt);
             self.newest_square += (self.newest * self.newest.transpose() - self.newest_square) * of_mean;
-            self.newest_at_nadir += (at_nadir - self.newest_at_nadir) * of_newest;
-            self.newest_square_m2 += (self.newest_at_nadir.norm_squared() - self.newest_square_m2) * of_mean;
-            self.own_m2 += (there.own_m2 - self.own_m2) * of_mean;
-            let unexplained = 1.0 - self.own_m2 / self.newest_square_m2.max(self.own_m2).max(f64::MIN_POSITIVE);
-            self.cov = self.newest_square * (FOLLOWED * unexplained);
+            let below = |cov: &Matrix6<f64>| (by_pose * cov * by_pose.transpose()).trace();
+            let (all, own) = (below(&self.newest_square), below(own));
+            self.cov = match own < all {
+                true => self.newest_square * (FOLLOWED * (1.0 - own / all)),
+                false => Matrix6::zeros(),
+            };
         }
         since_began
     }
@@ -134,10 +149,10 @@ impl CommonCourse {
 
     /// How long errors are averaged: as long as it is single poses that make them. What lasts is the tracks' own, as users turn together.
     fn memory_s(&self) -> f64 {
-        if self.on_time_s < MEMORY_S || !(self.change < self.square) {
+        if self.on_time_s < MEMORY_S {
             return MEMORY_S;
         }
-        (MEMORY_S * self.change / self.square).max(LEAST_MEMORY_S)
+        (MEMORY_S * self.lasting.share_of_single()).max(LEAST_MEMORY_S)
     }
 
     /// The pull of a frame that comes `dt` seconds after the last one.
@@ -164,10 +179,15 @@ mod tests {
 
     use super::*;
 
-    fn at_nadir(x: f64) -> AtNadir {
-        AtNadir {
-            error: Vector2::new(x, 0.0),
-            own_m2: 0.0,
+    impl CommonCourse {
+        /// Takes an error of the place, m.
+        fn take_shift(&mut self, x: f64, pull: Pull, dt: f64) -> Vector6<f64> {
+            let found = Registration {
+                error: Vector6::new(0.0, 0.0, 0.0, x, 0.0, 0.0),
+                cov: Matrix6::zeros(),
+            };
+            let by_pose = Matrix2x6::from_fn(|row, column| f64::from(u8::from(column == 3 + row)));
+            self.take(&found, &by_pose, pull, dt)
         }
     }
 
@@ -182,7 +202,7 @@ mod tests {
             course.take_delay(0.0, off_m);
             let error = late(t) - x;
             let pull = course.pull(dt);
-            let since_began = course.take(&Vector6::new(0.0, 0.0, 0.0, error, 0.0, 0.0), at_nadir(error), pull, dt);
+            let since_began = course.take_shift(error, pull, dt);
             if turning(t) == 0.0 {
                 // All but the velocity that the tracks began with.
                 assert!((since_began[3] - (late(t) - (t + dt))).abs() < 1e-9);
@@ -206,12 +226,7 @@ mod tests {
             let noise: f64 = StandardNormal.sample(&mut rng);
             let error = 0.15 * noise - x;
             let pull = course.pull(0.1);
-            course.take(
-                &Vector6::new(0.0, 0.0, 0.0, error, 0.0, 0.0),
-                at_nadir(error),
-                pull,
-                0.1,
-            );
+            course.take_shift(error, pull, 0.1);
             x += pull.position * error;
             v += pull.velocity * error;
             if k > 100 {
