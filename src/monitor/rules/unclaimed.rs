@@ -213,6 +213,11 @@ fn content(frame: &FrameContext, track: &Track, since: Timestamp) -> Content {
         "vanished_users": vanished_users(frame, since),
         "flags": track.detection.flags,
     });
+    // A flash before it, which counts as if the two were one.
+    let before_s = seconds(since, track.since);
+    if before_s > 0.0 {
+        evidence["shone_before_s"] = json!(before_s);
+    }
     let of_light = [
         ("lamp_or_beam", frame.light.lamp_or_beam(track, frame.budget.rate_hz())),
         ("rests_in", frame.light.rests_in(track)),

@@ -59,6 +59,8 @@ fn a_beam_that_blinks_is_alerted_once_it_has_shone_as_long() {
         !present(&watch.show(if shone(k) { &beams } else { &beams[..1] })).is_empty()
     });
     assert_eq!(first, Some(25));
+    let alert = watch.scene.alerts.open().next().unwrap().1;
+    assert_eq!(alert.evidence["shone_before_s"], 0.4);
 }
 
 #[test]
