@@ -17,6 +17,7 @@ const TELL = {
     const ratio = e.energy_against_users?.users_median_j > 0 ? e.energy_j / e.energy_against_users.users_median_j : NaN;
     return [
       isNumber(e.unclaimed_s) && [`The beam has been seen for ${seconds(e.unclaimed_s)} without a claim${e.seen_since ? `, since ${stamp(Date.parse(e.seen_since))}` : ""}.`],
+      isNumber(e.shone_before_s) && [`It came on again: ${seconds(e.shone_before_s)} of that are of a beam near it that had gone.`],
       e.shares_the_spot_of && ["It comes from within the spot of ", named(e.shares_the_spot_of), ": two lights where one is claimed."],
       near && near.second_beam_for_claim && ["It is a second beam for the claim of ", named(near.user), `, ${roughly(near.distance_m)} from the claimed place.`],
       near && !near.second_beam_for_claim && ["The nearest claimed user, ", named(near.user), `, is ${roughly(near.distance_m)} away.`],
