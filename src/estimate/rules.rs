@@ -77,8 +77,8 @@ rules! {
     /// A frame that another width or an elongated spot explains is searched from there, before it is asked whether its lens is another. Needed
     /// most in E2/64 with the condition `ellipse`.
     explain_by_width,
-    /// Where emitters explain the frame: a close pair that another width of all spots, or an ellipse, explains as well is one spot. Needed where spots
-    /// are wider than configured by less than a plain fit shows.
+    /// Where emitters explain the frame: a close pair that another width of all spots, or an ellipse, explains as well is one spot. Needed where the
+    /// axes of spots differ by less than a plain fit shows.
     width_for_pairs,
     /// A frame that round spots do not explain is searched with the ellipse that most recent frames showed. Needed where spots overlap through
     /// a lens with astigmatism (`oapwatch study lens`).
@@ -88,6 +88,8 @@ rules! {
     stack_misfits,
     /// The spot's shape is learned where frames show that spots differ from the PSF.
     learn_spots,
+    /// The spots' width is learned from frames together. Needed where it differs from the configured one by a few per cent.
+    learn_width,
     /// A rotated elliptical PSF is tried in the place of more sources. Needed with the condition `ellipse`.
     rotated_ellipse,
     /// Sources that do not exceed the misfit around them are removed. No cell of the trade-off needs it; the scene `hazy-noon` does: without

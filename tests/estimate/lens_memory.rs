@@ -98,10 +98,28 @@ fn later_numbers(rules: Rules, spot: &dyn Fn(f64, f64) -> f64, spots: &[([f64; 2
 
 #[test]
 fn a_width_that_is_off_by_a_percent_makes_no_pairs() {
-    let spots = FIVE.map(|at| (at, 140.0));
     let wider = |x: f64, y: f64| gaussian(x / 1.01, y / 1.01);
+    for users in [&FIVE[2..3], &FIVE] {
+        let spots: Vec<_> = users.iter().map(|at| (*at, 140.0)).collect();
+        let wrong = |rules: Rules| {
+            let numbers = later_numbers(rules, &wider, &spots);
+            numbers.iter().filter(|n| **n != users.len()).count()
+        };
+        let without = Rules {
+            width_for_pairs: false,
+            ..Rules::without("learn_width").unwrap()
+        };
+        let (with, without) = (wrong(Rules::default()), wrong(without));
+        assert!(with <= 2 && without > 20, "{with} and {without} of 100");
+    }
+}
+
+#[test]
+fn axes_that_differ_by_two_percent_make_no_pairs() {
+    let elliptical = |x: f64, y: f64| gaussian(x / 1.02, y);
+    let spots = FIVE.map(|at| (at, 140.0));
     let wrong = |rules: Rules| {
-        let numbers = later_numbers(rules, &wider, &spots);
+        let numbers = later_numbers(rules, &elliptical, &spots);
         numbers.iter().filter(|n| **n != 5).count()
     };
     let (with, without) = (
@@ -117,6 +135,17 @@ fn a_beam_beside_one_user_is_no_width() {
     spots.push(([FIVE[2][0] + 0.9e-3, FIVE[2][1] + 0.3e-3], 40.0));
     let numbers = later_numbers(Rules::default(), &gaussian, &spots);
     assert!(numbers.iter().filter(|n| **n == 6).count() >= 98, "{numbers:?}");
+}
+
+#[test]
+fn a_beam_beside_the_only_user_is_no_width() {
+    let spots = [(FIVE[2], 140.0), ([FIVE[2][0] + 0.9e-3, FIVE[2][1] + 0.3e-3], 40.0)];
+    let seen = |rules: Rules| {
+        let numbers = later_numbers(rules, &gaussian, &spots);
+        numbers.iter().filter(|n| **n == 2).count()
+    };
+    let (with, without) = (seen(Rules::default()), seen(Rules::without("learn_width").unwrap()));
+    assert!(with >= 98 && with >= without, "{with} and {without} of 100");
 }
 
 #[test]

@@ -6,10 +6,11 @@ use crate::estimate::emitter::{Estimate, Flags};
 use crate::estimate::error::Error;
 use crate::estimate::estimator::Estimator;
 use crate::estimate::estimators::budgets::Budgets;
-use crate::estimate::estimators::frame_search::{Found, FrameSearch};
+use crate::estimate::estimators::frame_search::{Found, FrameSearch, SearchKind};
 use crate::estimate::estimators::list::{EstimatorSpec, Method};
 use crate::estimate::estimators::search_bases::bases;
 use crate::estimate::estimators::spot_learner::{Lesson, SpotLearner};
+use crate::estimate::estimators::width_learner::WidthLearner;
 use crate::estimate::fit::work_budget::WorkBudget;
 use crate::estimate::model::compressed_frame::CompressedFrame;
 use crate::estimate::model::hypothesis::{Hypothesis, Nuisances, PointSource};
@@ -17,7 +18,7 @@ use crate::estimate::model::svd_basis::Basis;
 use crate::estimate::model_order::candidate::Candidate;
 use crate::estimate::model_order::map_search::maximum_posterior;
 use crate::estimate::model_order::power_prior::PowerPrior;
-use crate::estimate::model_order::search::SearchSpace;
+use crate::estimate::model_order::search::{Search, SearchSpace};
 use crate::estimate::preprocess::screening::PreprocessedFrame;
 use crate::estimate::rules::Rules;
 use crate::estimate::uncertainty::localise::localise;
@@ -30,8 +31,9 @@ pub(crate) struct AnalyticEstimator {
     spec: &'static EstimatorSpec,
     camera: Camera,
     search: FrameSearch,
-    /// Where the spot's shape may be learned.
+    /// Where the spot's shape and width may be learned.
     learner: Option<SpotLearner>,
+    width: Option<WidthLearner>,
     /// While a learned shape is used: the search without it.
     configured: Option<FrameSearch>,
     prior: Option<PowerPrior>,
@@ -47,6 +49,7 @@ impl AnalyticEstimator {
             camera: camera.clone(),
             configured: None,
             learner: SpotLearner::new(camera).filter(|_| rules.learn_spots && search.history.is_some()),
+            width: WidthLearner::new(camera).filter(|_| rules.learn_width && spec.chooses_order()),
             search,
             prior: known.map(|k| PowerPrior::new(k, camera)),
             rules,
@@ -66,6 +69,7 @@ impl AnalyticEstimator {
             camera: camera.clone(),
             search,
             learner: None,
+            width: None,
             configured: None,
             prior: None,
             rules,
@@ -154,7 +158,11 @@ impl AnalyticEstimator {
 
     /// What explains the loaded frame, searched again where it shows another spot than was searched for.
     fn find(&mut self, budgets: &mut Budgets) -> Found {
-        let found = self.search.run(budgets);
+        let mut found = self.search.run(budgets);
+        let is_told = self.spec.method != Method::Sequence && found.spot_error == 0.0;
+        if is_told && self.is_width_due() && self.learn_width(found.kind, &found.hypothesis, budgets) {
+            found = self.search.run(budgets);
+        }
         let learner = self.learner.as_mut();
         match learner.map_or(Lesson::Nothing, |l| l.learn(&mut self.search, &found, budgets)) {
             Lesson::Nothing => return found,
@@ -175,6 +183,41 @@ impl AnalyticEstimator {
         budgets.search.restart();
         budgets.reweighting.restart();
         self.search.run(budgets)
+    }
+
+    /// Counts a frame for the spots' width, and whether that is to be learned from it.
+    pub fn is_width_due(&mut self) -> bool {
+        let is_told = self.configured.is_none() && self.search.frame.smear.is_none();
+        is_told && self.width.as_mut().is_some_and(WidthLearner::is_due)
+    }
+
+    /// Learns the spots' width from what explains the loaded frame. Returns whether it is to be searched again, for spots of another width.
+    pub fn learn_width(&mut self, kind: SearchKind, hypothesis: &Hypothesis, budgets: &mut Budgets) -> bool {
+        let Some(width) = self
+            .width
+            .as_mut()
+            .and_then(|l| l.learn(&mut self.search.again(kind, budgets), hypothesis))
+        else {
+            return false;
+        };
+        self.camera.spot_sigma_m *= width;
+        let search = self.search.of_shape(&self.camera);
+        self.search = search;
+        if let Some(learner) = &mut self.learner {
+            learner.configure(&self.camera);
+        }
+        budgets.search.restart();
+        budgets.reweighting.restart();
+        true
+    }
+
+    /// The loaded frame under search.
+    pub fn again<'a, 'b>(&'a mut self, budgets: &'a mut Budgets<'b>) -> Search<'a, 'b> {
+        self.search.again(SearchKind::Main, budgets)
+    }
+
+    pub fn camera(&self) -> &Camera {
+        &self.camera
     }
 
     /// The emitters of the loaded frame, whose noise is `scale` times the configured noise.

@@ -11,4 +11,5 @@ pub mod network_start;
 pub mod pixel_correction;
 pub mod search_bases;
 pub mod spot_learner;
+pub mod width_learner;
 pub mod windowed;

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use crate::estimate::estimators::budgets::Budgets;
 use crate::estimate::estimators::frame_search::{Found, FrameSearch, SearchKind};
-use crate::estimate::fit::source_groups::linked;
+use crate::estimate::fit::source_groups::merged;
 use crate::estimate::model::hypothesis::{Hypothesis, PointSource};
 use crate::estimate::model_order::bright_spots::CORE;
 use crate::estimate::model_order::candidate::Candidate;
@@ -94,6 +94,11 @@ impl SpotLearner {
             failed: 0,
             rest: 0,
         })
+    }
+
+    /// Takes a camera as configured, whose spot is of another width.
+    pub fn configure(&mut self, camera: &Camera) {
+        self.camera = camera.clone();
     }
 
     /// Learns from a frame that was searched.
@@ -224,16 +229,10 @@ impl SpotLearner {
 
 /// Each group of close sources as one, where these groups are few enough to be the spots of another shape.
 fn groups_as_spots(hypothesis: &Hypothesis) -> Option<Hypothesis> {
-    let sources = &hypothesis.sources;
-    let groups = linked(sources, CORE);
-    let as_spot = |group: &Vec<usize>| {
-        let light: f64 = group.iter().map(|&i| sources[i].a).sum();
-        let u = [0, 1].map(|k| group.iter().map(|&i| sources[i].a * sources[i].u[k]).sum::<f64>() / light);
-        PointSource::new(u, light)
-    };
-    let are_crowded = groups.len() >= LEAST_GROUPS && CROWDED * groups.len() <= sources.len();
+    let spots = merged(&hypothesis.sources, CORE);
+    let are_crowded = spots.len() >= LEAST_GROUPS && CROWDED * spots.len() <= hypothesis.sources.len();
     are_crowded.then(|| Hypothesis {
-        sources: groups.iter().map(as_spot).collect(),
+        sources: spots,
         ..with_known_width(hypothesis)
     })
 }

@@ -45,6 +45,16 @@ pub(crate) fn linked(sources: &[PointSource], distance: f64) -> Vec<Vec<usize>> 
     groups
 }
 
+/// Each such group as one source: its centroid and its light.
+pub(crate) fn merged(sources: &[PointSource], distance: f64) -> Vec<PointSource> {
+    let as_one = |group: &Vec<usize>| {
+        let light: f64 = group.iter().map(|&i| sources[i].a).sum();
+        let u = [0, 1].map(|k| group.iter().map(|&i| sources[i].a * sources[i].u[k]).sum::<f64>() / light);
+        PointSource::new(u, light)
+    };
+    linked(sources, distance).iter().map(as_one).collect()
+}
+
 /// The sources of groups that a step moved; `None` where that is none, and where they are more than half of all. Only without nuisances.
 pub(crate) fn active_set(groups: &[Vec<usize>], step: &Step, equations: &NormalEquations) -> Option<Vec<usize>> {
     let (n, p) = (equations.sources, equations.parameters);

@@ -3,6 +3,7 @@
 use std::ops::{Deref, DerefMut};
 use std::sync::Arc;
 
+use crate::estimate::emitter::SecondMomentScore;
 use crate::estimate::fit::context::FitContext;
 use crate::estimate::fit::evaluation::Evaluation;
 use crate::estimate::fit::levenberg_marquardt::{evaluate, linearise};
@@ -74,6 +75,22 @@ impl Candidate {
         self.covariance.clone().flatten()
     }
 
+    /// The score in each source's second moments; none where the information is singular.
+    pub fn second_moments(&mut self, context: &mut FitContext) -> Vec<SecondMomentScore> {
+        if matches!(self.covariance, Some(None)) {
+            return Vec::new();
+        }
+        let problem = context.problem();
+        let mut at = linearise(problem, &mut self.hypothesis, context.budget, context.workspace);
+        let covariance = self
+            .covariance
+            .get_or_insert_with(|| Covariance::new(at.equations, POSITION_PRIOR).map(Arc::new));
+        match covariance {
+            Some(covariance) => second_moment_scores(problem, &mut at, covariance, context.budget),
+            None => Vec::new(),
+        }
+    }
+
     /// Splits suggested by the score test, the largest predicted gain first; none where the budget is spent.
     pub fn split_proposals(&mut self, context: &mut FitContext) -> Arc<[SplitProposal]> {
         if context.budget.is_exhausted() {
@@ -82,18 +99,7 @@ impl Candidate {
         if let Some(known) = &self.splits {
             return known.clone();
         }
-        if matches!(self.covariance, Some(None)) {
-            return Arc::default();
-        }
-        let problem = context.problem();
-        let mut at = linearise(problem, &mut self.hypothesis, context.budget, context.workspace);
-        let covariance = self
-            .covariance
-            .get_or_insert_with(|| Covariance::new(at.equations, POSITION_PRIOR).map(Arc::new));
-        let Some(covariance) = covariance else {
-            return Arc::default();
-        };
-        let scores = second_moment_scores(problem, &mut at, covariance, context.budget);
+        let scores = self.second_moments(context);
         let mut splits: Vec<_> = scores
             .iter()
             .enumerate()

@@ -26,7 +26,7 @@ const ELLIPSE_WORK: f64 = 0.7;
 const ELLIPSE_GAIN: f64 = 0.02;
 /// Sources within this distance, σ, may be one source with an elliptical PSF: a plain fit puts a pair in the place of a spot 5 % longer
 /// than wide; users so near each other are rare where spots stand apart.
-const CLOSE_PAIR_DISTANCE: f64 = 1.5;
+pub(crate) const CLOSE_PAIR_DISTANCE: f64 = 1.5;
 /// Spots that tell another width from a pair, and the decrease of the deviance for each of its parameters by which they do, the pairs left as they are:
 /// where no spot is wider, one in 600 frames has it. More makes pairs of wide spots, less hides strangers beside users.
 const LEAST_SPOTS: usize = 3;
