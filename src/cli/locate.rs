@@ -209,7 +209,7 @@ pub fn run(args: Args) -> Outcome {
     out.flush().map_err(Failure::other)?;
     if 2 * misshapen > usable {
         eprintln!(
-            "{misshapen} of {usable} frames: the spot is not what the config says (positions are less precise, faint emitters \
+            "{misshapen} of {usable} frames: the spot is not what the config says (positions may be less precise, faint emitters \
              beside bright ones are not seen); run `oapwatch calibrate --config {} --out CALIBRATION.toml {}`",
             args.config.display(),
             path.display()

@@ -217,7 +217,7 @@ function notices() {
   if (source.kind === "simulator") texts.push("Simulation: these frames are computed, no camera is watched.");
   if (source.kind === "fleet" && !latest.status.stations?.length) texts.push("No access point has said anything yet.");
   if (source.kind === "replay") texts.push("Replay: these frames come from a recording.");
-  if (latest.status.fit?.hint) texts.push(`${latest.status.fit.hint}. Until then positions are less precise, and faint beams beside bright ones are not seen.`.replace(/^./, (c) => c.toUpperCase()));
+  if (latest.status.fit?.hint) texts.push(`${latest.status.fit.hint}. Until then positions may be less precise, and faint beams beside bright ones unseen.`.replace(/^./, (c) => c.toUpperCase()));
   if (journal.place === "memory") texts.push("Journal in memory: a restart of the monitor forgets all alerts. [journal] path in its config keeps them.");
   const list = $("notices");
   list.hidden = !texts.length;
