@@ -201,8 +201,10 @@ impl AnalyticEstimator {
             return false;
         };
         self.camera.spot_sigma_m *= width;
-        let search = self.search.of_shape(&self.camera);
-        self.search = search;
+        self.search = self.search.of_shape(&self.camera);
+        if let Some(prior) = &mut self.prior {
+            prior.set_spot_sigma(self.camera.spot_sigma_m);
+        }
         if let Some(learner) = &mut self.learner {
             learner.configure(&self.camera);
         }

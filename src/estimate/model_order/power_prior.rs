@@ -35,6 +35,11 @@ impl PowerPrior {
         }
     }
 
+    /// Spots of another width: positions come in units of it.
+    pub fn set_spot_sigma(&mut self, spot_sigma_m: f64) {
+        self.camera.spot_sigma_m = spot_sigma_m;
+    }
+
     /// The energy prior of the user nearest to a source's energy, at the source's position.
     fn nearest(&self, source: &PointSource) -> Option<EnergyPrior> {
         let sensor = source.u.map(|u| u * self.camera.spot_sigma_m);
