@@ -2,7 +2,7 @@
 
 use jiff::{SignedDuration, Timestamp};
 use ndarray::Array2;
-use oapwatch::estimate::{Estimate, Estimator};
+use oapwatch::estimate::{Config, Estimate, Estimator, Rules, build};
 use oapwatch::frame::Frame;
 use oapwatch::optics::{self, Camera, add_spot};
 use rand::{RngExt, SeedableRng};
@@ -325,4 +325,37 @@ fn a_hundred_thousand_frames_leave_the_numerics_as_they_were() {
             "{misses:?} with {variance} m² after {thousand},000 frames"
         );
     }
+}
+
+#[test]
+fn spots_a_little_wider_than_configured_are_no_pairs() {
+    let walks: [Walk; 3] = [
+        |t| Some([-80.0 + t, -60.0]),
+        |_| Some([10.0, 70.0]),
+        |t| Some([80.0, t]),
+    ];
+    let wrong = |rules: Rules| {
+        let mut scene = Scene::new(1.5e-3, &walks);
+        let mut configured = scene.camera.clone();
+        configured.spot_sigma_m *= 0.98;
+        let config = Config {
+            name: Some("sequence".into()),
+            rules,
+            ..Default::default()
+        };
+        let mut sequence = build(&config, &configured).expect("a known estimator");
+        let numbers = (0..100).map(|_| {
+            sequence
+                .estimate(&scene.frame())
+                .expect("a usable frame")
+                .emitters
+                .len()
+        });
+        numbers.skip(20).filter(|n| *n > walks.len()).count()
+    };
+    let (with, without) = (
+        wrong(Rules::default()),
+        wrong(Rules::without("learn_width").expect("a rule")),
+    );
+    assert!(with == 0 && without > 20, "{with} and {without} of 80 frames");
 }

@@ -20,6 +20,7 @@ mod revision_schedule;
 mod search;
 mod sequence_estimator;
 mod snapshot;
+mod spot_width;
 mod straying;
 mod subspace;
 mod target;

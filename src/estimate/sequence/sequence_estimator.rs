@@ -9,16 +9,13 @@ use crate::estimate::emitter::Estimate;
 use crate::estimate::error::Error;
 use crate::estimate::estimator::Estimator;
 use crate::estimate::estimators::analytic::AnalyticEstimator;
-use crate::estimate::estimators::budgets::Budgets;
-use crate::estimate::estimators::frame_search::SearchKind;
 use crate::estimate::estimators::list::EstimatorSpec;
 use crate::estimate::fit::work_budget::WorkBudget;
-use crate::estimate::model::hypothesis::{Nuisances, Width};
 use crate::estimate::rules::Rules;
 use crate::estimate::sequence::chances::Chances;
 use crate::estimate::sequence::course::open;
 use crate::estimate::sequence::joint_information::{JointInformation, STATE};
-use crate::estimate::sequence::local_quadratic::{Energies, Engine, hypothesis};
+use crate::estimate::sequence::local_quadratic::Engine;
 use crate::estimate::sequence::motion::surprised;
 use crate::estimate::sequence::outlook::Outlook;
 use crate::estimate::sequence::report::report;
@@ -26,6 +23,7 @@ use crate::estimate::sequence::residual_map::ResidualSum;
 use crate::estimate::sequence::revision_schedule::{RevisionSchedule, YOUNG};
 use crate::estimate::sequence::search::{BESIDE, LATELY, TURN_PENALTY, WINDOW_STEPS, WindowSearch};
 use crate::estimate::sequence::snapshot::Snapshot;
+use crate::estimate::sequence::spot_width::learn_width;
 use crate::estimate::sequence::straying::SURPRISE;
 use crate::estimate::sequence::target::Target;
 use crate::estimate::sequence::upkeep::{MAX_SNAPSHOTS, bury, most_snapshots, refresh};
@@ -121,20 +119,20 @@ impl Estimator for SequenceEstimator {
             self.window.targets.iter_mut().for_each(|t| t.straying.go_straight());
         }
         self.window.keep_straight(time_s);
-        if let Some(alone) = self.take(time_s, elapsed, scale, is_over) {
-            if alone.spot_error == 0.0 {
-                let at = alone.emitters.iter().flat_map(|e| e.sensor_m);
-                let at: Vec<f64> = at.map(|v| v / self.camera.spot_sigma_m).collect();
-                self.learn_width(DVector::from_vec(at), is_over);
+        let estimate = match self.take(time_s, elapsed, scale, is_over) {
+            Some(alone) => alone,
+            None => {
+                self.tend(elapsed, is_over);
+                self.revise(is_over);
+                let (window, camera, name) = (&self.window, &self.camera, self.spec.name);
+                report(&mut self.single, window, camera, self.rules, name, scale, is_over)
             }
-            return Ok(alone);
+        };
+        // With spots of another width everything is seen anew.
+        if learn_width(&mut self.single, &estimate, is_over) {
+            self.camera = Arc::new(self.single.camera().clone());
+            self.forget();
         }
-        self.tend(elapsed, is_over);
-        self.revise(is_over);
-        let (window, camera, name) = (&self.window, &self.camera, self.spec.name);
-        let estimate = report(&mut self.single, window, camera, self.rules, name, scale, is_over);
-        let positions = self.window.positions(&self.single.loaded().0.bases);
-        self.learn_width(positions, is_over);
         Ok(estimate)
     }
 }
@@ -220,25 +218,6 @@ impl SequenceEstimator {
         let has_newcomers = !(before..after).contains(&found.emitters.len());
         let fresh = if has_newcomers { grown } else { fresh };
         fresh.is_last_explained().then_some(fresh)
-    }
-
-    /// Learns the spots' width from the newest frame with emitters at these positions, σ; with another one everything is seen anew.
-    fn learn_width(&mut self, positions: DVector<f64>, is_over: &dyn Fn() -> bool) {
-        if !self.single.is_width_due() {
-            return;
-        }
-        let mut budgets = Budgets::new(is_over);
-        let width = Nuisances {
-            width: Width::Common,
-            ..Nuisances::default()
-        };
-        let mut shown = hypothesis(&positions, Energies::NonNegative, width);
-        self.single.again(&mut budgets).fit_trial(&mut shown);
-        shown.sources.retain(|source| source.a > 0.0);
-        if self.single.learn_width(SearchKind::Main, &shown, &mut budgets) {
-            self.camera = Arc::new(self.single.camera().clone());
-            self.forget();
-        }
     }
 
     /// The newest frame fitted to what is remembered, where these targets may have changed their velocity `since_s` seconds ago.
