@@ -16,6 +16,10 @@ const OWN_SCATTER_RATIO: f64 = 3.0;
 /// Smallest standard deviation of an ln energy: what gains and the fit leave however steady the light. Not measured.
 const MIN_LN_STD: f64 = 0.05;
 
+/// Standard errors by which frames that are independent may seem to repeat. Smaller delays the alerts of beams that come by chance to look
+/// so, larger misses what few frames show of slow fading.
+const BY_CHANCE: f64 = 2.0;
+
 /// A beam's ln energies.
 #[derive(Clone, Debug, Default)]
 pub struct Brightness {
@@ -23,12 +27,14 @@ pub struct Brightness {
     past: BlockHistory<Variance>,
 }
 
-/// Mean and sum of squared deviations (Welford, 1962).
+/// Mean and sum of squared deviations (Welford, 1962), and of squared steps from one value to the next.
 #[derive(Clone, Copy, Debug, Default)]
 struct Variance {
     n: u32,
     mean: f64,
     squares: f64,
+    last: f64,
+    steps: f64,
 }
 
 /// Sum of squared deviations of block means and its degrees of freedom.
@@ -40,6 +46,10 @@ pub struct Scatter {
 
 impl Variance {
     fn add(&mut self, x: f64) {
+        if self.n > 0 {
+            self.steps += (x - self.last).powi(2);
+        }
+        self.last = x;
         self.n += 1;
         let d = x - self.mean;
         self.mean += d / f64::from(self.n);
@@ -65,10 +75,13 @@ impl std::iter::Sum for Scatter {
 impl Brightness {
     /// A beam known from before a restart by the mean and standard deviation of its ln energy.
     pub fn remembered(mean: f64, std: f64) -> Self {
+        let squares = f64::from(BLOCK_FRAMES - 1) * std * std;
         let block = Variance {
             n: BLOCK_FRAMES,
             mean,
-            squares: f64::from(BLOCK_FRAMES - 1) * std * std,
+            squares,
+            last: mean,
+            steps: 2.0 * squares,
         };
         Self {
             past: BlockHistory::of(std::iter::repeat_n(block, MIN_DRIFT_BLOCKS)),
@@ -128,8 +141,9 @@ impl Brightness {
         }
         let past = self.past_mean()?;
         let blocks = self.past.len() as f64;
-        let frames_freedom = self.past.blocks().map(|b| f64::from(b.n - 1)).sum::<f64>();
-        let within = self.within();
+        let repeats = self.repeats();
+        let frames_freedom = self.past.blocks().map(|b| f64::from(b.n - 1)).sum::<f64>() / repeats;
+        let within = repeats * self.within();
         let of_block = within / f64::from(BLOCK_FRAMES);
         let own = self.scatter();
         let scatter = match own.variance() > OWN_SCATTER_RATIO * all_beams.variance() {
@@ -158,6 +172,18 @@ impl Brightness {
         (n >= MIN_BLOCKS).then(|| self.past.blocks().map(|b| b.mean).sum::<f64>() / n as f64)
     }
 
+    /// Frames that count as one where each repeats much of the one before: (1 + ρ)/(1 − ρ) for a first-order autoregression (Bartlett,
+    /// 1935), ρ from the mean squared step over the variance (von Neumann, 1941). What chance makes of independent frames counts as none.
+    fn repeats(&self) -> f64 {
+        let squares = self.past.blocks().map(|b| b.squares).sum::<f64>();
+        let steps = self.past.blocks().map(|b| b.steps).sum::<f64>();
+        let correlation = 1.0 - steps / (2.0 * squares);
+        match correlation * f64::from(self.past.frames()).sqrt() > BY_CHANCE {
+            true => (1.0 + correlation) / (1.0 - correlation),
+            false => 1.0,
+        }
+    }
+
     /// Variance of ln energies within blocks.
     fn within(&self) -> f64 {
         let freedom = self.past.blocks().map(|b| f64::from(b.n - 1)).sum::<f64>();
@@ -168,6 +194,9 @@ impl Brightness {
 
 #[cfg(test)]
 mod tests {
+    use rand::{RngExt, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+
     use super::*;
 
     fn fed(brightness: &mut Brightness, frames: usize, ln_energy: impl Fn(usize) -> f64) {
@@ -224,6 +253,21 @@ mod tests {
             freedom: 10.0,
         };
         assert!(beam.test(10, 0.0, drifting).unwrap().neg_log_p < 0.25 * steady);
+    }
+
+    #[test]
+    fn light_that_changes_slowly_has_risen_by_chance() {
+        // The same rise over light that is new in each frame and over light that is new in every tenth.
+        let evidence = |held: usize| {
+            let mut rng = ChaCha8Rng::seed_from_u64(1);
+            let light: Vec<f64> = (0..=260 / held).map(|_| rng.random_range(-0.5..0.5)).collect();
+            let mut beam = Brightness::default();
+            fed(&mut beam, 180, |k| light[k / held]);
+            fed(&mut beam, 80, |k| light[(180 + k) / held] + 0.8);
+            beam.most_significant(0.3, Scatter::default()).neg_log_p
+        };
+        let (white, slow) = (evidence(1), evidence(10));
+        assert!(white > 40.0 && slow < 10.0, "{white} {slow}");
     }
 
     #[test]
