@@ -48,6 +48,7 @@ pub fn run(args: Args) -> Outcome {
     let mut upcoming = claims_of(&config.claims, config.source.start)?.into_iter().peekable();
     let mut out = std::io::BufWriter::new(std::io::stdout().lock());
     let bar = progress::count("frames");
+    let (mut usable, mut first_error) = (0_u64, None);
     loop {
         let next = source.next(Duration::from_secs(1));
         pipeline.monitor.recorded_in(source.file());
@@ -56,7 +57,12 @@ pub fn run(args: Args) -> Outcome {
                 pipeline.claim(from_fn(|| upcoming.next_if(|c| c.time <= frame.time)), frame.time);
                 pipeline.claim(arrivals.claims, frame.time);
                 pipeline.receive_poses(arrivals.poses, frame.time);
-                pipeline.step(&frame).report
+                let step = pipeline.step(&frame);
+                match step.estimate {
+                    Ok(_) => usable += 1,
+                    Err(e) => drop(first_error.get_or_insert(e)),
+                }
+                step.report
             }
             Next::Unusable {
                 index,
@@ -76,7 +82,12 @@ pub fn run(args: Args) -> Outcome {
         bar.inc(1);
     }
     bar.finish_and_clear();
-    out.flush().map_err(Failure::other)
+    out.flush().map_err(Failure::other)?;
+    match (source.failure(), first_error) {
+        (Some(reason), _) => Err(Failure::input(anyhow!("{reason}"))),
+        (None, Some(e)) if usable == 0 => Err(Failure::input(anyhow!("no frame can be used; the first: {e}"))),
+        _ => Ok(()),
+    }
 }
 
 fn claims_of(config: &claims::Config, start: Option<jiff::Timestamp>) -> Result<Vec<claims::Claim>, Failure> {

@@ -37,7 +37,7 @@ pub(super) fn open(config: &Config, joules_per_count: Option<f64>) -> Result<Box
         player,
         pace: Pace::new(config.speed)?,
         waiting: None,
-        ended: false,
+        failure: None,
         last: (0, Timestamp::UNIX_EPOCH),
     }))
 }
@@ -54,14 +54,15 @@ struct Playback {
     pace: Pace,
     /// The next event, held until it is due.
     waiting: Option<(Timestamp, Next)>,
-    ended: bool,
+    /// Why it ended early.
+    failure: Option<String>,
     /// Index and time of the last event given.
     last: (u64, Timestamp),
 }
 
 impl FrameSource for Playback {
     fn next(&mut self, patience: Duration) -> Next {
-        if self.ended {
+        if self.failure.is_some() {
             return Next::End;
         }
         let (time, next) = match self.waiting.take() {
@@ -74,9 +75,9 @@ impl FrameSource for Playback {
                 Ok(None) => return Next::End,
                 Err(error) => {
                     tracing::error!(%error, "the recording ends early");
-                    self.ended = true;
                     let (index, time) = self.last;
                     let reason = error.to_string();
+                    self.failure = Some(reason.clone());
                     return Next::Unusable {
                         index: index + 1,
                         time,
@@ -97,6 +98,10 @@ impl FrameSource for Playback {
         Some(self.player.path())
     }
 
+    fn failure(&self) -> Option<&str> {
+        self.failure.as_deref()
+    }
+
     fn waits(&self) -> bool {
         true
     }
@@ -111,8 +116,8 @@ struct Replay {
     looped: bool,
     pace: Pace,
     next: u64,
-    /// A truncated file was reported; the source has ended.
-    ended: bool,
+    /// Why it ended early.
+    failure: Option<String>,
 }
 
 impl Replay {
@@ -131,7 +136,7 @@ impl Replay {
             looped: config.r#loop,
             pace: Pace::new(config.speed)?,
             next: 0,
-            ended: false,
+            failure: None,
         })
     }
 
@@ -150,7 +155,7 @@ pub fn frame_time(start: Timestamp, rate_hz: f64, frame: u64) -> Timestamp {
 
 impl FrameSource for Replay {
     fn next(&mut self, patience: Duration) -> Next {
-        if self.ended {
+        if self.failure.is_some() {
             return Next::End;
         }
         let time = self.time(self.next);
@@ -176,11 +181,12 @@ impl FrameSource for Replay {
             }
             Some(Err(error)) => {
                 tracing::error!(%error, "the recording ends early");
-                self.ended = true;
+                let reason = error.to_string();
+                self.failure = Some(reason.clone());
                 Next::Unusable {
                     index,
                     time,
-                    reason: error.to_string(),
+                    reason,
                     arrivals: Arrivals::default(),
                 }
             }
@@ -190,6 +196,10 @@ impl FrameSource for Replay {
 
     fn file(&self) -> Option<&Path> {
         Some(self.reader.path())
+    }
+
+    fn failure(&self) -> Option<&str> {
+        self.failure.as_deref()
     }
 
     fn waits(&self) -> bool {

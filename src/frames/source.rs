@@ -20,6 +20,11 @@ pub trait FrameSource: Send {
         None
     }
 
+    /// Why the recording has ended before its time, where it has.
+    fn failure(&self) -> Option<&str> {
+        None
+    }
+
     /// Whether the source waits for its reader (a recording) instead of dropping frames (a device).
     fn waits(&self) -> bool {
         false
