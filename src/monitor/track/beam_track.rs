@@ -29,9 +29,9 @@ const JUST_MISSED_S: f64 = 0.35;
 /// Share of the time that a merged track counts as missed: it lives 1.5 s/0.2 = 7.5 s, longer than two users take to walk past
 /// each other, and not for ever.
 const MERGED_MISS_SHARE: f64 = 0.2;
-/// How far back a track knows where it was, s, for claims that come late, and in what steps. Longer serves later claims and takes
-/// memory; finer steps follow turns more exactly. Not tuned.
-const TRAIL_S: f64 = 6.0;
+/// How far back a track knows where it was, s, for claims that come late or seldom, and in what steps. Longer serves later claims and takes
+/// memory (30 kB for a minute); finer steps follow turns more exactly. Not tuned.
+const TRAIL_S: f64 = 60.0;
 const TRAIL_STEP_S: f64 = 0.05;
 /// Probability that an emitter in view is detected in a frame. Low, so that misses cost an eavesdropper's score little. Assumed.
 const DETECTION_PROBABILITY: f64 = 0.9;
