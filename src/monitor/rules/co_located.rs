@@ -42,8 +42,6 @@ pub struct Spot {
     test: CoLocationTest,
     /// Since when there is evidence of a second beam: the present is not added to the past.
     suspected_since: Option<Timestamp>,
-    /// When an emitter that had its own alert was last beside the beam.
-    accompanied_at: Option<Timestamp>,
 }
 
 impl Memory {
@@ -166,16 +164,13 @@ impl Memory {
     ) -> CoLocationEvidence {
         let others = self.others(spot.owner, watched);
         let remembered = self.entry(spot.owner);
+        if is_beside_unclaimed(frame, spot.track, &[]) {
+            remembered.test.restart();
+        }
         let evidence = remembered.test.evaluate(frame.config.tolerated_brightening, &others);
         // Whether it lasts is the known light's own question; here it ends what the spot learns.
         remembered.is_present(&evidence, threshold, false, frame);
-        if is_beside_unclaimed(frame, spot.track, &[]) {
-            remembered.accompanied_at = Some(frame.now);
-        }
-        match remembered.is_explained(frame) {
-            true => CoLocationEvidence::default(),
-            false => evidence,
-        }
+        evidence
     }
 }
 
@@ -195,7 +190,7 @@ pub fn evaluate(frame: &FrameContext, memory: &mut Memory) -> Vec<Finding> {
         let is_open = frame.alerts.is_open(&cause);
         let spot = memory.entry(w.owner);
         if is_beside_unclaimed(frame, w.track, &findings) {
-            spot.accompanied_at = Some(frame.now);
+            spot.test.restart();
         }
         let evidence = spot.test.evaluate(frame.config.tolerated_brightening, &others);
         if !spot.is_present(&evidence, threshold, is_open, frame) {
@@ -267,14 +262,7 @@ impl Spot {
         };
         // A second beam may be a user's whose claim has yet to come.
         let is_due = evidence.neg_log_p() > threshold && seconds(suspected, now) >= claim_wait_s;
-        is_open || (is_due && !self.is_explained(frame))
-    }
-
-    /// Whether an emitter with an alert of its own beside it explains it. One detection that goes astray does not part a user and a
-    /// stranger who has an alert.
-    fn is_explained(&self, frame: &FrameContext) -> bool {
-        let lately = |t| seconds(t, frame.now) < frame.claim_wait_s();
-        self.accompanied_at.is_some_and(lately)
+        is_open || is_due
     }
 }
 

@@ -98,6 +98,11 @@ impl Brightness {
         }
     }
 
+    /// Forgets the newest frames, not the past.
+    pub fn restart(&mut self) {
+        self.recent = Recent::default();
+    }
+
     /// Newest frames.
     pub fn frames(&self) -> usize {
         self.recent.len()

@@ -73,6 +73,14 @@ impl CoLocationTest {
         }
     }
 
+    /// Forgets the newest frames, which show another's light, not the past.
+    pub fn restart(&mut self) {
+        self.brightness.restart();
+        self.jitter.restart();
+        self.steps.restart();
+        self.second_moment.restart();
+    }
+
     /// Whether enough frames have been seen to say that there is no second beam.
     pub fn has_verdict(&self) -> bool {
         self.brightness.frames() >= WINDOWS[2]

@@ -80,6 +80,12 @@ impl Jitter {
         self.last.clear();
     }
 
+    /// Forgets the newest frames, not the past.
+    pub fn restart(&mut self) {
+        self.interrupt();
+        self.recent = Recent::default();
+    }
+
     /// Takes a second difference, with or without what all beams have in `common`, whichever is less: that may be the noise of
     /// others. With `learn` the one that it pushes out of the newest is added to the past.
     pub fn push(&mut self, difference: SecondDifference, common: Vector2<f64>, learn: bool) {

@@ -117,6 +117,12 @@ impl SecondMomentTest {
         self.update_windows();
     }
 
+    /// Forgets the newest frames, not the past.
+    pub fn restart(&mut self) {
+        self.recent = Recent::default();
+        self.update_windows();
+    }
+
     fn learn_dispersion(&mut self, expected: Vector3<f64>) {
         let settled = self.recent.iter().rev().nth(SETTLED);
         if let Some(distance2) = settled.and_then(|m| m.distance2(expected)) {

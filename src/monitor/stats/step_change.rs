@@ -117,6 +117,12 @@ impl StepDetector {
         }
     }
 
+    /// Forgets the newest frames, not the past.
+    pub fn restart(&mut self) {
+        self.newest.clear();
+        self.found.clear();
+    }
+
     /// The most significant step of the newest frames, once the past shows how steps scatter: air and platform move beams about
     /// beyond what the fit's covariance says.
     pub fn most_significant(&self) -> Option<StepEvidence> {
