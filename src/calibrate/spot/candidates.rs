@@ -33,7 +33,7 @@ pub fn first<'a>(
     let Err(error) = check(&shape) else {
         return Ok(shape);
     };
-    let wavefront = wavefront(camera, images, noise_j, run);
+    let wavefront = wavefront(camera, images, noise_j, true, run);
     check(&wavefront).map_err(|_| error)?;
     Ok(wavefront)
 }
@@ -49,8 +49,20 @@ pub fn best<'a>(first: Learner<'a>, held: &[&Image], is_field_covered: bool, run
         (score, statistics::unexplained(&held))
     };
     let (mut least, _) = on_held(&first);
-    let wavefront = wavefront(first.camera, first.images, first.noise_j, run);
-    let (score, unexplained) = on_held(&wavefront);
+    let mut learned = |varies: bool| {
+        let wavefront = wavefront(first.camera, first.images, first.noise_j, varies, run);
+        let (score, unexplained) = on_held(&wavefront);
+        (wavefront, score, unexplained)
+    };
+    let mut of_lens = learned(true);
+    // Where no spot stood a change over the field is extrapolated, which the held-out frames do not see.
+    if !is_field_covered {
+        let same = learned(false);
+        if same.1 - of_lens.1 < BETTER {
+            of_lens = same;
+        }
+    }
+    let (wavefront, score, unexplained) = of_lens;
     if score < least && unexplained < EXPLAINED {
         return wavefront;
     }
@@ -70,9 +82,9 @@ pub fn best<'a>(first: Learner<'a>, held: &[&Image], is_field_covered: bool, run
     if score < least { wavefront } else { best }
 }
 
-fn wavefront<'a>(camera: &'a Camera, images: &'a [&'a Image], noise_j: f64, run: Run) -> Learner<'a> {
+fn wavefront<'a>(camera: &'a Camera, images: &'a [&'a Image], noise_j: f64, varies: bool, run: Run) -> Learner<'a> {
     let mut learner = Learner::new(camera, images, noise_j);
-    learner.begin_wavefront();
+    learner.begin_wavefront(varies);
     run(&mut learner, WAVEFRONT_ROUNDS, "the lens's wavefront");
     learner
 }

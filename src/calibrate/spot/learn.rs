@@ -303,14 +303,14 @@ impl<'a> Learner<'a> {
         found
     }
 
-    /// Goes on with the spot of a lens's pupil, whose wavefront is then what is learned.
-    pub fn begin_wavefront(&mut self) {
+    /// Goes on with the spot of a lens's pupil, whose wavefront is then what is learned; `varies` where it may change over the field.
+    pub fn begin_wavefront(&mut self, varies: bool) {
         let radius = FIRST_PUPIL_RADIUS * self.camera.spot_sigma_m;
         let knots = (2.0 * radius / self.model.knot_m) as usize;
         let like = self
             .model
             .widened((knots | 1).clamp(self.model.n, MOST_SPLINES.max(self.model.n)));
-        self.adopt(like.with_pupil(Pupil::of_camera(self.camera)));
+        self.adopt(like.with_pupil(Pupil::of_camera(self.camera, varies)));
     }
 
     /// One step of the template and of everything else at once.

@@ -23,7 +23,11 @@ const START_WAVES: f64 = 0.03;
 
 /// ln of the first dark ring's radius, m, and for each polynomial its root mean square in waves over the field.
 #[derive(Clone, Copy, Debug)]
-pub struct Pupil(pub [f64; Self::PARAMETERS]);
+pub struct Pupil {
+    pub parameters: [f64; Self::PARAMETERS],
+    /// Whether it may change over the field.
+    pub varies: bool,
+}
 
 /// What a lens does to a plane wave, in an optical engineer's terms.
 #[derive(Clone, Copy, Debug, serde::Serialize)]
@@ -44,13 +48,13 @@ impl Pupil {
     pub const CHANGES: usize = 1 + ZERNIKES;
 
     /// Nearly the Airy disc whose core is the camera's Gaussian.
-    pub fn of_camera(camera: &Camera) -> Self {
+    pub fn of_camera(camera: &Camera, varies: bool) -> Self {
         let mut parameters = [0.0; Self::PARAMETERS];
         parameters[0] = (ZERO_PER_SIGMA * camera.spot_sigma_m).ln();
         for even in [0, 1, 2] {
             parameters[1 + FIELD * even] = START_WAVES;
         }
-        Self(parameters)
+        Self { parameters, varies }
     }
 
     /// The derivatives of what changes the image at a field place by the parameters: one factor for each of the parameters, those of
@@ -70,21 +74,27 @@ impl Pupil {
         }
     }
 
+    /// The parameters that stay zero.
+    pub fn fixed(&self) -> impl Iterator<Item = usize> + use<> {
+        let varies = self.varies;
+        (1..Self::PARAMETERS).filter(move |c| !varies && (c - 1) % FIELD != 0)
+    }
+
     /// ln of the first dark ring's radius and each polynomial's waves at a field place.
     pub fn local(&self, place: [f64; 2]) -> [f64; Self::CHANGES] {
         std::array::from_fn(|k| {
-            let parameters = &self.0[Self::range(k)];
+            let parameters = &self.parameters[Self::range(k)];
             parameters.iter().zip(Self::factors(k, place)).map(|(p, f)| p * f).sum()
         })
     }
 
     pub fn wavefront(&self) -> Wavefront {
         let rms = |changes: std::ops::Range<usize>| {
-            let of = |k: usize| FieldPolynomial(self.0[Self::range(k)].to_vec()).rms().powi(2);
+            let of = |k: usize| FieldPolynomial(self.parameters[Self::range(k)].to_vec()).rms().powi(2);
             changes.map(of).sum::<f64>().sqrt()
         };
         Wavefront {
-            first_zero_m: self.0[0].exp(),
+            first_zero_m: self.parameters[0].exp(),
             defocus: rms(1..2),
             astigmatism: rms(2..4),
             coma: rms(4..6),

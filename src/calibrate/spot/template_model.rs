@@ -345,9 +345,9 @@ mod tests {
         };
         let camera = config.camera().expect("a camera");
         let like = TemplateModel::gaussian(&camera, 0.3e-3, 9e-3);
-        let mut pupil = Pupil::of_camera(&camera);
+        let mut pupil = Pupil::of_camera(&camera, true);
         // Coma along x that grows along u.
-        pupil.0[Pupil::range(5)][1] = 0.12;
+        pupil.parameters[Pupil::range(5)][1] = 0.12;
         let (model, changes) = (like.with_pupil(pupil), like.pupil_changes(&pupil));
         let at = [0.8 * 0.015, -0.3 * 0.015];
         let (values, mut local) = (model.field_values(at), Vec::new());
@@ -360,7 +360,7 @@ mod tests {
         // What one parameter changes there.
         let step = 1e-4;
         let mut moved = pupil;
-        moved.0[Pupil::range(5)][1] += step;
+        moved.parameters[Pupil::range(5)][1] += step;
         let slope: Vec<f64> = exact(&moved)
             .iter()
             .zip(&expected)

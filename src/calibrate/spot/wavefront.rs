@@ -40,7 +40,11 @@ pub fn step(camera: &Camera, model: &TemplateModel, pupil: Pupil, patches: &[Pat
     }
     for k in 1..Pupil::PARAMETERS {
         h[(k, k)] += PRIOR.powi(-2);
-        g[k] -= pupil.0[k] * PRIOR.powi(-2);
+        g[k] -= pupil.parameters[k] * PRIOR.powi(-2);
+    }
+    for k in pupil.fixed() {
+        (0..Pupil::PARAMETERS).for_each(|l| (h[(k, l)], h[(l, k)]) = (0.0, 0.0));
+        (h[(k, k)], g[k]) = (1.0, 0.0);
     }
     let mut step = ScaledCholesky::new(&h, DAMPING)?.solve(&g);
     let longest = step.iter().fold(0.0, |a: f64, s| a.max(s.abs()));
@@ -54,12 +58,12 @@ pub fn step(camera: &Camera, model: &TemplateModel, pupil: Pupil, patches: &[Pat
             patch.chi2
         });
         let chi2: Vec<f64> = fitted.collect();
-        chi2.iter().sum::<f64>() + pupil.0[1..].iter().map(|p| (p / PRIOR).powi(2)).sum::<f64>()
+        chi2.iter().sum::<f64>() + pupil.parameters[1..].iter().map(|p| (p / PRIOR).powi(2)).sum::<f64>()
     };
     let now = cost(model, &pupil);
     for _ in 0..HALVINGS {
         let mut next = pupil;
-        next.0.iter_mut().zip(&step).for_each(|(p, s)| *p += s);
+        next.parameters.iter_mut().zip(&step).for_each(|(p, s)| *p += s);
         let template = model.with_pupil(next);
         if cost(&template, &next) < now {
             return Some(template);
