@@ -81,6 +81,8 @@ pub struct Learned {
     pub gain_scatter: Option<f64>,
     pub saturation_j: Option<f64>,
     pub saturated_frames: usize,
+    /// Frames that are cut off at their darkest value: their noise is more than what they show.
+    pub cut_off_frames: usize,
     pub before: Fit,
     pub after: Fit,
     /// Mean residual around the held-out spots over their energy, before and after, 1 at the learned peak; shape (2n+1, 2n+1) pixels.
@@ -281,6 +283,7 @@ pub fn learn(
         gain_scatter,
         saturation_j: prepared.saturation_j,
         saturated_frames: prepared.saturated_frames,
+        cut_off_frames: prepared.cut_off_frames,
         before: before_fit,
         after: after_fit,
         residuals,

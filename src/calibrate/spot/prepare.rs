@@ -7,7 +7,7 @@ use super::detection;
 use super::grouping::Image;
 use super::slope;
 use crate::optics::{Camera, PixelMaps};
-use crate::stats::median;
+use crate::stats::{is_cut_off, median};
 
 /// Half-width of what is left out around a saturated pixel, σ: further out a saturated spot's halo is below that of others.
 const AROUND_SATURATED: f64 = 6.0;
@@ -23,6 +23,8 @@ pub struct Prepared {
     pub saturation_j: Option<f64>,
     /// Frames with a saturated pixel.
     pub saturated_frames: usize,
+    /// Frames that are cut off at their darkest value.
+    pub cut_off_frames: usize,
     /// Pixels (index, row by row) that are hot in most frames.
     pub hot: Vec<usize>,
     /// Pixels that are hot in a single frame, over all frames.
@@ -109,6 +111,10 @@ pub fn prepare(camera: &Camera, frames: &[(usize, &Array2<f64>)]) -> Prepared {
         noise_j,
         saturation_j,
         saturated_frames,
+        cut_off_frames: frames
+            .iter()
+            .filter(|(_, pixels)| is_cut_off(pixels.iter().copied()))
+            .count(),
         hot,
         flashes,
     }

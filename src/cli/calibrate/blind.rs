@@ -142,7 +142,8 @@ fn report(camera: &Camera, l: &Learned) -> Vec<String> {
     let field = match l.field_degree {
         0 if l.coverage.is_field_covered() => "the same all over the sensor".to_owned(),
         0 => "its change over the sensor is not known: the spots stand on too few parts of it".to_owned(),
-        degree => format!("changing over the sensor (degree {degree})"),
+        degree if l.coverage.is_field_covered() => format!("changing over the sensor (degree {degree})"),
+        degree => format!("changing over the sensor (degree {degree}), by a guess where no spots stand"),
     };
     lines.push(format!(
         "spot: as wide as a Gaussian of {:.4} mm ({:.3} pixels; the config: {:.4} mm), {:.1} % of its light within 2 σ (a Gaussian: 86.5 %), {field}; {} separable terms. \
@@ -212,6 +213,13 @@ fn report(camera: &Camera, l: &Learned) -> Vec<String> {
             l.saturated_frames
         ));
     }
+    if l.cut_off_frames > 0 {
+        lines.push(format!(
+            "warning: {} frames are cut off at their darkest value, and half of the noise with it: noise and stated errors are too small. Raise the \
+             camera's black level until no pixel reaches 0, and record again",
+            l.cut_off_frames
+        ));
+    }
     lines
 }
 
@@ -242,6 +250,7 @@ fn object(args: &Args, camera: &Camera, l: &Learned) -> serde_json::Value {
         "bad_pixels": l.bad_pixels,
         "flashes": l.flashes,
         "saturated_frames": l.saturated_frames,
+        "cut_off_frames": l.cut_off_frames,
         "before": { "chi2": l.before.chi2, "degrees_of_freedom": l.before.degrees_of_freedom },
         "after": { "chi2": l.after.chi2, "degrees_of_freedom": l.after.degrees_of_freedom },
     })

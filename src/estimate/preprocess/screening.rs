@@ -5,6 +5,7 @@ use crate::estimate::model::hypothesis::PointSource;
 use crate::estimate::preprocess::noise_variance::VarianceFunction;
 use crate::frame::Frame;
 use crate::optics::{Camera, DisplacedSpots};
+use crate::stats::is_cut_off;
 
 /// Values of this many standard deviations or more count as non-finite: their squares approach the range of f64.
 const OVERFLOWS: f64 = 1e100;
@@ -41,10 +42,6 @@ pub(crate) struct FlaggedPixel {
     /// It holds light that is searched for elsewhere: the emitters here lack nothing.
     pub is_foreign: bool,
 }
-
-/// Share of pixels at the lowest value from which on it is cut off there: of counts up to six times as coarse as the noise a fortieth
-/// at most is.
-const CLIPPED: f64 = 0.1;
 
 impl PreprocessedFrame {
     /// Checks and normalises a frame.
@@ -110,10 +107,8 @@ impl PreprocessedFrame {
 
     /// Whether the camera cuts off what is darker than its black level: half of the noise then lies on the frame's lowest value.
     pub fn is_clipped(&self) -> bool {
-        let usable = || self.pixels.iter().zip(&self.is_masked).filter(|(_, bad)| !**bad);
-        let lowest = usable().fold(f64::INFINITY, |lowest, (p, _)| lowest.min(*p));
-        let at_lowest = usable().filter(|(p, _)| **p == lowest).count();
-        at_lowest as f64 > CLIPPED * self.pixels.len() as f64
+        let usable = self.pixels.iter().zip(&self.is_masked).filter(|(_, bad)| !**bad);
+        is_cut_off(usable.map(|(p, _)| *p))
     }
 
     /// Masks one more pixel; the caller fills it.
