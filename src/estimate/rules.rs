@@ -130,6 +130,8 @@ rules! {
     weigh_speeds,
     /// Who has gone dark is not reported before it is dropped.
     hide_dark,
+    /// Frames through another lens than the configured one are answered one by one. Needed in `oapwatch study lens-alerts`.
+    watch_lens,
     }
 }
 

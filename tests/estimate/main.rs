@@ -5,6 +5,7 @@ mod frames;
 mod hot_pixels;
 mod lens;
 mod lens_memory;
+mod lens_watch;
 mod moving;
 mod sequence;
 mod shot_noise;

@@ -7,7 +7,7 @@ use crate::estimate::estimators::list::{DEFAULT, Learned, Method, find};
 use crate::estimate::estimators::network::NetworkEstimator;
 use crate::estimate::estimators::pixel_correction::PixelCorrected;
 use crate::estimate::estimators::windowed::WindowedEstimator;
-use crate::estimate::sequence::SequenceEstimator;
+use crate::estimate::sequence::{LensWatch, SequenceEstimator};
 use crate::optics::Camera;
 
 /// Builds the configured estimator for a camera.
@@ -45,13 +45,16 @@ pub fn build(config: &Config, camera: &Camera) -> Result<Box<dyn Estimator>, Con
             let spec = find(name)?;
             let single = || AnalyticEstimator::new(spec, camera, config.known_power.as_ref(), config.rules);
             match spec.method {
-                Method::Sequence => Box::new(SequenceEstimator::new(
-                    spec,
-                    single(),
-                    camera,
-                    config.memory_s(),
-                    config.rules,
-                )),
+                Method::Sequence => {
+                    let rules = config.rules;
+                    let together = SequenceEstimator::new(spec, single(), camera, config.memory_s(), rules);
+                    if rules.watch_lens && !WindowedEstimator::suits(camera, rules) {
+                        let alone = AnalyticEstimator::new(find(DEFAULT)?, camera, None, rules);
+                        Box::new(LensWatch::new(together, alone))
+                    } else {
+                        Box::new(together)
+                    }
+                }
                 Method::MaximumLikelihood if WindowedEstimator::suits(camera, config.rules) => {
                     Box::new(WindowedEstimator::new(spec, camera, config.rules))
                 }

@@ -9,6 +9,7 @@ mod acceleration_bank;
 mod chances;
 mod course;
 mod joint_information;
+mod lens_watch;
 mod local_quadratic;
 mod motion;
 mod outlook;
@@ -28,4 +29,5 @@ mod upkeep;
 mod window;
 mod window_fit;
 
+pub(crate) use lens_watch::LensWatch;
 pub(crate) use sequence_estimator::SequenceEstimator;
