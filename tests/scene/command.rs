@@ -197,6 +197,22 @@ fn simulate_writes_a_config_that_review_runs() {
         raised.iter().any(|e| e["alert"]["kind"] == "unclaimed_emitter"),
         "{text}"
     );
+    // A recording that was cut short is said to be, after all that it says.
+    let frames = folder.path().join("frames.npy");
+    let whole = std::fs::metadata(&frames).unwrap().len();
+    std::fs::File::options()
+        .write(true)
+        .open(&frames)
+        .unwrap()
+        .set_len(whole - 1)
+        .unwrap();
+    let reviewed = oapwatch(&["review", "--config", config.to_str().unwrap()]);
+    let said = String::from_utf8_lossy(&reviewed.stderr);
+    assert_eq!(reviewed.status.code(), Some(2));
+    assert!(
+        said.contains("frame 89 is truncated") && !reviewed.stdout.is_empty(),
+        "{said}"
+    );
     std::fs::write(&config, "# mine\n").unwrap();
     simulate();
     assert_eq!(std::fs::read_to_string(&config).unwrap(), "# mine\n");

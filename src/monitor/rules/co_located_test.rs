@@ -120,6 +120,27 @@ fn a_stranger_with_an_alert_beside_the_user_explains_the_light() {
 }
 
 #[test]
+fn what_a_spot_showed_beside_a_stranger_counts_no_more_once_they_have_parted() {
+    let mut watch = Watch::new();
+    let mut beams = Watch::beams([3.0, 1.0, 1.0, 1.0]);
+    beams.push(detection(5.0, 0.0));
+    watch.scene.detect(&beams);
+    let stranger = watch.scene.tracker.tracks.last().unwrap().id;
+    let content =
+        Content::new(Severity::Warning, json!({})).at(nalgebra::Vector3::new(5.0, 0.0, 0.0), Default::default());
+    watch
+        .scene
+        .apply(vec![Finding::present(Cause::Track(stranger), content)]);
+    (0..40).for_each(|_| drop(watch.detect(&beams)));
+    // The stranger goes away at 4 m/s, and the user's light is their own.
+    beams[0].energy_j = 1.0;
+    for k in 0..60 {
+        *beams.last_mut().unwrap() = detection(5.0 + 0.4 * f64::from(k), 0.0);
+        assert!(present(&watch.detect(&beams)).is_empty(), "frame {k}");
+    }
+}
+
+#[test]
 fn the_past_outlasts_a_restart() {
     let mut watch = Watch::new();
     watch.until_found([3.0, 1.0, 1.0, 1.0]).expect("found");
