@@ -187,6 +187,7 @@ mod tests {
             noise_j: 1.0,
             saturation_j: None,
             saturated_frames: 0,
+            cut_off_frames: 0,
             hot: Vec::new(),
             flashes: 0,
         };
