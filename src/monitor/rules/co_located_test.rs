@@ -36,6 +36,21 @@ impl Watch {
         USERS.into_iter().zip(energies).map(of).collect()
     }
 
+    /// The first user's spot is three times as bright, and an alerted stranger stands 5 m off: their beams, and the stranger's track.
+    fn beside_a_stranger() -> (Self, Vec<Detection>, u64) {
+        let mut watch = Self::new();
+        let mut beams = Self::beams([3.0, 1.0, 1.0, 1.0]);
+        beams.push(detection(5.0, 0.0));
+        watch.scene.detect(&beams);
+        let stranger = watch.scene.tracker.tracks.last().expect("a track").id;
+        let at = nalgebra::Vector3::new(5.0, 0.0, 0.0);
+        let content = Content::new(Severity::Warning, json!({})).at(at, Default::default());
+        watch
+            .scene
+            .apply(vec![Finding::present(Cause::Track(stranger), content)]);
+        (watch, beams, stranger)
+    }
+
     fn detect(&mut self, beams: &[Detection]) -> Vec<Finding> {
         self.scene.detect(beams);
         let findings = evaluate(self.scene.context(), &mut self.memory);
@@ -97,16 +112,7 @@ fn it_ends_when_the_light_is_one_beams_again() {
 
 #[test]
 fn a_stranger_with_an_alert_beside_the_user_explains_the_light() {
-    let mut watch = Watch::new();
-    let mut beams = Watch::beams([3.0, 1.0, 1.0, 1.0]);
-    beams.push(detection(5.0, 0.0));
-    watch.scene.detect(&beams);
-    let stranger = watch.scene.tracker.tracks.last().unwrap().id;
-    let content =
-        Content::new(Severity::Warning, json!({})).at(nalgebra::Vector3::new(5.0, 0.0, 0.0), Default::default());
-    watch
-        .scene
-        .apply(vec![Finding::present(Cause::Track(stranger), content)]);
+    let (mut watch, mut beams, stranger) = Watch::beside_a_stranger();
     assert!((0..40).all(|_| present(&watch.detect(&beams)).is_empty()));
     // Once it has merged into the spot, its alert goes on as that of the spot.
     beams.pop();
@@ -121,16 +127,7 @@ fn a_stranger_with_an_alert_beside_the_user_explains_the_light() {
 
 #[test]
 fn what_a_spot_showed_beside_a_stranger_counts_no_more_once_they_have_parted() {
-    let mut watch = Watch::new();
-    let mut beams = Watch::beams([3.0, 1.0, 1.0, 1.0]);
-    beams.push(detection(5.0, 0.0));
-    watch.scene.detect(&beams);
-    let stranger = watch.scene.tracker.tracks.last().unwrap().id;
-    let content =
-        Content::new(Severity::Warning, json!({})).at(nalgebra::Vector3::new(5.0, 0.0, 0.0), Default::default());
-    watch
-        .scene
-        .apply(vec![Finding::present(Cause::Track(stranger), content)]);
+    let (mut watch, mut beams, _) = Watch::beside_a_stranger();
     (0..40).for_each(|_| drop(watch.detect(&beams)));
     // The stranger goes away at 4 m/s, and the user's light is their own.
     beams[0].energy_j = 1.0;
