@@ -8,6 +8,7 @@ pub(super) mod error_budget;
 pub(super) mod gaussian;
 pub(super) mod jitter;
 pub(super) mod lamp_or_beam;
+pub(super) mod moment_blocks;
 pub(super) mod moment_score;
 pub(super) mod robust;
 pub(super) mod second_moment;

@@ -2,7 +2,8 @@
 
 use nalgebra::{Matrix3, Vector3};
 
-use super::block_history::{BlockHistory, MIN_DRIFT_BLOCKS, RECENT_FRAMES, Recent};
+use super::block_history::{BlockHistory, RECENT_FRAMES, Recent};
+use super::moment_blocks::Blocks;
 use super::moment_score::MomentScore;
 use super::robust::median_high;
 
@@ -46,32 +47,6 @@ pub struct SecondMomentTest {
     dispersion: f64,
     dispersion_frames: f64,
     windows: [Option<WindowEstimate>; WINDOWS.len()],
-}
-
-/// The blocks' sum, and how their means scatter: the sum of squares over one less than their number, and the trace of a mean's own covariance.
-/// The latter two are only of enough blocks.
-#[derive(Clone, Copy, Debug, Default)]
-struct Blocks {
-    sum: MomentScore,
-    scatter: Option<(f64, f64)>,
-}
-
-impl Blocks {
-    fn of<'a>(blocks: impl Iterator<Item = &'a MomentScore> + Clone) -> Self {
-        let mut sum = MomentScore::default();
-        blocks.clone().for_each(|block| sum.add(block));
-        let means: Vec<_> = blocks.filter_map(MomentScore::solved).collect();
-        let n = means.len() as f64;
-        let scatter = (means.len() >= MIN_DRIFT_BLOCKS).then(|| {
-            let middle = means.iter().map(|(m, _)| m).sum::<Vector3<f64>>() / n;
-            let squares: f64 = means.iter().map(|(m, _)| (m - middle).norm_squared()).sum();
-            (
-                squares / (n - 1.0),
-                means.iter().map(|(_, cov)| cov.trace()).sum::<f64>() / n,
-            )
-        });
-        Self { sum, scatter }
-    }
 }
 
 /// Moments of a window, and their rise over what came before it, each with its covariance.
