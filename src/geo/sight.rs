@@ -140,6 +140,12 @@ impl Sight {
         Some(camera.distortion.project(camera.plane_distance_m, tangents))
     }
 
+    /// How far in front of the lens a place in the world is, along the optical axis, and its distance, m.
+    pub fn depth_and_distance_m(&self, place_m: [f64; 3]) -> (f64, f64) {
+        let way = Vector3::from(place_m) - self.lens_m;
+        (self.to_world.column(2).dot(&way), way.norm())
+    }
+
     /// The ground below or above a place, east and north; `None` where it is not known.
     pub fn ground_below(&self, place_m: [f64; 2]) -> Option<Ground> {
         match &self.terrain {

@@ -105,6 +105,16 @@ impl View {
         self.sight.as_ref().map_or(Vector2::zeros(), |s| s.lens_m().xy())
     }
 
+    /// ln of the geometric gain of a beam from the ground at a place, but for a constant: the lens's area as the beam sees it over the squared
+    /// distance, by which a beam that is wider than the lens is collected; `None` behind the camera.
+    pub fn ln_gain(&self, p: Vector2<f64>) -> Option<f64> {
+        let (depth_m, distance_m) = match &self.sight {
+            None => (self.camera.altitude_m, self.camera.altitude_m.hypot(p.norm())),
+            Some(sight) => sight.depth_and_distance_m([p.x, p.y, self.ground_z_m(p).unwrap_or(0.0)]),
+        };
+        (depth_m > 0.0).then(|| (depth_m / distance_m.powi(3)).ln())
+    }
+
     /// Ground metres per sensor metre straight below.
     pub fn ground_scale(&self) -> f64 {
         match &self.sight {

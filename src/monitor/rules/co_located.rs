@@ -94,7 +94,7 @@ impl Memory {
     }
 
     /// Takes the frame's light and positions, less what all beams have in common.
-    fn update(&mut self, watched: &[WatchedSpot]) {
+    fn update(&mut self, frame: &FrameContext, watched: &[WatchedSpot]) {
         let users = self.users.iter_mut().map(|(user, spot)| (Owner::User(user), spot));
         let lights = self.lights.iter_mut().map(|(id, spot)| (Owner::Light(id), spot));
         for (_, spot) in users.chain(lights).filter(|(owner, _)| find(watched, *owner).is_none()) {
@@ -125,9 +125,9 @@ impl Memory {
         for (w, (jump, steps)) in watched.iter().zip(displacements) {
             let spot = self.entry(w.owner);
             let learn = spot.suspected_since.is_none();
-            if let Some(ln_energy) = w.ln_energy() {
+            if let Some(light) = w.light(frame) {
                 spot.test.second_moment.push(&w.detection.moments, learn);
-                spot.test.brightness.push(w.track.last_hit, ln_energy, learn);
+                spot.test.brightness.push(w.track.last_hit, light, learn);
             }
             if let Some(jump) = jump {
                 spot.test.jitter.push(jump, common_jump, learn);
@@ -179,7 +179,7 @@ impl Memory {
 pub fn evaluate(frame: &FrameContext, memory: &mut Memory) -> Vec<Finding> {
     let threshold = frame.budget.threshold(TestFamily::CoLocated, frame.claims.len() as f64);
     let watched = watched_spots(frame);
-    memory.update(&watched);
+    memory.update(frame, &watched);
     let mut findings = Vec::new();
     for w in &watched {
         let Owner::User(user) = w.owner else {

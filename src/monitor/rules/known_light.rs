@@ -120,7 +120,7 @@ fn evaluate_light(
     let suspected_since = is_suspect.then(|| state.suspected_since.unwrap_or(frame.now));
     memory.observed.push(Observed {
         id: id.clone(),
-        ln_energy: spot.and_then(WatchedSpot::ln_energy),
+        ln_energy: spot.and_then(|spot| Some(spot.light(frame)?.ln_energy)),
         place: frame.world(track).into(),
         suspected_since,
     });

@@ -2,6 +2,7 @@
 
 use crate::estimate::Flags;
 use crate::monitor::frame_context::FrameContext;
+use crate::monitor::stats::brightness::Light;
 use crate::monitor::stats::gaussian::largest_eigenvalue;
 use crate::monitor::track::beam_track::Track;
 use crate::monitor::track::detection::Detection;
@@ -25,11 +26,16 @@ pub struct WatchedSpot<'a> {
 }
 
 impl WatchedSpot<'_> {
-    /// ln of the spot's energy, where the frame shows all of its light.
-    pub fn ln_energy(&self) -> Option<f64> {
+    /// The spot's light, where the frame shows all of it.
+    pub fn light(&self, frame: &FrameContext) -> Option<Light> {
         let incomplete = Flags::SATURATED | Flags::MASKED | Flags::NEAR_EDGE | Flags::OUT_OF_TIME;
         let detection = &self.detection;
-        (detection.energy_j > 0.0 && !detection.flags.intersects(incomplete)).then(|| detection.energy_j.ln())
+        let is_whole = detection.energy_j > 0.0 && !detection.flags.intersects(incomplete);
+        let ln_gain = frame.view.ln_gain(self.track.filter.position())?;
+        is_whole.then(|| Light {
+            ln_energy: detection.energy_j.ln(),
+            ln_gain,
+        })
     }
 }
 
@@ -131,16 +137,18 @@ mod tests {
             scene.detect(&[detection(0.0, 0.0), detection(x, 0.0)]);
             let spots = watched_spots(scene.context());
             assert_eq!(spots[0].detection.energy_j, energy_j, "{x}");
-            assert_eq!(spots[0].ln_energy(), Some(energy_j.ln()));
+            let light = spots[0].light(scene.context()).unwrap();
+            assert_eq!(light.ln_energy, energy_j.ln());
         }
     }
 
     #[test]
-    fn light_that_is_cut_off_has_no_energy() {
+    fn light_that_is_cut_off_is_not_compared() {
         let mut scene = Scene::of_users(&[[0.0, 0.0]]);
         let mut beam = detection(0.0, 0.0);
         beam.flags = Flags::NEAR_EDGE;
         scene.detect(&[beam]);
-        assert_eq!(watched_spots(scene.context())[0].ln_energy(), None);
+        let frame = scene.context();
+        assert_eq!(watched_spots(frame)[0].light(frame), None);
     }
 }

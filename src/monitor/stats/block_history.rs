@@ -92,6 +92,10 @@ impl<B: Default> BlockHistory<B> {
         self.blocks.iter()
     }
 
+    pub fn blocks_mut(&mut self) -> std::collections::vec_deque::IterMut<'_, B> {
+        self.blocks.iter_mut()
+    }
+
     /// Number of full blocks.
     pub fn len(&self) -> usize {
         self.blocks.len()

@@ -20,11 +20,25 @@ const MIN_LN_STD: f64 = 0.05;
 /// so, larger misses what few frames show of slow fading.
 const BY_CHANCE: f64 = 2.0;
 
-/// A beam's ln energies.
+/// The light of one frame.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Light {
+    /// ln of the energy, J.
+    pub ln_energy: f64,
+    /// ln of the geometric gain, but for a constant.
+    pub ln_gain: f64,
+}
+
+/// A beam's ln energies. How they follow its distance is not known: a wide beam's light falls with its square, a narrow one's not at all. So
+/// energies are compared as at the same gain, and what a loss of gain may be too much for that is no evidence.
 #[derive(Clone, Debug, Default)]
 pub struct Brightness {
+    /// ln energies less the gain, and gains.
     recent: Recent<(Timestamp, f64)>,
+    gains: Recent<(Timestamp, f64)>,
     past: BlockHistory<Variance>,
+    /// The gain that the past was seen with is not known.
+    is_gain_unknown: bool,
 }
 
 /// Mean and sum of squared deviations (Welford, 1962), and of squared steps from one value to the next.
@@ -32,6 +46,7 @@ pub struct Brightness {
 struct Variance {
     n: u32,
     mean: f64,
+    gain: f64,
     squares: f64,
     last: f64,
     steps: f64,
@@ -45,7 +60,7 @@ pub struct Scatter {
 }
 
 impl Variance {
-    fn add(&mut self, x: f64) {
+    fn add(&mut self, x: f64, gain: f64) {
         if self.n > 0 {
             self.steps += (x - self.last).powi(2);
         }
@@ -54,6 +69,7 @@ impl Variance {
         let d = x - self.mean;
         self.mean += d / f64::from(self.n);
         self.squares += d * (x - self.mean);
+        self.gain += (gain - self.gain) / f64::from(self.n);
     }
 }
 
@@ -73,34 +89,43 @@ impl std::iter::Sum for Scatter {
 }
 
 impl Brightness {
-    /// A beam known from before a restart by the mean and standard deviation of its ln energy.
+    /// A beam known from before a restart by the mean and standard deviation of its ln energy, at the gain that its next frame has.
     pub fn remembered(mean: f64, std: f64) -> Self {
         let squares = f64::from(BLOCK_FRAMES - 1) * std * std;
         let block = Variance {
             n: BLOCK_FRAMES,
             mean,
+            gain: 0.0,
             squares,
             last: mean,
             steps: 2.0 * squares,
         };
         Self {
             past: BlockHistory::of(std::iter::repeat_n(block, MIN_DRIFT_BLOCKS)),
+            is_gain_unknown: true,
             ..Self::default()
         }
     }
 
-    /// Takes a frame's ln energy. With `learn` the frame that it pushes out of the newest is added to the past.
-    pub fn push(&mut self, time: Timestamp, ln_energy: f64, learn: bool) {
-        if let Some((_, old)) = self.recent.push((time, ln_energy))
-            && learn
-        {
-            self.past.push(|block| block.add(old));
+    /// Takes a frame's light. With `learn` the frame that it pushes out of the newest is added to the past.
+    pub fn push(&mut self, time: Timestamp, light: Light, learn: bool) {
+        let Light { ln_energy, ln_gain } = light;
+        if std::mem::take(&mut self.is_gain_unknown) {
+            for block in self.past.blocks_mut() {
+                block.mean -= ln_gain;
+                block.gain = ln_gain;
+            }
+        }
+        let oldest = (self.recent.push((time, ln_energy - ln_gain))).zip(self.gains.push((time, ln_gain)));
+        if let Some(((_, at_gain), (_, gain))) = oldest.filter(|_| learn) {
+            self.past.push(|block| block.add(at_gain, gain));
         }
     }
 
     /// Forgets the newest frames, not the past.
     pub fn restart(&mut self) {
         self.recent = Recent::default();
+        self.gains = Recent::default();
     }
 
     /// Newest frames.
@@ -115,10 +140,10 @@ impl Brightness {
 
     /// Mean and standard deviation of the past's ln energy.
     pub fn past(&self) -> Option<(f64, f64)> {
-        Some((self.past_mean()?, self.within().sqrt()))
+        Some((self.past_mean()? + self.past_gain(), self.within().sqrt()))
     }
 
-    /// Rise of the mean ln energy of the shortest window over the past.
+    /// Rise of the mean ln energy of the shortest window over the past, at the same gain.
     pub fn recent_rise(&self) -> Option<f64> {
         (self.recent.len() >= WINDOWS[0]).then_some(self.recent.mean_of_newest(WINDOWS[0]) - self.past_mean()?)
     }
@@ -165,9 +190,10 @@ impl Brightness {
         let variance = slow + fast;
         let freedom = variance * variance / (slow * slow / drift_freedom + fast * fast / frames_freedom);
         let rise = self.recent.mean_of_newest(n) - past;
-        let t = (rise - allowed).max(0.0) / variance.sqrt();
+        let gained = self.gains.mean_of_newest(n) - self.past_gain();
+        let t = (rise + gained.min(0.0) - allowed).max(0.0) / variance.sqrt();
         Some(WindowExcess {
-            ratio: rise.exp(),
+            ratio: (rise + gained).exp(),
             neg_log_p: 0.5 * (freedom + 1.0) * (t * t / freedom).ln_1p(),
         })
     }
@@ -175,6 +201,10 @@ impl Brightness {
     fn past_mean(&self) -> Option<f64> {
         let n = self.past.len();
         (n >= MIN_BLOCKS).then(|| self.past.blocks().map(|b| b.mean).sum::<f64>() / n as f64)
+    }
+
+    fn past_gain(&self) -> f64 {
+        self.past.blocks().map(|b| b.gain).sum::<f64>() / self.past.len() as f64
     }
 
     /// Frames that count as one where each repeats much of the one before: (1 + ρ)/(1 − ρ) for a first-order autoregression (Bartlett,
@@ -208,7 +238,8 @@ mod tests {
         let first = brightness.frames();
         for k in 0..frames {
             let time = Timestamp::from_millisecond(100 * (first + k) as i64).unwrap();
-            brightness.push(time, ln_energy(k), true);
+            let (ln_energy, ln_gain) = (ln_energy(k), 0.0);
+            brightness.push(time, Light { ln_energy, ln_gain }, true);
         }
     }
 
@@ -249,6 +280,26 @@ mod tests {
     }
 
     #[test]
+    fn a_beam_that_comes_nearer_or_goes_away_is_no_second_one() {
+        // Light that falls with the square of the distance, and light that does not.
+        let evidence = |follows: f64, gained: f64, joined: f64| {
+            let mut beam = Brightness::default();
+            for k in 0..400 {
+                let ln_gain = gained * f64::from(k) / 400.0;
+                let noise = if k % 2 == 0 { 0.1 } else { -0.1 };
+                let ln_energy = follows * ln_gain + noise + if k >= 360 { joined } else { 0.0 };
+                let time = Timestamp::from_millisecond(100 * i64::from(k)).unwrap();
+                beam.push(time, Light { ln_energy, ln_gain }, true);
+            }
+            beam.most_significant(0.3, beam.scatter()).neg_log_p
+        };
+        for (follows, gained) in [(1.0, 2.0), (0.0, 2.0), (1.0, -2.0), (0.0, -2.0)] {
+            assert_eq!(evidence(follows, gained, 0.0), 0.0, "{follows} {gained}");
+        }
+        assert!(evidence(1.0, 2.0, 1.2) > 15.0);
+    }
+
+    #[test]
     fn drift_that_all_beams_show_takes_evidence_away() {
         let mut beam = Brightness::remembered(2.0, 0.3);
         fed(&mut beam, 10, |_| 3.0);
@@ -278,7 +329,7 @@ mod tests {
     #[test]
     fn welfords_sums_are_mean_and_variance() {
         let mut v = Variance::default();
-        [1.0, 2.0, 6.0].into_iter().for_each(|x| v.add(x));
-        assert_eq!((v.n, v.mean, v.squares), (3, 3.0, 14.0));
+        [1.0, 2.0, 6.0].into_iter().for_each(|x| v.add(x, 2.0));
+        assert_eq!((v.n, v.mean, v.squares, v.gain), (3, 3.0, 14.0, 2.0));
     }
 }

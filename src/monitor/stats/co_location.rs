@@ -112,6 +112,14 @@ mod tests {
     use jiff::Timestamp;
 
     use super::*;
+    use crate::monitor::stats::brightness::Light;
+
+    fn light(ln_energy: f64) -> Light {
+        Light {
+            ln_energy,
+            ln_gain: 0.0,
+        }
+    }
 
     fn excess(neg_log_p: f64) -> WindowExcess {
         WindowExcess { ratio: 2.0, neg_log_p }
@@ -155,7 +163,7 @@ mod tests {
         for k in 0..40 {
             assert!(!test.has_verdict());
             let time = Timestamp::from_millisecond(100 * k).unwrap();
-            test.brightness.push(time, -5.0 + 2f64.ln(), false);
+            test.brightness.push(time, light(-5.0 + 2f64.ln()), false);
         }
         assert!(test.has_verdict());
         let evidence = test.evaluate(1.35, &OtherBeams::default());
@@ -180,7 +188,8 @@ mod tests {
             let place = nalgebra::Vector2::new(0.01 * f64::from(k as i32 % 3), f64::from(u8::from(is_joined)));
             let tried = test.steps.candidates(at(k), place, 1e-2);
             test.steps.push(&tried, &Default::default(), true);
-            test.brightness.push(at(k), if is_joined { 1.0 } else { 0.0 }, true);
+            test.brightness
+                .push(at(k), light(if is_joined { 1.0 } else { 0.0 }), true);
             let evidence = test.evaluate(1.35, &OtherBeams::default());
             if is_joined && evidence.step.since == Some(at(60)) {
                 since.push((k, evidence.energy_since.neg_log_p > 0.0));
