@@ -37,9 +37,10 @@ use crate::time::seconds;
 /// takes calibration errors for one. Not measured.
 const SYSTEMATIC_M: f64 = 0.05;
 
-/// Share of the pose's variance that is left at a place beside the lasting error: what changes within seconds. Larger delays the
-/// alert of a displaced user, smaller takes such a rest for a displacement. Not measured.
+/// Share of the pose's variance that is left at a place beside the lasting error, what changes within seconds, until users have shown that for so
+/// long, s. Larger delays the alert of a displaced user, smaller takes such a rest for a displacement. Not measured.
 const UNMODELLED: f64 = 0.05;
+const SHOWN_S: f64 = 10.0;
 
 /// Age of a pose up to which it says where tracks are, s.
 const FRESH_S: f64 = 0.3;
@@ -280,7 +281,7 @@ impl FrameContext {
         let known = self.displacement_cov(p);
         match &self.view.sight {
             None => known,
-            Some(_) => known + self.view.pose_cov(p) * UNMODELLED,
+            Some(_) => known + self.view.pose_cov(p) * (UNMODELLED * SHOWN_S / (SHOWN_S + self.wander.seen_s())),
         }
     }
 
@@ -324,6 +325,7 @@ impl FrameContext {
     fn bias_cov(&self, p: Vector2<f64>) -> Matrix2<f64> {
         let by_pose = self.view.by_pose(p);
         by_pose * (self.bias.cov() + self.course.cov()) * by_pose.transpose()
+            + Matrix2::identity() * self.wander.wandered()
     }
 
     /// Covariance of a track's position in the world, m²: its own and our pose's.

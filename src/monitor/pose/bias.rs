@@ -37,11 +37,15 @@ pub struct Residual {
     pub by_pose: Matrix2x6<f64>,
 }
 
-/// How far beams are from their claims together, m.
-#[derive(Clone, Copy, Debug)]
+/// How far beams are from their claims together.
+#[derive(Clone, Copy, Debug, Default)]
 pub struct SharedOffset {
-    pub offset: Vector2<f64>,
-    /// Per axis, m².
+    /// What the lasting error leaves, m.
+    pub left: Vector2<f64>,
+    /// The lasting error, and how it displaces users in the mean.
+    pub error: Vector6<f64>,
+    pub by_pose: Matrix2x6<f64>,
+    /// Of what is left, per axis, m².
     pub variance: f64,
 }
 
@@ -95,14 +99,14 @@ impl PoseBias {
         self.solve(&prior_information, &prior);
     }
 
-    /// What residuals share: of what the lasting error leaves of each the median, which liars fewer than a half do not choose, and what
-    /// that error makes where the users are. None with fewer than three.
+    /// What residuals share: of what the lasting error leaves of each the median, which liars fewer than a half do not choose. None with
+    /// fewer than three.
     pub fn shared_offset(&self, residuals: &[Residual]) -> Option<SharedOffset> {
         let n = residuals.len();
-        let mean = |sum: Vector2<f64>| sum / n as f64;
         (n >= MIN_SHARING).then(|| SharedOffset {
-            offset: median_vector(residuals.iter().map(|r| r.offset - r.by_pose * self.error))
-                + mean(residuals.iter().map(|r| r.by_pose * self.error).sum()),
+            left: median_vector(residuals.iter().map(|r| r.offset - r.by_pose * self.error)),
+            error: self.error,
+            by_pose: residuals.iter().map(|r| r.by_pose).sum::<Matrix2x6<f64>>() / n as f64,
             variance: variance_of_median(residuals.iter().map(|r| r.variance).sum::<f64>() / n as f64, n),
         })
     }
@@ -249,7 +253,7 @@ mod tests {
         let of = |users: usize| PoseBias::default().shared_offset(&(0..users).map(residual).collect::<Vec<_>>());
         assert!(of(2).is_none());
         // The median of 1.1 to 1.5 and of 50.
-        assert!((of(6).expect("enough").offset.x - 1.35).abs() < 1e-12);
+        assert!((of(6).expect("enough").left.x - 1.35).abs() < 1e-12);
     }
 
     #[test]

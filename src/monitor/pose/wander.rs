@@ -3,7 +3,7 @@
 
 use std::collections::VecDeque;
 
-use nalgebra::Vector2;
+use nalgebra::{Matrix2x6, Vector2, Vector6};
 
 use super::bias::SharedOffset;
 use crate::monitor::stats::claim_consistency::share_after_averaging;
@@ -16,26 +16,54 @@ const AROUND_S: f64 = 4.0;
 const NEWEST_S: f64 = 2.0;
 /// Time between two that are kept, s: claims come once a second.
 const STEP_S: f64 = 0.5;
+/// Time after which it is learned how far the displacement wanders, s: most of the delay and of what lasts is known then.
+const LEARNED_S: f64 = 20.0;
+/// Time over which it is learned how far the displacement wanders, s. Longer is more exact, shorter follows a wind that rises.
+const WANDER_S: f64 = 60.0;
 /// Time in which a lasting error and the delay of the poses are learned, s: three times that over which claims are averaged.
 const SETTLES_S: f64 = 30.0;
 
 /// The displacement of the newest frames against that ten seconds before.
 #[derive(Clone, Debug, Default)]
 pub struct PoseWander {
-    newest: Vector2<f64>,
+    newest: Mean,
     /// Of the newest, per axis, m².
     variance: f64,
     /// What the newest was, and when.
-    earlier: VecDeque<(f64, Vector2<f64>)>,
+    earlier: VecDeque<(f64, Mean)>,
+    /// Mean square, per axis, of what the lasting error leaves of the newest, less the claims' own, m².
+    wandered: f64,
     known_s: f64,
     unknown_s: f64,
+}
+
+/// A mean of what users share.
+#[derive(Clone, Copy, Debug, Default)]
+struct Mean {
+    left: Vector2<f64>,
+    error: Vector6<f64>,
+    by_pose: Matrix2x6<f64>,
+}
+
+impl Mean {
+    fn follow(&mut self, next: &Self, gain: f64) {
+        self.left += (next.left - self.left) * gain;
+        self.error += (next.error - self.error) * gain;
+        self.by_pose += (next.by_pose - self.by_pose) * gain;
+    }
 }
 
 impl PoseWander {
     /// Takes the displacement that users share in a frame, `dt` seconds after the one before; each claims every `period_s`. None where
     /// they cannot tell: after that for longer than the memory it begins anew.
     pub fn update(&mut self, shared: Option<SharedOffset>, dt: f64, period_s: f64) {
-        let Some(SharedOffset { offset, variance }) = shared else {
+        let Some(SharedOffset {
+            left,
+            error,
+            by_pose,
+            variance,
+        }) = shared
+        else {
             self.unknown_s += dt;
             if self.unknown_s > MEMORY_S {
                 *self = Self::default();
@@ -44,30 +72,49 @@ impl PoseWander {
         };
         self.unknown_s = 0.0;
         self.known_s += dt;
-        self.newest += (offset - self.newest) * (dt / self.known_s.min(NEWEST_S)).min(1.0);
+        let gain = (dt / self.known_s.min(NEWEST_S)).min(1.0);
+        self.newest.follow(&Mean { left, error, by_pose }, gain);
         self.variance = variance * share_after_averaging(NEWEST_S, period_s);
         let now = self.known_s;
         if self.earlier.back().is_none_or(|(at, _)| now - at >= STEP_S) {
             self.earlier.push_back((now, self.newest));
         }
-        while self
-            .earlier
-            .front()
-            .is_some_and(|(at, _)| now - at > MEMORY_S + AROUND_S)
-        {
+        while let Some((at, was)) = self.earlier.front().filter(|(at, _)| now - at > MEMORY_S + AROUND_S) {
+            if *at > LEARNED_S {
+                let wandered = 0.5 * was.left.norm_squared() - self.variance;
+                self.wandered += (wandered - self.wandered) * (STEP_S / (at - LEARNED_S).min(WANDER_S)).min(1.0);
+            }
             self.earlier.pop_front();
         }
     }
 
-    /// By how much the displacement has changed, m; nothing before it has settled.
+    /// By how much the displacement has changed, m; nothing before it has settled. It is another at other places though nothing changes, and
+    /// where users were its error may not show: what has changed is less where they are or where they were, whichever it is.
     pub fn change(&self) -> Vector2<f64> {
         let before = self.known_s - (MEMORY_S - AROUND_S);
-        let earlier = || self.earlier.iter().filter(|(at, _)| *at < before);
-        match earlier().count() {
-            0 => Vector2::zeros(),
-            _ if self.known_s < SETTLES_S => Vector2::zeros(),
-            n => self.newest - earlier().map(|(_, offset)| offset).sum::<Vector2<f64>>() / n as f64,
+        let earlier = self.earlier.iter().filter(|(at, _)| *at < before);
+        let mut was = Mean::default();
+        let mut count = 0.0;
+        for (_, mean) in earlier {
+            count += 1.0;
+            was.follow(mean, 1.0 / count);
         }
+        if count == 0.0 || self.known_s < SETTLES_S {
+            return Vector2::zeros();
+        }
+        let (left, error) = (self.newest.left - was.left, self.newest.error - was.error);
+        let [here, there] = [self.newest.by_pose, was.by_pose].map(|by_pose| left + by_pose * error);
+        if here.norm() < there.norm() { here } else { there }
+    }
+
+    /// Variance per axis, m², by which the displacement wandered about the lasting error's before what may be a drag.
+    pub fn wandered(&self) -> f64 {
+        self.wandered.max(0.0)
+    }
+
+    /// For how long that has been seen, s.
+    pub fn seen_s(&self) -> f64 {
+        (self.known_s - LEARNED_S - MEMORY_S - AROUND_S).max(0.0)
     }
 
     /// Of the change, per axis, m². That of the mean before is less than what claims near in time share, which cancels.
@@ -84,8 +131,9 @@ mod tests {
     fn a_drag_is_a_change_and_a_lasting_error_is_none() {
         let shared = |x: f64| {
             Some(SharedOffset {
-                offset: Vector2::new(x, 0.0),
+                left: Vector2::new(x, 0.0),
                 variance: 0.03,
+                ..SharedOffset::default()
             })
         };
         let mut wander = PoseWander::default();
@@ -108,5 +156,48 @@ mod tests {
         assert!(wander.change().x > 4.0);
         (0..60).for_each(|_| wander.update(None, 0.1, 1.0));
         assert_eq!(wander.change(), Vector2::zeros());
+    }
+
+    #[test]
+    fn what_comes_and_goes_is_a_wander_and_what_claims_scatter_by_is_none() {
+        let swing = |amplitude: f64| {
+            let mut wander = PoseWander::default();
+            for k in 0..1800 {
+                let x = amplitude * (std::f64::consts::TAU * f64::from(k) / 300.0).sin();
+                let shared = SharedOffset {
+                    left: Vector2::new(x, 0.0),
+                    variance: 0.03,
+                    ..SharedOffset::default()
+                };
+                wander.update(Some(shared), 0.1, 1.0);
+            }
+            wander.wandered()
+        };
+        // A quarter of the amplitude's square per axis, a little less as the newest two seconds are averaged.
+        let found = swing(2.0);
+        assert!((0.8..1.0).contains(&found), "{found}");
+        assert_eq!(swing(0.1), 0.0);
+    }
+
+    #[test]
+    fn users_who_go_elsewhere_change_nothing() {
+        // A heading that is off by 3 degrees displaces a user at 100 m by 5 m, to another side on each side.
+        let error = Vector6::new(0.0, 0.0, 0.05, 0.0, 0.0, 0.0);
+        let seen_at = |x: f64, error: Vector6<f64>| SharedOffset {
+            error,
+            by_pose: Matrix2x6::from_fn(|row, column| if (row, column) == (1, 2) { -x } else { 0.0 }),
+            variance: 0.03,
+            ..SharedOffset::default()
+        };
+        let mut wander = PoseWander::default();
+        for k in 0..900 {
+            let x = 100.0 * (0.03 * f64::from(k)).sin();
+            wander.update(Some(seen_at(x, error)), 0.1, 1.0);
+            assert!(wander.change().norm() < 1e-9);
+        }
+        // One that turns by as much within five seconds does.
+        (0..200).for_each(|_| wander.update(Some(seen_at(100.0, error)), 0.1, 1.0));
+        (0..50).for_each(|_| wander.update(Some(seen_at(100.0, 2.0 * error)), 0.1, 1.0));
+        assert!(wander.change().norm() > 1.0, "{}", wander.change());
     }
 }

@@ -35,9 +35,9 @@ pub fn evaluate(frame: &FrameContext) -> Vec<Finding> {
     let neg_log_p = neg_log_p_outside(worst, &cov, limit);
     let threshold = frame.budget.threshold(TestFamily::Pose, 1.0);
     let is_open = frame.alerts.is_open(&CAUSE);
-    // A dragged position is held against where it was, not against the error that the poses' source states.
+    // A dragged position is held against where it was and how far that has wandered, not against the error that the poses' source states.
     let change = frame.wander.change();
-    let change_cov = Matrix2::identity() * frame.wander.variance();
+    let change_cov = Matrix2::identity() * (frame.wander.variance() + 2.0 * frame.wander.wandered());
     let is_dragged = neg_log_p_outside(change, &change_cov, limit) > threshold;
     let is_present = neg_log_p > threshold || is_dragged || (is_open && worst.norm() > ENDS_BELOW * limit);
     if !is_present {
@@ -155,8 +155,9 @@ mod tests {
             for k in 0..600 {
                 let seconds = (f64::from(k) * 0.1 - 50.0).max(0.0);
                 let shared = SharedOffset {
-                    offset: Vector2::new(speed * seconds, 0.0),
+                    left: Vector2::new(speed * seconds, 0.0),
                     variance: 0.03,
+                    ..SharedOffset::default()
                 };
                 scene.wander.update(Some(shared), 0.1, 1.0);
             }
