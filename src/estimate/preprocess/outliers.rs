@@ -24,6 +24,10 @@ const SHARE: f64 = 0.5;
 /// Pixels wider than the first, σ, can be lit alone by a spot's misfit, which is less than its light, and wider than the second by a spot; these
 /// are not tested for isolation.
 const WIDEST_PIXEL: [f64; 2] = [0.5, 0.8];
+/// The quantile of nine tenths of a χ² variate of one degree of freedom, and the standard deviations and rounds of a variance without outliers.
+const NINE_TENTHS: f64 = 2.706;
+const CLIPPED: f64 = 5.0;
+const CLIPPINGS: usize = 4;
 /// Signal levels at which the noise is measured: each holds half the pixels of the one before, the brightest 1/128.
 const LEVELS: usize = 8;
 
@@ -68,7 +72,7 @@ impl NoiseInspection {
         compressed.expand(bx, by, &mut self.smooth);
         self.measure_out_of_basis(frame, compressed, bx, by);
         let dark = self.estimate_variance(compressed);
-        // Constant noise is measured by its mean square; a median would assume it Gaussian.
+        // Constant noise is measured by its mean square; one without outliers would assume it Gaussian.
         let floor = if compressed.variance.is_constant() {
             compressed.outside.0
         } else {
@@ -228,8 +232,7 @@ impl NoiseInspection {
         !found.is_empty()
     }
 
-    /// Returns the variance in the dark and sets `compressed.variance`. Uses medians, which outliers hardly change: the median of a χ²
-    /// variate of one degree of freedom is 0.4549.
+    /// Returns the variance in the dark and sets `compressed.variance`.
     fn estimate_variance(&mut self, compressed: &mut CompressedFrame) -> f64 {
         let mut points: Vec<(f64, f64)> = self.squares.iter().copied().filter(|s| !s.1.is_nan()).collect();
         if points.len() < 8 * LEVELS {
@@ -249,11 +252,11 @@ impl NoiseInspection {
             }
             let (part, brighter) = rest.split_at_mut(size);
             let signal = part.iter().map(|p| p.0.max(0.0)).sum::<f64>() / size as f64;
-            levels.push((signal, median_variance(part), size as f64));
+            levels.push((signal, clipped_variance(part), size as f64));
             rest = brighter;
         }
         let dark = levels.first().map_or(1.0, |l| l.1).max(1e-6);
-        // Is the brightest level noisier than the darkest? The median's relative error is about 2.3/√size.
+        // Is the brightest level noisier than the darkest? The relative error is about 1.5/√size; where spots are misfits, more.
         let brightest = levels
             .iter()
             .copied()
@@ -262,7 +265,7 @@ impl NoiseInspection {
         compressed.variance = VarianceFunction::default();
         if brightest.0 <= 0.0 || excess < DIFFERENT * 2.3 / (brightest.2).sqrt() {
             // One level: use all pixels together.
-            return median_variance(&mut points).max(1e-6);
+            return clipped_variance(&mut points).max(1e-6);
         }
         let fit = |power: i32| {
             let (mut top, mut bottom) = (0.0, 0.0);
@@ -294,8 +297,22 @@ impl NoiseInspection {
     }
 }
 
-/// Variance by the median of squares; the points, (signal, square), come back in another order.
-fn median_variance(points: &mut [(f64, f64)]) -> f64 {
-    let middle = points.len() / 2;
-    points.select_nth_unstable_by(middle, |a, b| a.1.total_cmp(&b.1)).1.1 / 0.4549
+/// Variance by the mean of the squares within [`CLIPPED`] standard deviations of a first one, which is by the quantile of nine tenths: outliers
+/// hardly change it, and whole counts as coarse as the noise do not either, of which a median is one or the next. The points,
+/// (signal, square), come back in another order.
+fn clipped_variance(points: &mut [(f64, f64)]) -> f64 {
+    let most = points.len() * 9 / 10;
+    let mut variance = points.select_nth_unstable_by(most, |a, b| a.1.total_cmp(&b.1)).1.1 / NINE_TENTHS;
+    for _ in 0..CLIPPINGS {
+        let (mut sum, mut count) = (0.0, 0.0);
+        for (_, square) in points
+            .iter()
+            .filter(|(_, square)| *square <= CLIPPED * CLIPPED * variance)
+        {
+            sum += square;
+            count += 1.0;
+        }
+        variance = sum / f64::max(count, 1.0);
+    }
+    variance
 }
