@@ -44,7 +44,7 @@ pub async fn positions(Shared(state): Shared<State>, headers: HeaderMap) -> Resu
         (status = 200, description = "The user's position (null when unseen) and claim (null when none)", body = UserPosition),
         (status = 304, description = "Nothing new since the ETag given in If-None-Match"),
         (status = 400, description = "The path cannot be read", body = Problem, content_type = "application/problem+json"),
-        (status = 404, description = "Nobody claims this user and no beam answers for them", body = Problem, content_type = "application/problem+json"),
+        (status = 404, description = "Nobody claims this user to be in view or near it, and no beam answers for them", body = Problem, content_type = "application/problem+json"),
         (status = 503, description = "No frame has been looked at yet", body = Problem, content_type = "application/problem+json"),
     ))]
 pub async fn user_position(
@@ -57,7 +57,9 @@ pub async fn user_position(
     let position = report.emitters.iter().find(|e| e.user.as_deref() == Some(&user));
     let claim = report.claims.iter().find(|c| c.user == user);
     if position.is_none() && claim.is_none() {
-        return Err(Problem::not_found(format!("no user {user:?} is claimed or seen")));
+        return Err(Problem::not_found(format!(
+            "no user {user:?} is seen, or claimed to be in view or near it"
+        )));
     }
     let found = UserPosition {
         time: report.time,
