@@ -3,11 +3,11 @@
 use crate::estimate::estimators::budgets::Budgets;
 use crate::estimate::estimators::frame_search::{Found, FrameSearch, SearchKind};
 use crate::estimate::estimators::search_bases::bases;
-use crate::estimate::model::hypothesis::Hypothesis;
+use crate::estimate::model::hypothesis::{Hypothesis, Width};
 use crate::estimate::model_order::bright_spots::bright_spots;
 use crate::estimate::model_order::candidate::Candidate;
 use crate::estimate::model_order::initialise::initial_hypothesis;
-use crate::estimate::model_order::nuisance_selection::{EARLY_ROUNDS, ROTATED_ELLIPSE, ROUNDS};
+use crate::estimate::model_order::nuisance_selection::{EARLY_ROUNDS, ROUNDS};
 use crate::estimate::model_order::refine::refine;
 use crate::estimate::model_order::reweighting::Reweighting;
 use crate::estimate::model_order::spot_error::{
@@ -50,7 +50,7 @@ impl FrameSearch {
             candidate.covariance_xy = covariance_xy;
             search.fit_trial(&mut candidate);
             refine(&mut search, &mut candidate, ROUNDS);
-            candidate.nuisances = ROTATED_ELLIPSE;
+            candidate.nuisances = search.with_background(Width::RotatedEllipse);
             search.fit_trial(&mut candidate);
             refine(&mut search, &mut candidate, EARLY_ROUNDS);
             search.converge(&mut candidate);

@@ -3,7 +3,9 @@
 
 use crate::estimate::emitter::SecondMomentScore;
 use crate::estimate::fit::source_groups::{linked, merged};
-use crate::estimate::model::hypothesis::{Hypothesis, INDEPENDENT, Nuisances, OVERLAPPING, PointSource, Width};
+use crate::estimate::model::hypothesis::{
+    Background, Hypothesis, INDEPENDENT, Nuisances, OVERLAPPING, PointSource, Width,
+};
 use crate::estimate::model_order::candidate::Candidate;
 use crate::estimate::model_order::nuisance_selection::CLOSE_PAIR_DISTANCE;
 use crate::estimate::model_order::search::Search;
@@ -59,7 +61,12 @@ impl WidthLearner {
         let spots = merged(&found.sources, CLOSE_PAIR_DISTANCE);
         let melt = search.pencil.is_some() && linked(&spots, INDEPENDENT).len() < spots.len();
         let is_round = matches!(found.nuisances.width, Width::Known | Width::Common);
-        if spots.is_empty() || melt || !is_round || found.nuisances.background || !search.is_explained_by(found) {
+        if spots.is_empty()
+            || melt
+            || !is_round
+            || found.nuisances.background != Background::None
+            || !search.is_explained_by(found)
+        {
             return None;
         }
         let mut fitted = |sources: &[PointSource]| {

@@ -17,7 +17,7 @@ use crate::estimate::fit::work_budget::WorkBudget;
 use crate::estimate::fit::workspace::Workspace;
 use crate::estimate::model::bases::Bases;
 use crate::estimate::model::compressed_frame::CompressedFrame;
-use crate::estimate::model::hypothesis::{Hypothesis, Nuisances, PointSource, Width};
+use crate::estimate::model::hypothesis::{Background, Hypothesis, Nuisances, PointSource, Width};
 use crate::estimate::model::svd_basis::Basis;
 use crate::estimate::preprocess::screening::PreprocessedFrame;
 use crate::estimate::rules::Rules;
@@ -35,7 +35,7 @@ proptest! {
         start in prop::collection::vec((-1.2f64..1.2, -1.2f64..1.2, 0.0f64..6.0), 1..7),
         steps in 1usize..40,
         holes in prop::collection::vec(0usize..256, 0..20),
-        (background, width) in (any::<bool>(), 0u8..4),
+        (background, width) in (0u8..3, 0u8..4),
         seed in any::<u64>(),
     ) {
         let camera = Config { pixels: [16, 16], spot_sigma_m: Some(sigma), ..Config::default() }.camera().expect("a camera");
@@ -61,7 +61,7 @@ proptest! {
         let mut compressed = CompressedFrame::default();
         compressed.load(&preprocessed, &bases.x, &bases.y);
         let mut hypothesis = Hypothesis::empty(Nuisances {
-            background,
+            background: [Background::None, Background::Plane, Background::Curved][usize::from(background)],
             width: [Width::Known, Width::Common, Width::PerAxis, Width::RotatedEllipse][usize::from(width)],
         });
         hypothesis.sources = start.iter().map(|(x, y, e)| PointSource::new([x * half / sigma, y * half / sigma], 10f64.powf(*e))).collect();
@@ -196,7 +196,7 @@ fn check_derivatives(nuisances: Nuisances, masked: &[(usize, usize)]) {
 fn derivatives_agree_with_finite_differences() {
     for width in [Width::Known, Width::Common, Width::PerAxis] {
         let nuisances = Nuisances {
-            background: false,
+            background: Background::None,
             width,
         };
         check_derivatives(nuisances, &[]);
@@ -212,7 +212,7 @@ fn masked_pixels_count_as_deleted() {
         for width in [Width::Known, Width::Common] {
             check_derivatives(
                 Nuisances {
-                    background: true,
+                    background: Background::Curved,
                     width,
                 },
                 masked,

@@ -97,7 +97,7 @@ pub(crate) fn restrict_hypothesis(hypothesis: &Hypothesis, kept: &[usize]) -> Hy
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::estimate::model::hypothesis::PointSource;
+    use crate::estimate::model::hypothesis::{Background, PointSource};
 
     #[test]
     fn chains_of_close_sources_are_groups_and_only_the_moving_ones_are_active() {
@@ -124,7 +124,7 @@ mod tests {
         step.velocity[3 * 2] = 1.1e-2;
         assert_eq!(active_set(&groups, &step, &equations), None, "more than half move");
         hypothesis.sources[0].u = [0.0, -20.0];
-        hypothesis.nuisances.background = true;
+        hypothesis.nuisances.background = Background::Plane;
         assert_eq!(source_groups(&hypothesis), None, "a background is shared");
     }
 }

@@ -8,8 +8,8 @@ use crate::optics::Camera;
 pub(crate) struct Bases {
     pub x: Basis,
     pub y: Basis,
-    /// Constant and sloped profiles along each axis.
-    pub backgrounds: [[Vec<f64>; 2]; 2],
+    /// Constant, sloped and curved profiles along each axis.
+    pub backgrounds: [[Vec<f64>; 3]; 2],
     /// The PSF where it is measured; without one it is a Gaussian. Only in the pixel bases.
     pub shape: Option<MeasuredShape>,
 }
@@ -58,11 +58,17 @@ impl Bases {
     }
 }
 
-/// Constant and sloped profiles along one axis, of about a source's norm, so that the normal equations are well scaled.
-fn background(b: &Basis) -> [Vec<f64>; 2] {
+/// Constant, sloped and curved profiles along one axis (Legendre polynomials), of about a source's norm, so that the normal equations are well
+/// scaled.
+fn background(b: &Basis) -> [Vec<f64>; 3] {
     let (half, norm) = (0.5 * b.n as f64, (b.n as f64).sqrt());
-    let mut pair = [vec![0.0; b.stride], vec![0.0; b.stride]];
-    b.compress((0..b.n).map(|_| 1.0 / norm), &mut pair[0]);
-    b.compress((0..b.n).map(|k| (k as f64 + 0.5 - half) / half / norm), &mut pair[1]);
-    pair
+    let legendre: [fn(f64) -> f64; 3] = [|_| 1.0, |t| t, |t| 1.5 * t * t - 0.5];
+    legendre.map(|of| {
+        let mut profile = vec![0.0; b.stride];
+        b.compress(
+            (0..b.n).map(|k| of((k as f64 + 0.5 - half) / half) / norm),
+            &mut profile,
+        );
+        profile
+    })
 }

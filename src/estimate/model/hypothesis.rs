@@ -38,10 +38,23 @@ impl PointSource {
 /// Nuisance parameters fitted beside the sources.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(crate) struct Nuisances {
-    /// A constant and two slopes.
-    pub background: bool,
+    pub background: Background,
     pub width: Width,
 }
+
+/// Which light beside the sources' is fitted.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) enum Background {
+    #[default]
+    None,
+    /// A constant and two slopes.
+    Plane,
+    /// The same with the three curvatures: daylight through a lens that is darker towards its edge.
+    Curved,
+}
+
+/// Degrees along x and y of the terms of a background.
+pub(crate) const BACKGROUND_TERMS: [[usize; 2]; 6] = [[0, 0], [1, 0], [0, 1], [2, 0], [1, 1], [0, 2]];
 
 /// Which widths of the common PSF are fitted.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -56,7 +69,11 @@ pub(crate) enum Width {
 
 impl Nuisances {
     pub fn background_terms(self) -> usize {
-        if self.background { 3 } else { 0 }
+        match self.background {
+            Background::None => 0,
+            Background::Plane => 3,
+            Background::Curved => BACKGROUND_TERMS.len(),
+        }
     }
 
     pub fn widths(self) -> usize {
@@ -77,7 +94,7 @@ impl Nuisances {
 pub(crate) struct Hypothesis {
     pub sources: Vec<PointSource>,
     pub nuisances: Nuisances,
-    pub background: [f64; 3],
+    pub background: [f64; BACKGROUND_TERMS.len()],
     /// Widths along x and y, relative to the configured σ.
     pub width: [f64; 2],
     /// The PSF's covariance between the axes, σ².
@@ -96,7 +113,7 @@ impl Hypothesis {
         Self {
             sources: Vec::new(),
             nuisances,
-            background: [0.0; 3],
+            background: [0.0; BACKGROUND_TERMS.len()],
             width: [1.0; 2],
             covariance_xy: 0.0,
             has_signed_energies: false,
@@ -115,9 +132,7 @@ impl Hypothesis {
         if nuisances.width != Width::RotatedEllipse {
             self.covariance_xy = 0.0;
         }
-        if !nuisances.background {
-            self.background = [0.0; 3];
-        }
+        self.background[nuisances.background_terms()..].fill(0.0);
     }
 
     /// Squared distances of the energies from their priors' means, in standard deviations.

@@ -6,7 +6,7 @@
 
 use crate::estimate::model::bases::Bases;
 use crate::estimate::model::compressed_frame::CompressedFrame;
-use crate::estimate::model::hypothesis::{Nuisances, PointSource};
+use crate::estimate::model::hypothesis::{BACKGROUND_TERMS, Nuisances, PointSource};
 use crate::estimate::model::measured_components::{MeasuredComponents, Orders};
 use crate::estimate::model::separable_terms::SeparableTerms;
 use crate::estimate::preprocess::masked_pixels::Run;
@@ -73,7 +73,7 @@ macro_rules! sum_pairs {
 #[derive(Default)]
 pub(crate) struct SeparableModel {
     pub sources: Vec<PointSource>,
-    pub background: [f64; 3],
+    pub background: [f64; BACKGROUND_TERMS.len()],
     /// Relative to the configured σ.
     pub width: [f64; 2],
     /// The sources' covariance between the axes, σ².
@@ -151,8 +151,7 @@ impl SeparableModel {
             for s in &self.sources {
                 measured.push(shape, axes, s.u, displacement(s.u), motion);
             }
-            for b in 0..nuisances.background_terms() {
-                let kinds = [usize::from(b == 1), usize::from(b == 2)];
+            for kinds in &BACKGROUND_TERMS[..nuisances.background_terms()] {
                 measured.push_profiles(axes, [0, 1].map(|k| bases.backgrounds[k][kinds[k]].as_slice()));
             }
             return;
@@ -181,8 +180,7 @@ impl SeparableModel {
                 }
             }
         }
-        for b in 0..nuisances.background_terms() {
-            let kinds = [usize::from(b == 1), usize::from(b == 2)];
+        for kinds in &BACKGROUND_TERMS[..nuisances.background_terms()] {
             self.terms
                 .push_profiles([0, 1].map(|k| bases.backgrounds[k][kinds[k]].as_slice()));
         }

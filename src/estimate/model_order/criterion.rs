@@ -67,7 +67,7 @@ impl Criterion<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::estimate::model::hypothesis::{Nuisances, PointSource};
+    use crate::estimate::model::hypothesis::{Background, Nuisances, PointSource};
 
     #[test]
     fn a_source_must_decrease_the_deviance_by_its_penalty_times_the_noise() {
@@ -86,7 +86,7 @@ mod tests {
         assert_eq!(two.deviance, 470.0);
         assert_eq!(criterion.score(&two), criterion.score(&one));
         two.nuisances = Nuisances {
-            background: true,
+            background: Background::Plane,
             width: Width::RotatedEllipse,
         };
         // Three sources' penalties and six nuisances'.

@@ -46,11 +46,11 @@ impl EllipseHistory {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::estimate::model::hypothesis::{Nuisances, PointSource};
+    use crate::estimate::model::hypothesis::{Background, Nuisances, PointSource};
 
     fn hypothesis(width: Width, x: f64) -> Hypothesis {
         let nuisances = Nuisances {
-            background: true,
+            background: Background::Plane,
             width,
         };
         Hypothesis {

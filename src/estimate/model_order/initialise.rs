@@ -10,7 +10,6 @@ use crate::estimate::model_order::candidate::Candidate;
 use crate::estimate::model_order::nuisance_proposals::with_more_nuisances;
 use crate::estimate::model_order::search::Search;
 use crate::estimate::preprocess::noise_variance::VarianceFunction;
-use crate::estimate::preprocess::screening::PreprocessedFrame;
 
 /// Extra emitters accepted before testing a background or width: a background brings several peaks at once, and the test costs three fits.
 const ACCEPTED_EXTRA: usize = 2;
@@ -31,7 +30,7 @@ pub(crate) fn initial_hypothesis(search: &mut Search) -> Hypothesis {
         return initialise(search, Nuisances::default(), PENCIL_FIT_STEPS).into_hypothesis();
     }
     let mut candidate = Candidate::from(Hypothesis::empty(Nuisances {
-        background: has_visible_background(search.frame),
+        background: search.visible_background(),
         width: Width::Known,
     }));
     let peaks = search.residual_peaks(&mut candidate);
@@ -147,17 +146,8 @@ fn fit_pencil_orders(
     }
 }
 
-/// Whether the dark parts of the frame are brighter or darker than the noise. A fainter background shows in the residual.
-fn has_visible_background(frame: &PreprocessedFrame) -> bool {
-    let (mut usable, mut low) = (0.0, 0.0);
-    for (p, _) in frame.pixels.iter().zip(&frame.is_masked).filter(|(_, bad)| !**bad) {
-        usable += 1.0;
-        low += f64::from(u8::from(*p < -1.0));
-    }
-    is_background_visible(usable, low)
-}
-
-/// The same by the number of usable pixels and of those below −1.
+/// Whether the dark parts of a frame are brighter or darker than the noise, by the number of usable pixels and of those below −1. A fainter
+/// background shows in the residual.
 pub(crate) fn is_background_visible(usable: f64, low: f64) -> bool {
     let expected = BELOW_ONE * usable;
     low < 0.25 * expected - 5.0 || low > expected + 5.0 * expected.sqrt()

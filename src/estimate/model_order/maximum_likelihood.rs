@@ -1,9 +1,9 @@
 //! Maximum likelihood with the number of emitters unknown.
 
-use crate::estimate::model::hypothesis::Hypothesis;
+use crate::estimate::model::hypothesis::{Hypothesis, Width};
 use crate::estimate::model_order::candidate::Candidate;
 use crate::estimate::model_order::initialise::add_residual_peaks;
-use crate::estimate::model_order::nuisance_proposals::{BACKGROUND_AND_WIDTH, drop_nuisances, with_more_nuisances};
+use crate::estimate::model_order::nuisance_proposals::{drop_nuisances, with_more_nuisances};
 use crate::estimate::model_order::nuisance_selection::{
     EARLY_ROUNDS, ROUNDS, has_paired_sources, has_unequal_energies, nuisances_can_replace_sources, select_nuisances,
     try_rotated_ellipse, try_width_for_pairs,
@@ -85,7 +85,7 @@ fn reinitialise(search: &mut Search, candidate: &mut Candidate) {
     let mut wide = None;
     if search.rules().free_nuisances && search.pencil.is_some() {
         let mut free = first.clone();
-        free.nuisances = BACKGROUND_AND_WIDTH;
+        free.nuisances = search.with_background(Width::Common);
         search.fit_trial(&mut free);
         wide = Some(free.clone()).filter(|w| search.is_explained_by(w));
         free.restrict_nuisances(first.nuisances);

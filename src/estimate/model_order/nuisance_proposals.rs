@@ -1,14 +1,8 @@
 //! Proposals that change the nuisances of a hypothesis: more of them, or none.
 
-use crate::estimate::model::hypothesis::{Hypothesis, Nuisances, Width};
+use crate::estimate::model::hypothesis::{Background, Hypothesis, Nuisances, Width};
 use crate::estimate::model_order::candidate::Candidate;
 use crate::estimate::model_order::search::Search;
-
-/// The nuisances tried in the place of more emitters.
-pub(crate) const BACKGROUND_AND_WIDTH: Nuisances = Nuisances {
-    background: true,
-    width: Width::Common,
-};
 
 /// `hypothesis` with the further nuisances that score best, if any score better; fits that cannot beat `rival` are aborted.
 pub(crate) fn with_more_nuisances(
@@ -21,10 +15,7 @@ pub(crate) fn with_more_nuisances(
     }
     let mut best: Option<Hypothesis> = None;
     for width in [Width::Known, Width::Common, Width::PerAxis] {
-        let nuisances = Nuisances {
-            background: true,
-            width,
-        };
+        let nuisances = search.with_background(width);
         if nuisances.count() <= hypothesis.nuisances.count() || search.is_measured() && width != Width::Known {
             continue;
         }
@@ -44,19 +35,16 @@ pub(crate) fn with_more_nuisances(
 
 /// Removes nuisances where the score improves without them.
 pub(crate) fn drop_nuisances(search: &mut Search, candidate: &mut Candidate) {
+    let Nuisances { background, width } = candidate.nuisances;
     let simpler = [
-        Nuisances {
-            background: candidate.nuisances.background,
-            width: Width::Known,
-        },
-        Nuisances {
-            background: false,
-            width: candidate.nuisances.width,
-        },
-        Nuisances::default(),
-    ];
+        (background, Width::Known),
+        (Background::Plane, width),
+        (Background::None, width),
+        (Background::None, Width::Known),
+    ]
+    .map(|(background, width)| Nuisances { background, width });
     for nuisances in simpler {
-        if nuisances.count() < candidate.nuisances.count() {
+        if nuisances.background <= candidate.nuisances.background && nuisances.count() < candidate.nuisances.count() {
             let mut next = Hypothesis::clone(candidate);
             next.restrict_nuisances(nuisances);
             search.try_accept(candidate, next);

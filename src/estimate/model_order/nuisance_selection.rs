@@ -1,10 +1,10 @@
 //! Nuisance selection: a background, another width or a rotated ellipse may explain a frame better than more emitters.
 
 use crate::estimate::fit::levenberg_marquardt::fit;
-use crate::estimate::model::hypothesis::{Hypothesis, Nuisances, Width};
+use crate::estimate::model::hypothesis::{Hypothesis, Width};
 use crate::estimate::model_order::candidate::Candidate;
 use crate::estimate::model_order::initialise::initialise;
-use crate::estimate::model_order::nuisance_proposals::{BACKGROUND_AND_WIDTH, with_more_nuisances};
+use crate::estimate::model_order::nuisance_proposals::with_more_nuisances;
 use crate::estimate::model_order::proposals::{disjoint_close_pairs, merge_pairs};
 use crate::estimate::model_order::refine::{refine, shrink};
 use crate::estimate::model_order::search::Search;
@@ -15,10 +15,6 @@ pub(crate) const EARLY_ROUNDS: usize = 3;
 /// Ratio of energies from which overlapping sources may be an artefact of a wrong width or background. Users' energies scatter by a tenth;
 /// smaller would test nuisances in frames of honest users of two powers, which only costs time.
 const MAX_ENERGY_RATIO: f64 = 3.0;
-pub(crate) const ROTATED_ELLIPSE: Nuisances = Nuisances {
-    background: true,
-    width: Width::RotatedEllipse,
-};
 /// Rotated ellipses: shares of a frame's work before and after they have reduced the excess deviance to `ELLIPSE_GAIN` of it. The trial is
 /// paid by every frame that nothing explains.
 const ELLIPSE_TRIAL_WORK: f64 = 0.2;
@@ -39,13 +35,11 @@ const NUISANCE_FIT_STEPS: usize = 150;
 
 /// Tries a background, another width, or both instead of more emitters and keeps what scores better than `candidate`.
 pub(crate) fn select_nuisances(search: &mut Search, candidate: &mut Candidate) {
-    if candidate.nuisances == BACKGROUND_AND_WIDTH && is_settled(search, candidate) {
+    let with_width = search.with_background(Width::Common);
+    if candidate.nuisances == with_width && is_settled(search, candidate) {
         return;
     }
-    let lit = Nuisances {
-        background: true,
-        width: Width::Known,
-    };
+    let lit = search.with_background(Width::Known);
     // A background has singular values of its own, which the pencil would count as emitters.
     let grown = if search.pencil.is_some() {
         let mut grown = Candidate::from(Hypothesis::empty(lit));
@@ -58,13 +52,13 @@ pub(crate) fn select_nuisances(search: &mut Search, candidate: &mut Candidate) {
     search.keep_better(candidate, grown);
     if is_settled(search, candidate) {
         let mut next = candidate.clone();
-        next.nuisances = BACKGROUND_AND_WIDTH;
+        next.nuisances = with_width;
         search.fit_trial(&mut next);
         refine(search, &mut next, EARLY_ROUNDS);
         search.keep_better(candidate, next);
     }
     if !is_settled(search, candidate) {
-        let next = initialise(search, BACKGROUND_AND_WIDTH, NUISANCE_FIT_STEPS);
+        let next = initialise(search, with_width, NUISANCE_FIT_STEPS);
         search.keep_better(candidate, next);
     }
     if !search.is_explained_by(candidate)
@@ -82,7 +76,7 @@ fn is_settled(search: &Search, hypothesis: &Hypothesis) -> bool {
 /// Whether a background and another width can replace sources of a hypothesis that explains the frame.
 pub(crate) fn nuisances_can_replace_sources(search: &mut Search, candidate: &Candidate) -> bool {
     let mut next = candidate.clone();
-    next.nuisances = BACKGROUND_AND_WIDTH;
+    next.nuisances = search.with_background(Width::Common);
     search.fit_trial(&mut next);
     let least = DOUBTFUL * search.criterion.source_penalty;
     let significance = next.wald_statistics(&mut search.context);
@@ -106,13 +100,13 @@ pub(crate) fn try_rotated_ellipse(search: &mut Search, first: Hypothesis, candid
     } else {
         merge_pairs(candidate, &disjoint_close_pairs(candidate, CLOSE_PAIR_DISTANCE))
     });
-    next.nuisances = BACKGROUND_AND_WIDTH;
+    next.nuisances = search.with_background(Width::Common);
     search.fit_trial(&mut next);
     if search.is_explained_by(&next) {
         return search.keep_better(candidate, next);
     }
     let left = next.deviance - data_count;
-    next.nuisances = ROTATED_ELLIPSE;
+    next.nuisances = search.with_background(Width::RotatedEllipse);
     let limit = search.context.budget.limit(ELLIPSE_TRIAL_WORK);
     search.fit_trial(&mut next);
     search.context.budget.restore_limit(limit);
@@ -126,7 +120,8 @@ pub(crate) fn try_rotated_ellipse(search: &mut Search, first: Hypothesis, candid
     }
     search.keep_better(candidate, next);
     if is_overlapping && !is_settled(search, candidate) {
-        let next = initialise(search, ROTATED_ELLIPSE, NUISANCE_FIT_STEPS);
+        let ellipse = search.with_background(Width::RotatedEllipse);
+        let next = initialise(search, ellipse, NUISANCE_FIT_STEPS);
         search.keep_better(candidate, next);
     }
     search.context.budget.restore_limit(limit);

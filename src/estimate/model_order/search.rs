@@ -9,11 +9,13 @@ use crate::estimate::fit::work_budget::WorkBudget;
 use crate::estimate::fit::workspace::Workspace;
 use crate::estimate::model::bases::Bases;
 use crate::estimate::model::compressed_frame::CompressedFrame;
-use crate::estimate::model::hypothesis::{Hypothesis, OVERLAPPING};
+use crate::estimate::model::hypothesis::{Background, Hypothesis, Nuisances, OVERLAPPING, Width};
 use crate::estimate::model::svd_basis::Basis;
 use crate::estimate::model_order::candidate::Candidate;
+use crate::estimate::model_order::common_misfit::is_narrow;
 use crate::estimate::model_order::criterion::{Criterion, source_penalty};
 use crate::estimate::model_order::evidence::fit_with_prior;
+use crate::estimate::model_order::initialise::is_background_visible;
 use crate::estimate::model_order::power_prior::PowerPrior;
 use crate::estimate::preprocess::noise_variance::VarianceFunction;
 use crate::estimate::preprocess::screening::PreprocessedFrame;
@@ -143,6 +145,37 @@ impl<'a> Search<'a, '_> {
     /// Whether the PSF is measured: then it has no width to be fitted.
     pub fn is_measured(&self) -> bool {
         self.context.bases.shape.is_some()
+    }
+
+    /// The background that the dark parts of the frame show. A fainter one shows in the residual.
+    pub fn visible_background(&self) -> Background {
+        let (mut usable, mut low) = (0.0, 0.0);
+        for (p, _) in self
+            .frame
+            .pixels
+            .iter()
+            .zip(&self.frame.is_masked)
+            .filter(|(_, bad)| !**bad)
+        {
+            usable += 1.0;
+            low += f64::from(u8::from(*p < -1.0));
+        }
+        if !is_background_visible(usable, low) {
+            Background::None
+        } else if is_narrow(self.context.bases) {
+            // A curvature is a spot's there.
+            Background::Plane
+        } else {
+            Background::Curved
+        }
+    }
+
+    /// A width with the background that may be there.
+    pub fn with_background(&self, width: Width) -> Nuisances {
+        Nuisances {
+            background: self.visible_background().max(Background::Plane),
+            width,
+        }
     }
 
     /// Whether too many pixels are masked for the matrix pencil and for rotated ellipses.
