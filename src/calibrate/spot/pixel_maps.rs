@@ -10,7 +10,7 @@ use super::patch::Patch;
 use super::prepare::Prepared;
 use super::template_model::TemplateModel;
 use crate::calibrate::maps::{self, Pixels};
-use crate::optics::{Camera, PixelMaps};
+use crate::optics::{Axis, Camera, PixelMaps};
 use crate::stats::median;
 
 /// Pixel maps that a recording leads to.
@@ -68,18 +68,18 @@ fn estimate(
     let from = |frames: Vec<Pixels>| maps::estimate_from(shape, learner.noise_j, frames.into_iter());
     let indexed = frames.iter().enumerate();
     let others = indexed.filter(|(k, _)| !is_held(*k)).map(|(_, f)| f.clone()).collect();
-    let (Some(trial), Some(mut found)) = (from(others), from(frames)) else {
+    let (Some(mut trial), Some(mut found)) = (from(others), from(frames)) else {
         return Found {
             maps: learner.camera.pixels.as_deref().cloned(),
             are_better: false,
         };
     };
+    for maps in [&mut trial, &mut found] {
+        spare_spots(learner.camera, maps, own);
+    }
     let nx = learner.camera.x.n;
-    for (p, light) in &unknown {
-        let is_neighbour = |q: &usize| (q % nx).abs_diff(p % nx) <= 2 && (q / nx).abs_diff(p / nx) <= 2;
-        let lights = unknown.iter().filter(|(q, _)| is_neighbour(q)).map(|(_, light)| *light);
-        let most = lights.fold(OUTLIER * learner.noise_j, f64::max);
-        found.bad[(p / nx, p % nx)] = *light > HALF * most;
+    for p in bright_beside(learner, &unknown) {
+        found.bad[(p / nx, p % nx)] = true;
     }
     hot.iter().for_each(|p| found.bad[(p / nx, p % nx)] = true);
     found.bad.zip_mut_with(&own.bad, |new, old| *new |= *old);
@@ -125,6 +125,65 @@ fn unknown(learner: &Learner, frames: &[Pixels]) -> Vec<(usize, f64)> {
     pixels.filter(is_unknown).filter_map(|p| Some((p, light(p)?))).collect()
 }
 
+/// Those of `unknown` pixels that are brighter than what surrounds them, where they are fewer than a spot lights: two users who stay beside each
+/// other are odd in every frame too.
+fn bright_beside(learner: &Learner, unknown: &[(usize, f64)]) -> Vec<usize> {
+    let camera = learner.camera;
+    let nx = camera.x.n;
+    let is_bright = |p: usize, light: f64| {
+        let beside = unknown.iter().filter(|(q, _)| is_within(nx, p, *q, 2));
+        light
+            > HALF
+                * beside
+                    .map(|(_, light)| *light)
+                    .fold(OUTLIER * learner.noise_j, f64::max)
+    };
+    let bright = unknown
+        .iter()
+        .filter(|(p, light)| is_bright(*p, *light))
+        .map(|(p, _)| *p);
+    let patches = patches(nx, bright.collect()).into_iter();
+    patches.filter(|patch| !is_of_spot(camera, patch)).flatten().collect()
+}
+
+/// Leaves patches of bad pixels as they were that are as large as a spot: what light was not explained there is some beam's.
+fn spare_spots(camera: &Camera, found: &mut PixelMaps, own: &PixelMaps) {
+    let nx = camera.x.n;
+    let bad = found.bad.iter().enumerate().filter(|(_, bad)| **bad).map(|(p, _)| p);
+    let patches = patches(nx, bad.collect()).into_iter();
+    for p in patches.filter(|patch| is_of_spot(camera, patch)).flatten() {
+        let at = (p / nx, p % nx);
+        (found.bad[at], found.gain[at], found.dark_j[at]) = (own.bad[at], own.gain[at], own.dark_j[at]);
+    }
+}
+
+fn is_within(nx: usize, p: usize, q: usize, reach: usize) -> bool {
+    (q % nx).abs_diff(p % nx) <= reach && (q / nx).abs_diff(p / nx) <= reach
+}
+
+/// The pixels in patches of neighbours.
+fn patches(nx: usize, mut pixels: Vec<usize>) -> Vec<Vec<usize>> {
+    let mut found = Vec::new();
+    while let Some(first) = pixels.pop() {
+        let mut patch = vec![first];
+        let mut next = 0;
+        while next < patch.len() {
+            let p = patch[next];
+            patch.extend(pixels.extract_if(.., |q| is_within(nx, p, *q, 1)));
+            next += 1;
+        }
+        found.push(patch);
+    }
+    found
+}
+
+/// Whether a patch has as many pixels as a spot lights.
+fn is_of_spot(camera: &Camera, patch: &[usize]) -> bool {
+    let pitch = |axis: &Axis| axis.edge(1) - axis.edge(0);
+    let lit = HALF_LIGHT * camera.spot_sigma_m.powi(2) / (pitch(&camera.x) * pitch(&camera.y));
+    patch.len() as f64 >= lit.max(LEAST_PATCH)
+}
+
 /// What each frame would be if all pixels were alike; pixels around odd spots are not used.
 fn expected<'a>(learner: &'a Learner, odd: &[Odd]) -> Vec<Pixels<'a>> {
     let camera = learner.camera;
@@ -163,6 +222,9 @@ const OUTLIER_SHARE: f64 = 0.1;
 const FEW: f64 = 0.1;
 /// Share of the light of the brightest neighbour from which on a pixel that nothing is known of is bad too.
 const HALF: f64 = 0.5;
+/// Area of a Gaussian spot brighter than half of its peak, σ²; and pixels side by side that may be bad however small spots are.
+const HALF_LIGHT: f64 = 4.36;
+const LEAST_PATCH: f64 = 3.0;
 
 fn leave_out_flashes(learner: &Learner, frames: &mut [Pixels]) {
     for p in 0..frames.first().map_or(0, |f| f.used.len()) {
