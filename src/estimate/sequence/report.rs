@@ -13,7 +13,11 @@ use crate::estimate::sequence::local_quadratic::{Engine, hypothesis};
 use crate::estimate::sequence::motion::{Posterior, posterior, take_out, velocity_on_ground};
 use crate::estimate::sequence::window::Window;
 use crate::estimate::uncertainty::localise::localise;
-use crate::optics::Camera;
+use crate::optics::{Axis, Camera};
+
+/// Distance beyond the sensor's edges, σ, from which on a moving platform the tail of a spot does not say where its middle is: what comes and goes
+/// there is told apart from who walks by the light alone.
+const TOLD_BEYOND: f64 = 0.5;
 
 /// The emitters at the newest frame's time; `single` holds that frame, whose noise is `scale` times the configured noise.
 pub(crate) fn report(
@@ -90,7 +94,13 @@ pub(crate) fn report(
         }
     }
     let mut seen = present.iter().map(|e| window.targets[*e].is_seen(rules));
-    found.emitters.retain(|_| seen.next().unwrap_or(true));
+    let is_told = |[x, y]: [f64; 2]| {
+        let reach = |axis: &Axis| axis.half_width() + TOLD_BEYOND * sigma;
+        is_still || x.abs() < reach(&camera.x) && y.abs() < reach(&camera.y)
+    };
+    found
+        .emitters
+        .retain(|emitter| seen.next().unwrap_or(true) && is_told(emitter.sensor_m));
     Estimate {
         emitters: found.emitters,
         estimator: name,
