@@ -200,17 +200,22 @@ impl AnalyticEstimator {
         else {
             return false;
         };
-        self.camera.spot_sigma_m *= width;
+        self.take_width(width * self.camera.spot_sigma_m);
+        budgets.search.restart();
+        budgets.reweighting.restart();
+        true
+    }
+
+    /// Searches for spots of this width, m.
+    pub fn take_width(&mut self, sigma_m: f64) {
+        self.camera.spot_sigma_m = sigma_m;
         self.search = self.search.of_shape(&self.camera);
         if let Some(prior) = &mut self.prior {
-            prior.set_spot_sigma(self.camera.spot_sigma_m);
+            prior.set_spot_sigma(sigma_m);
         }
         if let Some(learner) = &mut self.learner {
             learner.configure(&self.camera);
         }
-        budgets.search.restart();
-        budgets.reweighting.restart();
-        true
     }
 
     /// The loaded frame under search.

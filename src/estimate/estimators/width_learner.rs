@@ -20,8 +20,8 @@ const ONE_IN: u32 = 8;
 const LEAST_TOLD: f64 = 3.5;
 /// Decrease of the deviance that a further source's three numbers bring of noise alone.
 const OF_NOISE: f64 = 3.0;
-/// Frames after which what they say counts 1/e.
-const MEMORY: f64 = 200.0;
+/// Frames after which what they say counts 1/e. More follow a lens that is warming up too late, fewer know the width less well.
+const MEMORY: f64 = 50.0;
 /// Least that ln width differs, at which no spot of SNR 1000 is a pair yet, and least of its spread from spot to spot: where spots differ as much it is
 /// another shape, as coma.
 const LEAST: f64 = 5e-4;
@@ -32,7 +32,9 @@ const MOST: f64 = 0.2;
 /// What frames say of the spots' width.
 #[derive(Default)]
 pub(crate) struct WidthLearner {
-    /// Spots that told it, their information on ln width, and its sums with what they show of it and with its square.
+    /// Frames and spots that told it, their information on ln width, its sum with what they show of it, and with the squared differences of a
+    /// frame's spots from their mean.
+    looks: f64,
     told: f64,
     information: f64,
     weighted: f64,
@@ -91,6 +93,7 @@ impl WidthLearner {
         let widths: Vec<_> = alone.iter().filter_map(|&i| ln_width(scores.get(i)?)).collect();
         let kept = 1.0 - 1.0 / MEMORY;
         for sum in [
+            &mut self.looks,
             &mut self.told,
             &mut self.information,
             &mut self.weighted,
@@ -100,12 +103,14 @@ impl WidthLearner {
             *sum *= kept;
         }
         self.of_close += of_close / inflation;
-        for (width, information) in widths {
-            let information = information / inflation;
-            self.told += 1.0;
+        let sum = |of: fn(f64) -> f64| widths.iter().map(|(width, i)| i / inflation * of(*width)).sum::<f64>();
+        let (information, weighted) = (sum(|_| 1.0), sum(|width| width));
+        if information > 0.0 {
+            self.looks += 1.0;
+            self.told += widths.len() as f64;
             self.information += information;
-            self.weighted += information * width;
-            self.squared += information * width * width;
+            self.weighted += weighted;
+            self.squared += sum(|width| width * width) - weighted * weighted / information;
         }
         (self.shown() > SHOWN).then(|| {
             let Self {
@@ -123,7 +128,8 @@ impl WidthLearner {
         }
         let mean = self.weighted / self.information;
         let of_mean = self.weighted * mean;
-        let scatter = (self.squared - of_mean) / (self.told - 1.0);
+        // One spot a frame differs from no other.
+        let scatter = self.squared / (self.told - self.looks).max(1.0);
         let spread = ((scatter - 1.0).max(0.0) * self.told / self.information).sqrt();
         if of_mean > self.of_close && mean.abs() > LEAST.max(SPREADS * spread) {
             of_mean / scatter.max(1.0)

@@ -14,7 +14,7 @@ use crate::estimate::fit::work_budget::WorkBudget;
 use crate::estimate::rules::Rules;
 use crate::estimate::sequence::chances::Chances;
 use crate::estimate::sequence::course::open;
-use crate::estimate::sequence::joint_information::{JointInformation, STATE};
+use crate::estimate::sequence::joint_information::JointInformation;
 use crate::estimate::sequence::local_quadratic::Engine;
 use crate::estimate::sequence::motion::surprised;
 use crate::estimate::sequence::outlook::Outlook;
@@ -81,6 +81,22 @@ impl SequenceEstimator {
         }
     }
 
+    pub fn camera(&self) -> &Camera {
+        &self.camera
+    }
+
+    /// Goes on with spots of this width, m.
+    pub fn take_width(&mut self, sigma_m: f64) {
+        self.single.take_width(sigma_m);
+        self.begin_anew();
+    }
+
+    /// With spots of another width everything is seen anew.
+    fn begin_anew(&mut self) {
+        self.camera = Arc::new(self.single.camera().clone());
+        self.forget();
+    }
+
     fn forget(&mut self) {
         let scale = self.sight.as_ref().map(|sight| sight.ground_scale(&self.camera));
         self.window = Window::empty(&self.camera, scale.unwrap_or(self.camera.ground_scale()));
@@ -128,10 +144,8 @@ impl Estimator for SequenceEstimator {
                 report(&mut self.single, window, camera, self.rules, name, scale, is_over)
             }
         };
-        // With spots of another width everything is seen anew.
         if learn_width(&mut self.single, &estimate, is_over) {
-            self.camera = Arc::new(self.single.camera().clone());
-            self.forget();
+            self.begin_anew();
         }
         Ok(estimate)
     }
@@ -201,7 +215,7 @@ impl SequenceEstimator {
             self.forget();
             self.window.time_s = time_s;
         }
-        self.accept(alone);
+        self.window.take(alone);
         None
     }
 
@@ -264,7 +278,7 @@ impl SequenceEstimator {
             open(&mut self.window.prior, &who, since_s, unit);
             self.left.clear();
         }
-        self.accept(grown);
+        self.window.take(grown);
     }
 
     /// Searches the frames of the window together with the loaded one, as what is remembered may be wrong. Whether that explains it.
@@ -305,23 +319,6 @@ impl SequenceEstimator {
             snapshots: vec![snapshot],
             ..Window::default()
         }
-    }
-
-    /// Makes a fitted newest frame part of the window.
-    fn accept(&mut self, mut fresh: Window) {
-        let window = &mut self.window;
-        for e in window.len()..fresh.len() {
-            let at = |k: usize| fresh.state[STATE * e + k];
-            window.insert(fresh.targets[e], [at(0), at(1)], [at(2), at(3)]);
-        }
-        for (target, fresh) in window.targets.iter_mut().zip(&fresh.targets) {
-            target.straying = fresh.straying;
-        }
-        window.state = fresh.state;
-        window.total = fresh.total;
-        window.pose_error = fresh.snapshots.last().map_or(window.pose_error, |s| s.local.pose_error);
-        window.snapshots.append(&mut fresh.snapshots);
-        window.age += 1;
     }
 
     /// Fits the newest frame to what is remembered.

@@ -125,6 +125,22 @@ impl Window {
         self.targets.push(target);
     }
 
+    /// Takes a newest frame that was fitted on top of this.
+    pub fn take(&mut self, mut fresh: Self) {
+        for e in self.len()..fresh.len() {
+            let at = |k: usize| fresh.state[STATE * e + k];
+            self.insert(fresh.targets[e], [at(0), at(1)], [at(2), at(3)]);
+        }
+        for (target, fresh) in self.targets.iter_mut().zip(&fresh.targets) {
+            target.straying = fresh.straying;
+        }
+        self.state = fresh.state;
+        self.total = fresh.total;
+        self.pose_error = fresh.snapshots.last().map_or(self.pose_error, |s| s.local.pose_error);
+        self.snapshots.append(&mut fresh.snapshots);
+        self.age += 1;
+    }
+
     /// Forgets a target, and that any snapshot held it. The caller fits again.
     pub fn remove(&mut self, e: usize) {
         self.targets.remove(e);
