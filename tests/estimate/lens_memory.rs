@@ -107,6 +107,7 @@ fn a_width_that_is_off_by_a_percent_makes_no_pairs() {
         };
         let without = Rules {
             width_for_pairs: false,
+            stack_misfits: false,
             ..Rules::without("learn_width").unwrap()
         };
         let (with, without) = (wrong(Rules::default()), wrong(without));
@@ -122,10 +123,11 @@ fn axes_that_differ_by_two_percent_make_no_pairs() {
         let numbers = later_numbers(rules, &elliptical, &spots);
         numbers.iter().filter(|n| **n != 5).count()
     };
-    let (with, without) = (
-        wrong(Rules::default()),
-        wrong(Rules::without("width_for_pairs").unwrap()),
-    );
+    let without = Rules {
+        stack_misfits: false,
+        ..Rules::without("width_for_pairs").unwrap()
+    };
+    let (with, without) = (wrong(Rules::default()), wrong(without));
     assert!(with <= 5 && without > 20, "{with} and {without} of 100");
 }
 

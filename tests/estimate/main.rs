@@ -1,6 +1,7 @@
 //! The estimators from outside, on frames that are drawn here from the optics alone.
 
 mod bound;
+mod daylight;
 mod frames;
 mod hot_pixels;
 mod lens;
