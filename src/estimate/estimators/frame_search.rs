@@ -10,7 +10,6 @@ use crate::estimate::model::compressed_frame::CompressedFrame;
 use crate::estimate::model::hypothesis::{Hypothesis, Nuisances};
 use crate::estimate::model::svd_basis::Basis;
 use crate::estimate::model_order::candidate::Candidate;
-use crate::estimate::model_order::common_misfit::is_narrow;
 use crate::estimate::model_order::ellipse_history::EllipseHistory;
 use crate::estimate::model_order::initialise::{add_residual_peaks, filter_peaks, initial_hypothesis, initialise};
 use crate::estimate::model_order::maximum_likelihood::maximum_likelihood;
@@ -107,7 +106,7 @@ impl FrameSearch {
         Self {
             spec,
             spot_error: camera.spot_error,
-            history: (is_sought && !is_narrow(&reweighting.space.bases)).then(SpotErrorHistory::default),
+            history: (is_sought && !reweighting.space.bases.is_narrow()).then(SpotErrorHistory::default),
             ellipse: EllipseHistory::default(),
             frame: PreprocessedFrame::default(),
             inspection: NoiseInspection::default(),
@@ -288,7 +287,7 @@ impl FrameSearch {
     /// Every other frame is searched in full, from another width where that explains it. Not where spots are all core: these show their shape
     /// in the end, if at all.
     fn search_unless_misfit(&mut self, mut initial: Hypothesis, budget: &mut WorkBudget) -> Found {
-        if self.spot_error.is_fixed() || is_narrow(&self.space.bases) {
+        if self.spot_error.is_fixed() || self.space.bases.is_narrow() {
             return self.search_with_outliers(initial, budget);
         }
         let kept = (self.frame.clone(), self.compressed.clone());

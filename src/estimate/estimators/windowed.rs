@@ -14,7 +14,7 @@ use crate::estimate::estimators::list::EstimatorSpec;
 use crate::estimate::model::halo;
 use crate::estimate::model::hypothesis::{OVERLAPPING, PointSource};
 use crate::estimate::model_order::criterion::source_penalty;
-use crate::estimate::model_order::initialise::is_background_visible;
+use crate::estimate::preprocess::screening::is_background_visible;
 use crate::estimate::rules::Rules;
 use crate::estimate::uncertainty::localise::EDGE_DISTANCE;
 use crate::frame::Frame;

@@ -4,6 +4,10 @@ use crate::estimate::model::measured_components::MeasuredShape;
 use crate::estimate::model::svd_basis::Basis;
 use crate::optics::Camera;
 
+/// Width of a sensor, σ, up to which one or two spots show no shape beside a width: on narrower ones spots are all core. Smaller takes melted
+/// spots of another width for a lens's, larger leaves two spots of a lens on 20 × 20 pixels to invented sources.
+const NARROW: f64 = 8.5;
+
 /// What a frame is compressed into and predicted in.
 pub(crate) struct Bases {
     pub x: Basis,
@@ -45,6 +49,11 @@ impl Bases {
     /// Whether coefficients are pixels, so that each may have a weight.
     pub fn are_pixels(&self) -> bool {
         self.x.is_pixels && self.y.is_pixels
+    }
+
+    /// Whether spots are all core on this sensor.
+    pub fn is_narrow(&self) -> bool {
+        self.axes().iter().any(|b| b.edges[b.n] - b.edges[0] < NARROW)
     }
 
     /// The wider pixel pitch of the two axes, σ.

@@ -3,7 +3,6 @@
 //! A stranger stands beside one user; a lens makes the same rings, tails and ghosts beside all. The share of its light by which a spot
 //! misses the model at an offset is therefore taken to be what three quarters of the bright spots show there at least.
 
-use crate::estimate::model::bases::Bases;
 use crate::estimate::model::halo;
 use crate::estimate::model::hypothesis::PointSource;
 use crate::estimate::model_order::bright_spots::{CORE, distance2};
@@ -79,14 +78,6 @@ pub(crate) const MAX_SPOT_ERROR: f64 = 0.07;
 /// discs, Moffat profiles, defocus, coma and astigmatism up to 0.06.
 pub(crate) const MAX_CORE: f64 = 0.1;
 
-/// Width of a sensor, σ, up to which one or two spots show no shape beside a width: on narrower ones spots are all core. Smaller takes melted
-/// spots of another width for a lens's, larger leaves two spots of a lens on 20 × 20 pixels to invented sources.
-const NARROW: f64 = 8.5;
-/// Whether spots are all core on this sensor.
-pub(crate) fn is_narrow(bases: &Bases) -> bool {
-    bases.axes().iter().any(|b| b.edges[b.n] - b.edges[0] < NARROW)
-}
-
 /// The spot error that a fitted hypothesis shows: by rings around its bright spots, or offset by offset where these are `least` or more. 0
 /// where their residuals have nothing in common. `is_explained`: whether more sources explain the frame.
 pub(crate) fn common_misfit(
@@ -113,7 +104,7 @@ pub(crate) fn common_misfit(
         is_masked: &search.frame.is_masked,
         norm,
     };
-    let ring = match is_narrow(bases) {
+    let ring = match bases.is_narrow() {
         true => None,
         false => rings.common(&bright, CORE, is_explained),
     };

@@ -20,8 +20,6 @@ const PENCIL_FIT_STEPS: usize = 100;
 const STRONG_PEAK: f64 = 0.1;
 /// A rival that leaves less than this share of the deviance is no sign of noise that grows with the light: sources explain it.
 const RIVAL_SHARE: f64 = 0.5;
-/// The share of standard normal noise below −1.
-const BELOW_ONE: f64 = 0.1587;
 
 /// The initial hypothesis: the pencil's sources, or the residual peaks of one round, with a background where one is visible. Good
 /// enough to find isolated outliers in the residual.
@@ -144,13 +142,6 @@ fn fit_pencil_orders(
             worse += 1;
         }
     }
-}
-
-/// Whether the dark parts of a frame are brighter or darker than the noise, by the number of usable pixels and of those below −1. A fainter
-/// background shows in the residual.
-pub(crate) fn is_background_visible(usable: f64, low: f64) -> bool {
-    let expected = BELOW_ONE * usable;
-    low < 0.25 * expected - 5.0 || low > expected + 5.0 * expected.sqrt()
 }
 
 /// The variance function, where it explains the frame better than `rival` does; only in the pixel bases.

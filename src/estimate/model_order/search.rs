@@ -12,10 +12,8 @@ use crate::estimate::model::compressed_frame::CompressedFrame;
 use crate::estimate::model::hypothesis::{Background, Hypothesis, Nuisances, OVERLAPPING, Width};
 use crate::estimate::model::svd_basis::Basis;
 use crate::estimate::model_order::candidate::Candidate;
-use crate::estimate::model_order::common_misfit::is_narrow;
 use crate::estimate::model_order::criterion::{Criterion, source_penalty};
 use crate::estimate::model_order::evidence::fit_with_prior;
-use crate::estimate::model_order::initialise::is_background_visible;
 use crate::estimate::model_order::power_prior::PowerPrior;
 use crate::estimate::preprocess::noise_variance::VarianceFunction;
 use crate::estimate::preprocess::screening::PreprocessedFrame;
@@ -149,20 +147,9 @@ impl<'a> Search<'a, '_> {
 
     /// The background that the dark parts of the frame show. A fainter one shows in the residual.
     pub fn visible_background(&self) -> Background {
-        let (mut usable, mut low) = (0.0, 0.0);
-        for (p, _) in self
-            .frame
-            .pixels
-            .iter()
-            .zip(&self.frame.is_masked)
-            .filter(|(_, bad)| !**bad)
-        {
-            usable += 1.0;
-            low += f64::from(u8::from(*p < -1.0));
-        }
-        if !is_background_visible(usable, low) {
+        if !self.frame.has_visible_background() {
             Background::None
-        } else if is_narrow(self.context.bases) {
+        } else if self.context.bases.is_narrow() {
             // A curvature is a spot's there.
             Background::Plane
         } else {

@@ -9,7 +9,7 @@ use crate::estimate::model::halo::{ErrorByDistance, Halo, height, spot_norm};
 use crate::estimate::model::hypothesis::{Background, Hypothesis, Nuisances, PointSource, Width};
 use crate::estimate::model_order::bright_spots::{CORE, are_pairs_alike, bright_spots, distance2, is_faint_beside};
 use crate::estimate::model_order::candidate::Candidate;
-use crate::estimate::model_order::common_misfit::{Agreement, MAX_SPOT_ERROR, common_misfit, is_narrow};
+use crate::estimate::model_order::common_misfit::{Agreement, MAX_SPOT_ERROR, common_misfit};
 use crate::estimate::model_order::maximum_likelihood::refit_reweighted;
 use crate::estimate::model_order::proposals::split_all;
 use crate::estimate::model_order::pruning::drop_insignificant;
@@ -65,7 +65,7 @@ pub(crate) fn inspect_shape(
     budget: &mut WorkBudget,
 ) -> Shape {
     let is_explained = excess < compressed.most_excess();
-    let is_narrow = is_narrow(&space.bases);
+    let is_narrow = space.bases.is_narrow();
     let has_width = hypothesis.nuisances.width != Width::Known;
     let is_elongated = has_width || may_be_elongated(space, hypothesis);
     let (merged, separate) = (bright_spots(hypothesis, true), bright_spots(hypothesis, false));

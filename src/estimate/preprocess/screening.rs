@@ -7,6 +7,9 @@ use crate::frame::Frame;
 use crate::optics::{Camera, DisplacedSpots};
 use crate::stats::is_cut_off;
 
+/// The share of standard normal noise below −1.
+const BELOW_ONE: f64 = 0.1587;
+
 /// Values of this many standard deviations or more count as non-finite: their squares approach the range of f64.
 const OVERFLOWS: f64 = 1e100;
 
@@ -111,6 +114,16 @@ impl PreprocessedFrame {
         is_cut_off(usable.map(|(p, _)| *p))
     }
 
+    /// Whether the dark parts are brighter or darker than the noise. A fainter background shows in the residual.
+    pub fn has_visible_background(&self) -> bool {
+        let (mut usable, mut low) = (0.0, 0.0);
+        for (p, _) in self.pixels.iter().zip(&self.is_masked).filter(|(_, bad)| !**bad) {
+            usable += 1.0;
+            low += f64::from(u8::from(*p < -1.0));
+        }
+        is_background_visible(usable, low)
+    }
+
     /// Masks one more pixel; the caller fills it.
     pub fn mask(&mut self, x: usize, y: usize, nx: usize) {
         if !std::mem::replace(&mut self.is_masked[y * nx + x], true) {
@@ -161,6 +174,12 @@ impl PreprocessedFrame {
             };
         }
     }
+}
+
+/// The same by the number of usable pixels and of those below −1.
+pub(crate) fn is_background_visible(usable: f64, low: f64) -> bool {
+    let expected = BELOW_ONE * usable;
+    low < 0.25 * expected - 5.0 || low > expected + 5.0 * expected.sqrt()
 }
 
 #[cfg(test)]
