@@ -236,6 +236,31 @@ mod tests {
     }
 
     #[test]
+    fn a_beam_is_collected_by_the_lens_as_it_sees_it() {
+        let camera = optics::Config::default().camera().unwrap();
+        let h = camera.altitude_m;
+        let level = View::level(&camera);
+        let of = |z_m: f64, pitch: f64| {
+            let mut pose = Pose::level(Timestamp::UNIX_EPOCH, [0.0, 0.0, z_m]);
+            pose.attitude = UnitQuaternion::from_euler_angles(0.0, pitch, 0.0);
+            let sight = Some(Sight::new(&pose, &Mount::default()));
+            let camera = camera.clone();
+            View { camera, sight }
+        };
+        let [below, aside] = [Vector2::zeros(), Vector2::new(0.0, h)];
+        for p in [below, aside] {
+            let gains = [&level, &of(h, 0.0)].map(|view| view.ln_gain(p).unwrap());
+            assert!((gains[0] - gains[1]).abs() < 1e-9, "{gains:?}");
+        }
+        // Half as far is four times as much; at 45 degrees twice the squared distance, and the lens foreshortened by 1/√2.
+        let over = |view: &View, p| view.ln_gain(p).unwrap() - level.ln_gain(below).unwrap();
+        assert!((over(&of(0.5 * h, 0.0), below) - 4f64.ln()).abs() < 1e-9);
+        assert!((over(&level, aside) + 1.5 * 2f64.ln()).abs() < 1e-9);
+        assert!((over(&of(h, 0.6), below) - 0.6f64.cos().ln()).abs() < 1e-9);
+        assert_eq!(of(h, 2.0).ln_gain(below), None, "behind the camera");
+    }
+
+    #[test]
     fn the_outline_is_the_view_s_corners_and_ends_where_the_sky_begins() {
         let camera = optics::Config::default().camera().unwrap();
         let level = View::level(&camera).outline_m();
