@@ -13,9 +13,10 @@ mod patch;
 mod pixel_maps;
 mod prepare;
 mod pupil;
-mod slope;
+
 mod solve;
 mod statistics;
+mod stray_light;
 mod template_model;
 mod terms;
 mod wavefront;

@@ -5,7 +5,7 @@ use ndarray::Array2;
 use super::band::pixels_within;
 use super::detection;
 use super::grouping::Image;
-use super::slope;
+use super::stray_light;
 use crate::optics::{Camera, PixelMaps};
 use crate::stats::{is_cut_off, median};
 
@@ -87,9 +87,9 @@ pub fn prepare(camera: &Camera, frames: &[(usize, &Array2<f64>)]) -> Prepared {
         .filter_map(|image| spare_saturated(camera, image, limit))
         .count();
     let mut middle = middle_image(&images);
-    if let Some(slope) = slope::of(camera, &middle, noise_j) {
+    if let Some(stray) = stray_light::of(camera, &middle, noise_j) {
         let pixels = images.iter_mut().map(|image| &mut image.pixels).chain([&mut middle]);
-        pixels.for_each(|pixels| pixels.iter_mut().zip(&slope).for_each(|(v, s)| *v -= s));
+        pixels.for_each(|pixels| pixels.iter_mut().zip(&stray).for_each(|(v, stray)| *v -= stray));
     }
     // The standard deviation of a median is 1.25 σ/√T.
     let std = 1.25 * noise_j / (images.len() as f64).sqrt();
