@@ -14,8 +14,9 @@ pub(crate) fn with_more_nuisances(
         return None;
     }
     let mut best: Option<Hypothesis> = None;
+    let lit = search.with_background(Width::Known);
     for width in [Width::Known, Width::Common, Width::PerAxis] {
-        let nuisances = search.with_background(width);
+        let nuisances = Nuisances { width, ..lit };
         if nuisances.count() <= hypothesis.nuisances.count() || search.is_measured() && width != Width::Known {
             continue;
         }

@@ -6,7 +6,7 @@ use crate::estimate::fit::work_budget::WorkBudget;
 use crate::estimate::model::bases::Bases;
 use crate::estimate::model::compressed_frame::CompressedFrame;
 use crate::estimate::model::halo::{ErrorByDistance, Halo, height, spot_norm};
-use crate::estimate::model::hypothesis::{Background, Hypothesis, Nuisances, PointSource, Width};
+use crate::estimate::model::hypothesis::{Hypothesis, Nuisances, PointSource, Width};
 use crate::estimate::model_order::bright_spots::{CORE, are_pairs_alike, bright_spots, distance2, is_faint_beside};
 use crate::estimate::model_order::candidate::Candidate;
 use crate::estimate::model_order::common_misfit::{Agreement, MAX_SPOT_ERROR, common_misfit};
@@ -127,10 +127,7 @@ pub(crate) fn explained_by_width(search: &mut Search, hypothesis: &Hypothesis) -
             ..hypothesis.clone()
         });
         [Width::Common, Width::RotatedEllipse].into_iter().find_map(|width| {
-            candidate.nuisances = Nuisances {
-                background: search.visible_background().max(Background::Plane),
-                width,
-            };
+            candidate.nuisances = search.with_background(width);
             search.fit_trial(&mut candidate);
             search
                 .is_explained_by(&candidate)

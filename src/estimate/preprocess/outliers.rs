@@ -256,7 +256,7 @@ impl NoiseInspection {
             rest = brighter;
         }
         let dark = levels.first().map_or(1.0, |l| l.1).max(1e-6);
-        // Is the brightest level noisier than the darkest? The relative error is about 1.5/√size; where spots are misfits, more.
+        // Is the brightest level noisier than the darkest? The relative error is 1.4/√size, and more where the model misses spots.
         let brightest = levels
             .iter()
             .copied()

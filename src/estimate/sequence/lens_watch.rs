@@ -17,7 +17,7 @@ const FIRST: u32 = 32;
 const ONE_IN: u32 = 128;
 /// Emitters of which a frame alone takes long: with more it is looked at seldom from the start.
 const MANY: usize = 12;
-/// The same while more emitters overlap with others than when that was looked at last, and how often it is as many again.
+/// One in so many while more emitters overlap with others than in the answer before the last look.
 const ONE_IN_DOUBT: u32 = 8;
 /// Least that ln width differs for memory to begin anew: so much makes no pair of a spot of SNR 300.
 const ANOTHER_WIDTH: f64 = 1e-3;
@@ -31,7 +31,7 @@ pub(crate) struct LensWatch {
     alone: AnalyticEstimator,
     frames: u32,
     with_light: u32,
-    /// Emitters of the last answer that overlap with others, and most of those that were looked at.
+    /// Emitters of the last answer that overlap with others, and of that before the last look.
     overlapping: usize,
     looked_at: usize,
     /// Frame from which on one by one are looked at again where they show fewer emitters.

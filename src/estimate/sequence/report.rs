@@ -15,8 +15,8 @@ use crate::estimate::sequence::window::Window;
 use crate::estimate::uncertainty::localise::localise;
 use crate::optics::{Axis, Camera};
 
-/// Distance beyond the sensor's edges, σ, from which on a moving platform the tail of a spot does not say where its middle is: what comes and goes
-/// there is told apart from who walks by the light alone.
+/// Distance beyond the sensor's edges, σ, from which on a moving platform the tail of a spot does not say where its middle is: a brighter beam
+/// farther out looks the same.
 const TOLD_BEYOND: f64 = 0.5;
 
 /// The emitters at the newest frame's time; `single` holds that frame, whose noise is `scale` times the configured noise.
