@@ -199,3 +199,22 @@ fn a_pose_that_jumps_invents_nobody_and_moves_nobody_on_the_sensor() {
     // Noise looks like somebody for a frame now and then.
     assert!(others <= 2, "{others}");
 }
+
+#[test]
+fn spots_whose_middle_is_out_of_view_are_not_reported_by_frames_together() {
+    // The view ends at 125 m; the sway moves it by 21 m.
+    let walks = [[0.0, 0.0], [60.0, 40.0], [-50.0, 60.0], [-30.0, -60.0], [118.0, -10.0]].map(|at| (at, [0.5, 0.2]));
+    let farthest = |name: &str| {
+        let mut flight = Flight::new(&walks);
+        let mut estimator = estimator(Some(name), &flight.camera);
+        let mut farthest = 0.0f64;
+        for _ in 0..100 {
+            let (_, found) = flight.estimate(&mut *estimator, Clone::clone);
+            let places = found.emitters.iter().flat_map(|e| e.sensor_m);
+            farthest = places.fold(farthest, |most, v| most.max(v.abs()));
+        }
+        (farthest - flight.camera.x.half_width()) / flight.camera.spot_sigma_m
+    };
+    let (together, alone) = (farthest("sequence"), farthest("ml"));
+    assert!(together < 0.5 && alone > 0.5, "{together} and {alone} σ");
+}

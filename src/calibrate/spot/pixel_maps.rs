@@ -264,3 +264,26 @@ pub fn gain_scatter(maps: &PixelMaps) -> Option<f64> {
     let scatter = (maps.gain.iter().map(|g| (g - 1.0).powi(2)).sum::<f64>() / n).sqrt();
     (scatter > 0.0).then_some(scatter)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_as_large_as_a_spot_is_spared_and_single_bad_pixels_are_not() {
+        let camera = crate::optics::Config::default().camera().unwrap();
+        let own = PixelMaps::ideal(camera.shape());
+        let mut found = own.clone();
+        // A spot's light on five by five pixels, one pixel, and two side by side.
+        let spot = || (20..25).flat_map(|y| (30..35).map(move |x| (y, x)));
+        for at in spot() {
+            (found.bad[at], found.gain[at]) = (true, 0.7);
+        }
+        for at in [(5, 5), (40, 8), (40, 9)] {
+            found.bad[at] = true;
+        }
+        spare_spots(&camera, &mut found, &own);
+        assert!(spot().all(|at| !found.bad[at] && found.gain[at] == 1.0));
+        assert_eq!(found.bad.iter().filter(|bad| **bad).count(), 3);
+    }
+}
