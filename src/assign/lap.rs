@@ -30,21 +30,26 @@ pub fn assign(rows: usize, columns: usize, c_max: f64, cost: impl Fn(usize, usiz
         let clamped = if c < c_max { c.max(0.0) } else { c_max };
         (clamped / c_max * STEPS) as i64
     };
-    let mut matched_long = vec![None; long];
-    if short > 0 {
+    let steps: Vec<i64> = (0..short)
+        .flat_map(|i| (0..long).map(move |j| (i, j)))
+        .map(|(i, j)| step(i, j))
+        .collect();
+    let cost = |i: usize, j: usize| steps[i * long + j];
+    let is_pair = |i: usize, j: usize| j < long && cost(i, j) < STEPS as i64;
+    let matched_long = uncontested(short, long, is_pair).unwrap_or_else(|| {
         // Every short item may also take a dummy column of its own.
         let costs = Matrix::from_fn(
             short,
             long + short,
-            |(i, j)| if j < long { step(i, j) } else { STEPS as i64 },
+            |(i, j)| if j < long { cost(i, j) } else { STEPS as i64 },
         );
         let (_, columns_of) = kuhn_munkres_min(&costs);
-        for (i, j) in columns_of.into_iter().enumerate() {
-            if j < long && step(i, j) < STEPS as i64 {
-                matched_long[j] = Some(i);
-            }
+        let mut matched_long = vec![None; long];
+        for (i, j) in columns_of.into_iter().enumerate().filter(|(i, j)| is_pair(*i, *j)) {
+            matched_long[j] = Some(i);
         }
-    }
+        matched_long
+    });
     let mut matching = Matching::default();
     let mut short_used = vec![false; short];
     for (j, m) in matched_long.iter().enumerate() {
@@ -62,6 +67,20 @@ pub fn assign(rows: usize, columns: usize, c_max: f64, cost: impl Fn(usize, usiz
         (alone_short, alone_long)
     };
     matching
+}
+
+/// The row of each column, where nobody has a choice: the only matching there is.
+fn uncontested(rows: usize, columns: usize, is_pair: impl Fn(usize, usize) -> bool) -> Option<Vec<Option<usize>>> {
+    let mut matched = vec![None; columns];
+    for i in 0..rows {
+        let mut own = (0..columns).filter(|&j| is_pair(i, j));
+        if let Some(j) = own.next()
+            && (own.next().is_some() || matched[j].replace(i).is_some())
+        {
+            return None;
+        }
+    }
+    Some(matched)
 }
 
 #[cfg(test)]
