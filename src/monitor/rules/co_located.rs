@@ -139,18 +139,24 @@ impl Memory {
     /// What the watched beams of the same kind besides the owner's show: lamps are steadier than users.
     fn others(&self, owner: Owner, watched: &[WatchedSpot]) -> OtherBeams {
         let is_like = |w: &&WatchedSpot| matches!(w.owner, Owner::User(_)) == matches!(owner, Owner::User(_));
-        let alike = || watched.iter().filter(is_like);
-        let tests = || alike().filter_map(|w| Some((w.owner, &self.get(w.owner)?.test)));
-        let others = || tests().filter(|(other, _)| *other != owner).map(|(_, test)| test);
+        let alike = watched.iter().filter(is_like);
+        let tests: Vec<_> = alike
+            .filter_map(|w| Some((w.owner, &self.get(w.owner)?.test)))
+            .collect();
+        let others: Vec<_> = tests
+            .iter()
+            .filter(|(other, _)| *other != owner)
+            .map(|(_, test)| *test)
+            .collect();
         let enough = |values: Vec<f64>| match values.len() >= MIN_OTHERS {
             true => median_high(values.into_iter()),
             false => None,
         };
         OtherBeams {
-            second_moment: CommonMode::of(others().map(|test| &test.second_moment)),
-            rise: enough(others().filter_map(|test| test.brightness.recent_rise()).collect()),
-            jitter: enough(others().filter_map(|test| test.jitter.recent_mean()).collect()),
-            scatter: tests().map(|(_, test)| test.brightness.scatter()).sum(),
+            second_moment: CommonMode::of(others.iter().map(|test| &test.second_moment)),
+            rise: enough(others.iter().filter_map(|test| test.brightness.recent_rise()).collect()),
+            jitter: enough(others.iter().filter_map(|test| test.jitter.recent_mean()).collect()),
+            scatter: tests.iter().map(|(_, test)| test.brightness.scatter()).sum(),
         }
     }
 

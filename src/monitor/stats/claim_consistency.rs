@@ -78,20 +78,12 @@ impl ClaimConsistency {
         for m in WINDOWS.into_iter().take_while(|&m| m <= self.residuals.len()) {
             // Newer residuals weigh more, m : m − 1 : … : 1: a user who drifts away is farther now.
             let all = (m * (m + 1) / 2) as f64;
-            let weighted = || {
-                (0..m)
-                    .rev()
-                    .map(|k| (k + 1) as f64 / all)
-                    .zip(self.residuals.iter().rev())
-            };
-            let of = |f: &dyn Fn(&Residual) -> f64| weighted().map(|(w, r)| w * f(r)).sum::<f64>();
-            let mean = Vector2::new(of(&|r| r.offset.x), of(&|r| r.offset.y));
-            let beam = Matrix2::from_fn(|i, j| of(&|r| r.beam[(i, j)]));
-            let claim = Matrix2::from_fn(|i, j| {
-                let own: f64 = weighted().map(|(w, r)| w * w * r.claim[(i, j)]).sum();
-                COMMON_SHARE * of(&|r| r.claim[(i, j)]) + (1.0 - COMMON_SHARE) * own
-            });
-            let cov = beam + claim + systematic;
+            let (mut mean, mut cov) = (Vector2::zeros(), *systematic);
+            for (k, r) in (1..=m).rev().zip(self.residuals.iter().rev()) {
+                let weight = k as f64 / all;
+                mean += r.offset * weight;
+                cov += (r.beam + r.claim * (COMMON_SHARE + (1.0 - COMMON_SHARE) * weight)) * weight;
+            }
             let neg_log_p = neg_log_p_outside(mean, &cov, radius_m);
             if neg_log_p > worst.neg_log_p || m == 1 {
                 worst = Excess {

@@ -3,8 +3,9 @@
 use super::brightness::{Brightness, Scatter};
 use super::gaussian::neg_log_p_of_sum;
 use super::jitter::Jitter;
-use super::second_moment::{CommonMode, SecondMomentTest, Widening};
+use super::second_moment::{CommonMode, SecondMomentTest};
 use super::step_change::{StepDetector, StepEvidence};
+use super::widening::Widening;
 use super::window_excess::{WINDOWS, WindowExcess, of_frames};
 
 /// What is remembered of one spot. Two beams too near to be resolved show one spot at their centre of light; they fade

@@ -13,4 +13,5 @@ pub(super) mod moment_score;
 pub(super) mod robust;
 pub(super) mod second_moment;
 pub(super) mod step_change;
+pub(super) mod widening;
 pub(super) mod window_excess;

@@ -13,14 +13,12 @@ pub fn median(values: impl Iterator<Item = f64>) -> Option<f64> {
 
 /// The median; of an even number of values the upper of the two in the middle, so that it is always one of them.
 pub fn median_high(values: impl Iterator<Item = f64>) -> Option<f64> {
-    let values = sorted(values);
-    values.get(values.len() / 2).copied()
+    order_statistic(values, |n| n / 2)
 }
 
 /// The value below which nine tenths of all values lie. `None` of none.
 pub fn ninth_decile(values: impl Iterator<Item = f64>) -> Option<f64> {
-    let values = sorted(values);
-    values.get(values.len() * 9 / 10).copied()
+    order_statistic(values, |n| n * 9 / 10)
 }
 
 /// Component-wise median; zero of none.
@@ -42,6 +40,13 @@ pub fn common_displacement(others: usize, displacements: impl Iterator<Item = Ve
         true => Vector2::new(axis(0), axis(1)),
         false => Vector2::zeros(),
     }
+}
+
+/// The value of that rank, of so many; `None` of none.
+fn order_statistic(values: impl Iterator<Item = f64>, rank: impl FnOnce(usize) -> usize) -> Option<f64> {
+    let mut values: Vec<f64> = values.collect();
+    let rank = rank(values.len());
+    (rank < values.len()).then(|| *values.select_nth_unstable_by(rank, f64::total_cmp).1)
 }
 
 fn sorted(values: impl Iterator<Item = f64>) -> Vec<f64> {

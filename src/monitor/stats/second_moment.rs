@@ -6,6 +6,7 @@ use super::block_history::{BlockHistory, RECENT_FRAMES, Recent};
 use super::moment_blocks::Blocks;
 use super::moment_score::MomentScore;
 use super::robust::median_high;
+use super::widening::{Widening, widening};
 
 /// Windows of newest frames that are tested: the shortest for a strong second beam, the longest for one that no frame shows. They
 /// share data, and no correction is made for their number (the soaks of docs/verdicts.md hold the rate of false alerts).
@@ -31,10 +32,6 @@ const MIN_OTHERS: usize = 3;
 /// Largest squared Mahalanobis distance that one frame counts for (winsorised): a bird is one event. Smaller hides a strong
 /// second beam for longer; χ² of three degrees exceeds it 15 times in 10⁶.
 const MAX_FRAME: f64 = 25.0;
-/// Directions of a second beam that are tried, over half a turn. The best of sixteen is at most 6° off, which costs less than 2 %
-/// of the statistic.
-const DIRECTIONS: usize = 16;
-
 /// A beam's second moments. Two beams d apart, with shares w and 1 − w of the light, have w(1 − w)·d² along the line between them,
 /// however they fade; frames add up what none of them shows.
 #[derive(Clone, Debug, Default)]
@@ -66,17 +63,10 @@ struct CommonWindow {
     rise: (Vector3<f64>, Matrix3<f64>),
 }
 
-/// Trace of the moments beyond what is expected, σ², and −ln p of them.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Widening {
-    pub trace: f64,
-    pub neg_log_p: f64,
-}
-
 impl SecondMomentTest {
     /// Takes a frame. With `learn` the frame that it pushes out of the newest is added to the past.
     pub fn push(&mut self, frame: &MomentScore, learn: bool) {
-        let expected = self.mean_before(0).unwrap_or_default();
+        let expected = self.mean().unwrap_or_default();
         let Some(frame) = frame.within(expected, MAX_FRAME) else {
             return;
         };
@@ -106,26 +96,42 @@ impl SecondMomentTest {
         }
     }
 
-    /// Everything before the newest `n` frames, where that is enough.
-    fn sum_before(&self, n: usize) -> Option<MomentScore> {
-        let old = self.recent.len().checked_sub(n)?;
-        (self.past.frames() + old as u32 >= MIN_FRAMES_BEFORE).then(|| {
-            let mut sum = self.blocks.sum;
-            sum.add(self.past.filling());
-            self.recent.iter().take(old).for_each(|m| sum.add(m));
-            sum
-        })
+    /// The mean of all frames, where they are enough.
+    fn mean(&self) -> Option<Vector3<f64>> {
+        let recent = self.recent.len() as u32;
+        let mut sum = self.blocks.sum;
+        sum.add(self.past.filling());
+        self.recent.iter().for_each(|m| sum.add(m));
+        let (mean, _) = (self.past.frames() + recent >= MIN_FRAMES_BEFORE).then(|| sum.solved())??;
+        Some(mean)
     }
 
-    fn mean_before(&self, n: usize) -> Option<Vector3<f64>> {
-        self.sum_before(n)?.solved().map(|(mean, _)| mean)
+    /// Everything before the newest frames of each window, where that is enough.
+    fn before(&self) -> [Option<MomentScore>; WINDOWS.len()] {
+        let mut sum = self.blocks.sum;
+        sum.add(self.past.filling());
+        let mut frames = self.recent.iter();
+        let mut before = [None; WINDOWS.len()];
+        for (n, before) in WINDOWS.iter().zip(&mut before).rev() {
+            let Some(old) = self.recent.len().checked_sub(*n) else {
+                continue;
+            };
+            let taken = self.recent.len() - frames.len();
+            frames.by_ref().take(old - taken).for_each(|m| sum.add(m));
+            *before = (self.past.frames() + old as u32 >= MIN_FRAMES_BEFORE).then_some(sum);
+        }
+        before
     }
 
-    fn newest(&self, n: usize) -> Option<(Vector3<f64>, Matrix3<f64>)> {
-        let first = self.recent.len().checked_sub(n)?;
+    /// The newest frames, as many as each window has, where there are so many.
+    fn newest(&self) -> [Option<MomentScore>; WINDOWS.len()] {
         let mut sum = MomentScore::default();
-        self.recent.iter().skip(first).for_each(|m| sum.add(m));
-        sum.solved()
+        let mut frames = self.recent.iter().rev();
+        WINDOWS.map(|n| {
+            let taken = self.recent.len() - frames.len();
+            frames.by_ref().take(n - taken).for_each(|m| sum.add(m));
+            (n <= self.recent.len()).then_some(sum)
+        })
     }
 
     /// Standard deviation of the blocks' means beyond their noise.
@@ -139,16 +145,16 @@ impl SecondMomentTest {
     fn update_windows(&mut self) {
         let dispersion = self.dispersion.max(1.0);
         let drift = Matrix3::identity() * self.drift().powi(2);
-        self.windows = WINDOWS.map(|n| {
-            let (mean, cov) = self.newest(n)?;
+        let mut windows = self.newest().into_iter().zip(self.before()).map(|(newest, before)| {
+            let (mean, cov) = newest?.solved()?;
             let cov = cov * dispersion;
-            let before = self.sum_before(n).and_then(|m| m.solved());
-            let rise = before.map(|(past, past_cov)| (mean - past, cov + past_cov * dispersion + drift));
+            let before = before.and_then(|sum| sum.solved());
             Some(WindowEstimate {
                 level: (mean, cov),
-                rise,
+                rise: before.map(|(past, past_cov)| (mean - past, cov + past_cov * dispersion + drift)),
             })
         });
+        self.windows = std::array::from_fn(|_| windows.next().flatten());
     }
 
     /// The most significant window, as it is against the other beams or by its rise against its own past; with or without what the others
@@ -161,8 +167,11 @@ impl SecondMomentTest {
             let level = Some(((window.level.0, window.level.1 + lens), common.level));
             let rise = window.rise.map(|rise| (rise, common.rise));
             for ((own, cov), (shared, shared_cov)) in level.into_iter().chain(rise) {
-                let more = |off, cov: Matrix3<f64>| {
-                    let found = cov.try_inverse().map(|inverse| widening(off, inverse));
+                let more = |off: Vector3<f64>, cov: Matrix3<f64>| {
+                    let inverse = cov.try_inverse()?;
+                    // No direction explains more than all there is.
+                    let can_be_more = 0.5 * off.dot(&(inverse * off)) > most.neg_log_p;
+                    let found = can_be_more.then(|| widening(off, inverse));
                     found.filter(|found| found.neg_log_p > most.neg_log_p)
                 };
                 if let Some(whole) = more(own, cov)
@@ -180,10 +189,10 @@ impl CommonMode {
     /// Medians over `others`, where there are enough, with their own uncertainty.
     pub fn of<'a>(others: impl Iterator<Item = &'a SecondMomentTest> + Clone) -> Self {
         Self(std::array::from_fn(|k| {
-            let windows = || others.clone().filter_map(|b| b.windows[k]);
+            let windows = || others.clone().filter_map(|b| b.windows[k].as_ref());
             CommonWindow {
                 level: middle(windows().map(|w| w.level.0).collect()),
-                rise: middle(windows().filter_map(|w| w.rise).map(|r| r.0).collect()),
+                rise: middle(windows().filter_map(|w| Some(w.rise.as_ref()?.0)).collect()),
             }
         }))
     }
@@ -207,26 +216,6 @@ pub fn middle(of: Vec<Vector3<f64>>) -> (Vector3<f64>, Matrix3<f64>) {
         Vector3::new(x.0, xy.0, y.0),
         Matrix3::from_diagonal(&Vector3::new(x.1, xy.1, y.1)),
     )
-}
-
-/// The moments of a second beam in the direction that explains `off` best. Whitened, the directions are the edge of a convex
-/// cone: a closed convex curve on the unit sphere, at most 2π long. The largest of them exceeds u with a probability of at
-/// most Q(u) + e^(−u²/2) (Rice, 1945, for the upcrossings), below 1.5·e^(−u²/2).
-fn widening(off: Vector3<f64>, inverse: Matrix3<f64>) -> Widening {
-    let mut best = Widening::default();
-    for k in 0..DIRECTIONS {
-        let (y, x) = (std::f64::consts::PI * k as f64 / DIRECTIONS as f64).sin_cos();
-        let v = Vector3::new(x * x, x * y, y * y);
-        let (slope, curvature) = (v.dot(&(inverse * off)), v.dot(&(inverse * v)));
-        let neg_log_p = 0.5 * slope * slope / curvature - 1.5f64.ln();
-        if slope > 0.0 && neg_log_p > best.neg_log_p {
-            best = Widening {
-                trace: slope / curvature,
-                neg_log_p,
-            };
-        }
-    }
-    best
 }
 
 #[cfg(test)]
@@ -263,16 +252,6 @@ mod tests {
 
     fn neg_log_p(test: &SecondMomentTest) -> f64 {
         test.most_significant(&CommonMode::default()).neg_log_p
-    }
-
-    #[test]
-    fn the_direction_of_a_second_beam_by_hand() {
-        // Along x, three standard deviations out: 3²/2 − ln 1.5.
-        let found = widening(Vector3::new(0.3, 0.0, 0.0), Matrix3::identity() * 100.0);
-        assert!((found.neg_log_p - (4.5 - 1.5f64.ln())).abs() < 1e-12 && (found.trace - 0.3).abs() < 1e-12);
-        // Narrower than one spot is no second beam.
-        let narrower = widening(Vector3::new(-0.3, 0.0, -0.3), Matrix3::identity() * 100.0);
-        assert_eq!(narrower, Widening::default());
     }
 
     #[test]
