@@ -3,6 +3,7 @@
 
 mod config;
 mod geoid;
+mod pose_error;
 mod sight;
 mod smear;
 mod terrain;
@@ -11,6 +12,7 @@ mod wgs84;
 
 pub use config::{Config, ConfigError, Datum, Origin};
 pub use geoid::undulation_m;
+pub use pose_error::PoseError;
 pub use sight::{GroundPoint, Sight};
 pub use terrain::{Error as TerrainError, Fault as TerrainFault, Ground, Terrain};
 pub use view::{Placed, View};

@@ -2,8 +2,9 @@
 
 use std::sync::Arc;
 
-use nalgebra::{Matrix2, Matrix2x3, Matrix2x6, Matrix3, Matrix6, Rotation3, Vector2, Vector3, Vector6};
+use nalgebra::{Matrix2, Matrix2x3, Matrix2x6, Matrix3, Matrix6, Vector2, Vector3, Vector6};
 
+use super::pose_error::PoseError;
 use super::terrain::{Ground, Terrain};
 use crate::optics::Camera;
 use crate::pose::{Mount, Pose, swap_ned_enu};
@@ -82,10 +83,10 @@ impl Sight {
     /// The same with the pose corrected by a rotation vector (north, east, down) and a shift (east, north, up), which are then
     /// known to `cov`.
     pub fn corrected(&self, by: &Vector6<f64>, cov: Matrix6<f64>) -> Self {
-        let turn = swap_ned_enu(by.fixed_rows::<3>(0).into());
+        let by = PoseError::of(*by);
         Self {
-            lens_m: self.lens_m + by.fixed_rows::<3>(3),
-            to_world: Rotation3::from_scaled_axis(turn) * self.to_world,
+            lens_m: self.lens_m + by.shift_m(),
+            to_world: by.turn * self.to_world,
             cov,
             terrain: self.terrain.clone(),
         }
@@ -112,22 +113,20 @@ impl Sight {
         self.meet(Vector3::from(place_m) - self.lens_m)
     }
 
-    /// The ground where this sees what `other`, of another pose, sees on the ground at a place, east and north, m.
-    pub fn ground_seen_by(&self, other: &Self, place_m: [f64; 2]) -> Option<GroundPoint> {
-        let [x, y] = place_m;
-        let z_m = other.ground_below(place_m)?.z_m;
-        let ray = other.to_world.transpose() * (Vector3::new(x, y, z_m) - other.lens_m);
-        self.meet(self.to_world * ray)
-    }
-
     /// The ground that a beam from the ground at a place, east and north, m, appears to come from, where the pose is off by `error`, as
     /// [`Sight::corrected`] has it.
-    pub fn seen_with_error(&self, place_m: [f64; 2], error: &Vector6<f64>) -> Option<GroundPoint> {
+    pub fn seen_with_error(&self, place_m: [f64; 2], error: &PoseError) -> Option<GroundPoint> {
         let [x, y] = place_m;
         let z_m = self.ground_below(place_m)?.z_m;
-        let turn = swap_ned_enu(error.fixed_rows::<3>(0).into());
-        let ray = Vector3::new(x, y, z_m) - self.lens_m + error.fixed_rows::<3>(3);
-        self.meet(Rotation3::from_scaled_axis(turn) * ray)
+        self.meet(error.turn * (Vector3::new(x, y, z_m) - self.lens_m + error.shift_m()))
+    }
+
+    /// The ground that a beam comes from which appears to come from there, where the pose is off by `error`.
+    pub fn seen_without_error(&self, seen_m: [f64; 2], error: &PoseError) -> Option<GroundPoint> {
+        let [x, y] = seen_m;
+        let z_m = self.ground_below(seen_m)?.z_m;
+        let ray = error.turn.inverse() * (Vector3::new(x, y, z_m) - self.lens_m);
+        self.meet_from(self.lens_m - error.shift_m(), ray)
     }
 
     /// The sensor position, m, of a place in the world; `None` behind the camera.
@@ -170,39 +169,25 @@ impl Sight {
         let normal = Some(normal(&ground))
             .filter(is_met)
             .or(Some(Vector3::z()).filter(is_met))?;
-        Some(self.point(&ray, 1.0, normal))
+        Some(GroundPoint::at(self.lens_m, &ray, 1.0, normal))
     }
 
     fn meet(&self, ray: Vector3<f64>) -> Option<GroundPoint> {
-        if let Some(terrain) = &self.terrain {
-            let crossing = terrain.cross(&self.lens_m, &ray)?;
-            let normal = normal(&crossing.ground);
-            return is_steep(&ray, &normal).then(|| self.point(&ray, crossing.reach, normal));
-        }
-        if !(-ray.z > MIN_DESCENT * ray.norm()) || !(self.lens_m.z > 0.0) {
-            return None;
-        }
-        let mut point = self.point(&ray, -self.lens_m.z / ray.z, Vector3::z());
-        point.position_m.z = 0.0;
-        Some(point)
+        self.meet_from(self.lens_m, ray)
     }
 
-    /// Where a ray ends on ground with a normal.
-    fn point(&self, ray: &Vector3<f64>, reach: f64, normal: Vector3<f64>) -> GroundPoint {
-        let way = ray * reach;
-        let onto = onto_ground(ray, &normal);
-        // A turn δ (north, east, down) moves the ray by (Sδ) × ray, S being the change of axes.
-        let swap = Matrix3::from_columns(&[Vector3::x(), Vector3::y(), Vector3::z()].map(swap_ned_enu));
-        let by_turn = horizontal(&onto) * (-way.cross_matrix() * swap);
-        let mut by_pose = Matrix2x6::zeros();
-        by_pose.fixed_view_mut::<2, 3>(0, 0).copy_from(&by_turn);
-        by_pose.fixed_view_mut::<2, 3>(0, 3).copy_from(&horizontal(&onto));
-        GroundPoint {
-            position_m: self.lens_m + way,
-            by_sensor: Matrix2::zeros(),
-            by_pose,
-            normal,
+    fn meet_from(&self, lens_m: Vector3<f64>, ray: Vector3<f64>) -> Option<GroundPoint> {
+        if let Some(terrain) = &self.terrain {
+            let crossing = terrain.cross(&lens_m, &ray)?;
+            let normal = normal(&crossing.ground);
+            return is_steep(&ray, &normal).then(|| GroundPoint::at(lens_m, &ray, crossing.reach, normal));
         }
+        if !(-ray.z > MIN_DESCENT * ray.norm()) || !(lens_m.z > 0.0) {
+            return None;
+        }
+        let mut point = GroundPoint::at(lens_m, &ray, -lens_m.z / ray.z, Vector3::z());
+        point.position_m.z = 0.0;
+        Some(point)
     }
 }
 
@@ -226,6 +211,21 @@ fn horizontal(m: &Matrix3<f64>) -> Matrix2x3<f64> {
 }
 
 impl GroundPoint {
+    /// Where a ray from the lens ends on ground with a normal.
+    fn at(lens_m: Vector3<f64>, ray: &Vector3<f64>, reach: f64, normal: Vector3<f64>) -> Self {
+        let way = ray * reach;
+        let onto = onto_ground(ray, &normal);
+        let by_shift = [0, 1].map(|k| onto.row(k).transpose());
+        // A turn δ (north, east, down) moves the ray by (Sδ) × ray, S being the change of axes, and a place by h·((Sδ) × ray) = (ray × h)·Sδ.
+        let by_turn = by_shift.map(|h| swap_ned_enu(way.cross(&h)));
+        Self {
+            position_m: lens_m + way,
+            by_sensor: Matrix2::zeros(),
+            by_pose: Matrix2x6::from_fn(|r, c| if c < 3 { by_turn[r][c] } else { by_shift[r][c - 3] }),
+            normal,
+        }
+    }
+
     pub fn horizontal_m(&self) -> Vector2<f64> {
         self.position_m.xy()
     }

@@ -1,7 +1,8 @@
 //! What the camera sees of the world in one frame: from a fixed, level platform by the camera's own map, else by a sight.
 
-use nalgebra::{Matrix2, Matrix2x6, Vector2, Vector6};
+use nalgebra::{Matrix2, Matrix2x6, Vector2};
 
+use super::pose_error::PoseError;
 use super::sight::Sight;
 use crate::optics::Camera;
 
@@ -172,7 +173,7 @@ impl View {
 
     /// Where a beam from a place on the ground, m, appears to come from because the pose is off by `error` (as
     /// [`Sight::corrected`] has it); there itself for a fixed platform.
-    pub fn displaced(&self, p: Vector2<f64>, error: &Vector6<f64>) -> Vector2<f64> {
+    pub fn displaced(&self, p: Vector2<f64>, error: &PoseError) -> Vector2<f64> {
         let Some(sight) = &self.sight else {
             return p;
         };
@@ -181,12 +182,11 @@ impl View {
     }
 
     /// The place on the ground, m, of a beam that appears to come from `seen` because the pose is off by `error`.
-    pub fn undisplaced(&self, seen: Vector2<f64>, error: &Vector6<f64>) -> Vector2<f64> {
+    pub fn undisplaced(&self, seen: Vector2<f64>, error: &PoseError) -> Vector2<f64> {
         let Some(sight) = &self.sight else {
             return seen;
         };
-        let truth = sight.corrected(&-error, *sight.cov());
-        let place = truth.ground_seen_by(sight, seen.into());
+        let place = sight.seen_without_error(seen.into(), error);
         place.map_or(seen, |point| point.horizontal_m())
     }
 
@@ -202,7 +202,7 @@ impl View {
 #[cfg(test)]
 mod tests {
     use jiff::Timestamp;
-    use nalgebra::UnitQuaternion;
+    use nalgebra::{UnitQuaternion, Vector6};
 
     use super::*;
     use crate::optics;
@@ -218,21 +218,22 @@ mod tests {
         let sight = Sight::new(&pose, &Mount::default());
         let error = Vector6::new(0.01, -0.02, 0.1, 2.0, -1.0, 3.0);
         let truth = sight.corrected(&-error, *sight.cov());
+        let by = PoseError::of(error);
         let view = View {
             camera: camera.clone(),
             sight: Some(sight.clone()),
         };
         for spot in [[0.0, 0.0], [5e-3, -3e-3], [-8e-3, 6e-3]] {
             let [place, seen] = [&truth, &sight].map(|s| s.ground(&camera, spot).unwrap().horizontal_m());
-            assert!((view.displaced(place, &error) - seen).norm() < 1e-9);
-            assert!((view.undisplaced(seen, &error) - place).norm() < 1e-9);
+            assert!((view.displaced(place, &by) - seen).norm() < 1e-9);
+            assert!((view.undisplaced(seen, &by) - place).norm() < 1e-9);
             // A tenth of a radian is no small heading error.
             let linear = view.by_pose(place) * error;
             assert!((place + linear - seen).norm() > 0.1);
         }
         let level = View::level(&camera);
         let p = Vector2::new(3.0, 4.0);
-        assert_eq!((level.displaced(p, &error), level.undisplaced(p, &error)), (p, p));
+        assert_eq!((level.displaced(p, &by), level.undisplaced(p, &by)), (p, p));
     }
 
     #[test]

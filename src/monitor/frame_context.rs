@@ -278,20 +278,8 @@ impl FrameContext {
 
     /// Covariance of what all residuals of a user at `p` share, m²: our own pose and what is systematic in positions.
     pub fn systematic_cov(&self, p: Vector2<f64>) -> Matrix2<f64> {
-        let known = self.displacement_cov(p);
-        match &self.view.sight {
-            None => known,
-            Some(_) => known + self.view.pose_cov(p) * (UNMODELLED * SHOWN_S / (SHOWN_S + self.wander.seen_s())),
-        }
-    }
-
-    /// Covariance of [`FrameContext::displacement_at`], m².
-    pub fn displacement_cov(&self, p: Vector2<f64>) -> Matrix2<f64> {
         let systematic = Matrix2::identity() * (SYSTEMATIC_M.powi(2) + self.pose.variance(p));
-        match &self.view.sight {
-            None => systematic,
-            Some(_) => systematic + self.bias_cov(p),
-        }
+        systematic + self.bias_cov(p, UNMODELLED * SHOWN_S / (SHOWN_S + self.wander.seen_s()))
     }
 
     /// Takes what this frame's beams and claims say of the pose error that lasts and of how it changes, `dt` seconds after the last
@@ -322,19 +310,20 @@ impl FrameContext {
         self.view.undisplaced(track.filter.position(), self.bias.error())
     }
 
-    fn bias_cov(&self, p: Vector2<f64>) -> Matrix2<f64> {
+    /// What the pose makes of a place's covariance, m²: what lasts, what users share, and a share that is `unmodelled`; zero for a fixed
+    /// platform.
+    fn bias_cov(&self, p: Vector2<f64>, unmodelled: f64) -> Matrix2<f64> {
+        let Some(sight) = &self.view.sight else {
+            return Matrix2::zeros();
+        };
         let by_pose = self.view.by_pose(p);
-        by_pose * (self.bias.cov() + self.course.cov()) * by_pose.transpose()
-            + Matrix2::identity() * self.wander.wandered()
+        let cov = self.bias.cov() + self.course.cov() + sight.cov() * unmodelled;
+        by_pose * cov * by_pose.transpose() + Matrix2::identity() * self.wander.wandered()
     }
 
     /// Covariance of a track's position in the world, m²: its own and our pose's.
     pub fn position_cov(&self, track: &Track) -> Matrix2<f64> {
-        let own = track.filter.position_cov();
-        match &self.view.sight {
-            None => own,
-            Some(_) => own + self.bias_cov(track.filter.position()),
-        }
+        track.filter.position_cov() + self.bias_cov(track.filter.position(), 0.0)
     }
 
     /// Associates known lights with the tracks that are no user's.

@@ -174,7 +174,9 @@ impl PoseBuffer {
     /// The pose at `time`: between two by slerp; beyond the ends at the nearest rates for a tenth of a second, then held. Its
     /// covariance says how far the platform may have moved from there. `None` while no pose is known.
     pub fn at(&self, time: Timestamp) -> Option<PoseAt> {
-        let after = self.poses.partition_point(|p| p.time <= time);
+        // Frames come with the newest poses: a search among all would fetch old ones.
+        let later = self.poses.iter().rev().take_while(|p| p.time > time).count();
+        let after = self.poses.len() - later;
         let (Some(first), Some(last)) = (self.poses.front(), self.poses.back()) else {
             return None;
         };

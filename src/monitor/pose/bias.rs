@@ -3,6 +3,7 @@
 
 use nalgebra::{Matrix2, Matrix2x6, Matrix6, Vector2, Vector6};
 
+use crate::geo::PoseError;
 use crate::monitor::stats::gaussian::mahalanobis2;
 use crate::monitor::stats::robust::{median_vector, variance_of_median};
 
@@ -26,7 +27,7 @@ pub struct PoseBias {
     /// The same with the squares of the weights: how much the weighted sums scatter.
     scatter: Matrix6<f64>,
     vector: Vector6<f64>,
-    error: Vector6<f64>,
+    error: PoseError,
     cov: Matrix6<f64>,
 }
 
@@ -50,7 +51,7 @@ pub struct SharedOffset {
 }
 
 impl PoseBias {
-    pub fn error(&self) -> &Vector6<f64> {
+    pub fn error(&self) -> &PoseError {
         &self.error
     }
 
@@ -74,7 +75,6 @@ impl PoseBias {
         self.information *= keep;
         self.scatter *= keep * keep;
         self.vector *= keep;
-        self.solve(&prior_information, &prior);
         let share = (dt / period_s.max(0.01)).min(1.0);
         let is_outside = |r: &&Residual| !(self.distance2(r) < OUTSIDE * OUTSIDE);
         if 2 * residuals.iter().filter(is_outside).count() > residuals.len() {
@@ -104,8 +104,8 @@ impl PoseBias {
     pub fn shared_offset(&self, residuals: &[Residual]) -> Option<SharedOffset> {
         let n = residuals.len();
         (n >= MIN_SHARING).then(|| SharedOffset {
-            left: median_vector(residuals.iter().map(|r| r.offset - r.by_pose * self.error)),
-            error: self.error,
+            left: median_vector(residuals.iter().map(|r| r.offset - r.by_pose * self.error.vector())),
+            error: *self.error.vector(),
             by_pose: residuals.iter().map(|r| r.by_pose).sum::<Matrix2x6<f64>>() / n as f64,
             variance: variance_of_median(residuals.iter().map(|r| r.variance).sum::<f64>() / n as f64, n),
         })
@@ -114,7 +114,7 @@ impl PoseBias {
     /// Squared distance of a claim from its beam, standard deviations.
     fn distance2(&self, r: &Residual) -> f64 {
         let spread = r.by_pose * self.cov * r.by_pose.transpose() + Matrix2::identity() * r.variance;
-        mahalanobis2(r.offset - r.by_pose * self.error, spread)
+        mahalanobis2(r.offset - r.by_pose * self.error.vector(), spread)
     }
 
     fn solve(&mut self, prior_information: &Matrix6<f64>, prior: &Matrix6<f64>) {
@@ -122,7 +122,7 @@ impl PoseBias {
         let weighted = (prior_information + self.information).cholesky().map(|c| c.inverse());
         let inverse = weighted.unwrap_or(*prior);
         self.cov = inverse * (prior_information + self.scatter) * inverse;
-        self.error = inverse * self.vector;
+        self.error = PoseError::of(inverse * self.vector);
     }
 }
 
@@ -174,7 +174,8 @@ mod tests {
     fn left(bias: &PoseBias, error: &Vector6<f64>) -> f64 {
         let pose = Pose::level(Timestamp::UNIX_EPOCH, [5.0, -8.0, 300.0]);
         let sight = Sight::new(&pose, &Mount::default());
-        let at = |[x, y]: [f64; 2]| sight.apparent([x, y, 0.0]).expect("below").by_pose * (error - bias.error());
+        let at =
+            |[x, y]: [f64; 2]| sight.apparent([x, y, 0.0]).expect("below").by_pose * (error - bias.error().vector());
         USERS.into_iter().map(|p| at(p).norm()).fold(0.0, f64::max)
     }
 
@@ -227,7 +228,7 @@ mod tests {
                 (0..10).for_each(|_| bias.update(&residuals, Some(&prior.cov()), 0.1, 1.0));
             }
             for h in by_pose {
-                let off = h * (error - bias.error());
+                let off = h * (error - bias.error().vector());
                 mean += mahalanobis2(off, h * bias.cov() * h.transpose()) / (2 * by_pose.len() * RUNS) as f64;
             }
         }

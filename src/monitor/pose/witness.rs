@@ -1,9 +1,9 @@
 //! The claims that our own pose is estimated from: where each user's beam may be now.
 
-use nalgebra::{Vector2, Vector6};
+use nalgebra::Vector2;
 
 use super::bias::Residual;
-use crate::geo::View;
+use crate::geo::{PoseError, View};
 use crate::monitor::input::claim_state::ActiveClaim;
 use crate::monitor::track::tracker::Tracker;
 
@@ -64,7 +64,7 @@ pub fn witnesses(claims: &[ActiveClaim], tracker: &Tracker) -> Vec<Witness> {
 
 /// The claims whose own beam is followed and stands alone, each with how far the beam is from it, linearised at a lasting `error` of
 /// the pose.
-pub fn residuals(claims: &[ActiveClaim], tracker: &Tracker, view: &View, error: &Vector6<f64>) -> Vec<Residual> {
+pub fn residuals(claims: &[ActiveClaim], tracker: &Tracker, view: &View, error: &PoseError) -> Vec<Residual> {
     let residual = |a: &ActiveClaim| {
         let track = tracker.get(a.before.current()?)?;
         let is_clear = track.hit && track.confirmed && track.unresolved_from.is_none() && !a.ended;
@@ -74,7 +74,7 @@ pub fn residuals(claims: &[ActiveClaim], tracker: &Tracker, view: &View, error: 
             let expected = view.displaced(claimed, error);
             let by_pose = view.by_pose(expected);
             Residual {
-                offset: here - expected + by_pose * error,
+                offset: here - expected + by_pose * error.vector(),
                 variance: a.variance + 0.5 * track.filter.position_cov().trace(),
                 by_pose,
             }
