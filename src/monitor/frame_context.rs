@@ -213,7 +213,10 @@ impl FrameContext {
         }
         let pull = match self.pose_age_s < FRESH_S {
             true => self.course.pull(dt),
-            false => Pull::default(),
+            false => {
+                self.course.lose(dt);
+                Pull::default()
+            }
         };
         let Some(found) = register(&self.tracker.tracks, detections, sight.cov(), pull.position) else {
             return;

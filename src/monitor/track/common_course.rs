@@ -25,6 +25,12 @@ const RETIMED_MEMORY_S: f64 = 2.0;
 /// Time over which it is learned whether errors last, s. Longer is more exact, shorter follows users who begin to turn. Not measured.
 const AVERAGED_S: f64 = 20.0;
 
+/// How fast tracks go astray together while no pose tells, m/s per axis: users change their pace by more, but not all alike. Not measured
+/// on users other than the simulator's.
+const LOST_M_S: f64 = 0.2;
+/// Time in which they are back once poses tell again, s: the first ones tell most. Not tuned.
+const BACK_S: f64 = 1.5;
+
 /// Variance of the mean of white errors over that of the same mean of what is left of them against tracks that follow it.
 const FOLLOWED: f64 = 1.4;
 
@@ -41,6 +47,8 @@ pub struct CommonCourse {
     newest: Vector6<f64>,
     newest_square: Matrix6<f64>,
     cov: Matrix6<f64>,
+    /// How far tracks may have gone astray without poses, m per axis.
+    lost_m: f64,
     averaged_s: f64,
     /// Since when the poses are on time, s.
     on_time_s: f64,
@@ -142,9 +150,16 @@ impl CommonCourse {
         since_began
     }
 
-    /// Covariance of the end of the line: what the errors of single poses, and users who turn together, leave in all tracks.
-    pub fn cov(&self) -> &Matrix6<f64> {
-        &self.cov
+    /// Covariance of the end of the line: what the errors of single poses, and users who turn together, leave in all tracks, and what
+    /// they went astray without poses.
+    pub fn cov(&self) -> Matrix6<f64> {
+        let lost = self.lost_m * self.lost_m;
+        self.cov + Matrix6::from_diagonal(&[0.0, 0.0, 0.0, lost, lost, 0.0].into())
+    }
+
+    /// No pose tells of `dt` seconds.
+    pub fn lose(&mut self, dt: f64) {
+        self.lost_m += LOST_M_S * dt;
     }
 
     /// How long errors are averaged: as long as it is single poses that make them. What lasts is the tracks' own, as users turn together.
@@ -161,6 +176,7 @@ impl CommonCourse {
             return Pull::default();
         }
         self.on_time_s += dt;
+        self.lost_m *= (-dt / BACK_S).exp();
         self.seen_s = (self.seen_s + dt).min(self.memory_s());
         let n = (self.seen_s / dt).max(1.0);
         let of_both = 2.0 / ((n + 1.0) * (n + 2.0));
@@ -214,6 +230,16 @@ mod tests {
             }
         }
         largest
+    }
+
+    #[test]
+    fn tracks_go_astray_without_poses_and_come_back_with_them() {
+        let mut course = CommonCourse::default();
+        (0..40).for_each(|_| course.lose(0.1));
+        // 0.2 m/s for four seconds.
+        assert!((course.cov()[(3, 3)] - 0.64).abs() < 1e-9 && course.cov()[(0, 0)] == 0.0);
+        (0..15).for_each(|_| _ = course.pull(0.1));
+        assert!((course.cov()[(4, 4)] - 0.64 * (-2.0f64).exp()).abs() < 1e-6);
     }
 
     #[test]
