@@ -156,6 +156,15 @@ impl Sight {
         }
     }
 
+    /// The ground at a place, m, as high as that below the lens where the map has a void; `None` off the map.
+    pub fn ground_about(&self, place_m: [f64; 2]) -> Option<Ground> {
+        self.ground_below(place_m).or_else(|| {
+            let half_m = self.terrain.as_ref()?.half_m();
+            let is_on_map = place_m.iter().all(|v| v.abs() <= half_m);
+            is_on_map.then(|| self.ground_below(self.lens_m.xy().into()))?
+        })
+    }
+
     /// The ground at a place, east and north, as a ray to there would meet it. Where it cannot be seen, behind a hill, it is taken
     /// to be level.
     pub fn ground_at(&self, place_m: [f64; 2]) -> Option<GroundPoint> {

@@ -57,12 +57,12 @@ impl View {
         }
     }
 
-    /// The sensor position, m, of a place on the ground, m; infinite behind the camera and where the ground's height is not known.
+    /// The sensor position, m, of a place on the ground, m; infinite behind the camera and off the map. In a void about that.
     pub fn to_sensor(&self, [x, y]: [f64; 2]) -> [f64; 2] {
         let Some(sight) = &self.sight else {
             return self.camera.to_sensor([x, y]);
         };
-        let seen = sight.ground_below([x, y]);
+        let seen = sight.ground_about([x, y]);
         let seen = seen.and_then(|ground| sight.sensor(&self.camera, [x, y, ground.z_m]));
         seen.unwrap_or([f64::INFINITY; 2])
     }
@@ -99,6 +99,23 @@ impl View {
             None => Some(0.0),
             Some(sight) => sight.ground_below(p.into()).map(|ground| ground.z_m),
         }
+    }
+
+    /// Whether the ground's height is known at a place and around it: a beam from elsewhere has no place.
+    pub fn is_ground_known(&self, p: Vector2<f64>, around_m: f64) -> bool {
+        const AROUND: [[f64; 2]; 9] = [
+            [0.0, 0.0],
+            [1.0, 0.0],
+            [-1.0, 0.0],
+            [0.0, 1.0],
+            [0.0, -1.0],
+            [0.7, 0.7],
+            [-0.7, 0.7],
+            [0.7, -0.7],
+            [-0.7, -0.7],
+        ];
+        let is_known = |[x, y]: [f64; 2]| self.ground_z_m(p + Vector2::new(x, y) * around_m).is_some();
+        !self.sight.as_ref().is_some_and(Sight::has_terrain) || AROUND.into_iter().all(is_known)
     }
 
     /// The place below the lens, m.
@@ -201,10 +218,13 @@ impl View {
 
 #[cfg(test)]
 mod tests {
+    use std::sync::Arc;
+
     use jiff::Timestamp;
     use nalgebra::{UnitQuaternion, Vector6};
 
     use super::*;
+    use crate::geo::Terrain;
     use crate::optics;
     use crate::pose::{Mount, Pose};
 
@@ -234,6 +254,30 @@ mod tests {
         let level = View::level(&camera);
         let p = Vector2::new(3.0, 4.0);
         assert_eq!((level.displaced(p, &by), level.undisplaced(p, &by)), (p, p));
+    }
+
+    #[test]
+    fn who_is_in_a_void_or_beside_one_is_in_view_and_need_not_be_seen() {
+        let camera = optics::Config::default().camera().unwrap();
+        let pose = Pose::level(Timestamp::UNIX_EPOCH, [0.0, 0.0, 400.0]);
+        let ground = Terrain::sampled(
+            100,
+            5.0,
+            |x, y| if (x - 40.0).hypot(y) < 7.0 { f64::NAN } else { 100.0 },
+        );
+        let view = View {
+            sight: Some(Sight::new(&pose, &Mount::default()).over(Some(Arc::new(ground)))),
+            camera: camera.clone(),
+        };
+        let place = |x: f64| Vector2::new(x, 0.0);
+        // 300 m above the ground below the lens.
+        let shown = view.to_sensor([40.0, 0.0]);
+        assert!(
+            (shown[1].hypot(shown[0]) - 40.0 * camera.plane_distance_m / 300.0).abs() < 1e-12,
+            "{shown:?}"
+        );
+        assert!(!view.is_ground_known(place(40.0), 0.0) && !view.is_ground_known(place(25.0), 10.0));
+        assert!(view.is_ground_known(place(25.0), 1.0) && View::level(&camera).is_ground_known(place(40.0), 10.0));
     }
 
     #[test]
