@@ -17,6 +17,8 @@ use crate::geo::View;
 const MIN_DEVIANCE: f64 = 100.0;
 /// Neighbours that are considered, nearest first; bounds the cost where many stand together.
 const MAX_NEIGHBOURS: usize = 4;
+/// Spot widths over which the halo of a spot falls to a half, as a frame's spot error takes it.
+const HALO: f64 = 3.0;
 /// Standard deviations of a claim about its place that are considered too. Larger excuses users who are really absent, smaller
 /// alerts those whose claim is a little off. Not measured.
 const CLAIM_REACH: f64 = 2.0;
@@ -38,19 +40,19 @@ pub(super) fn confusion_m(track: &Track, tracker: &Tracker, association: &Associ
         .fold(0.0, f64::max)
 }
 
-/// Marks the claims without a beam whose beam, of the user's usual energy (`usual_energy_j`), would not be resolved from those
-/// that are seen.
+/// Marks the claims whose user's own beam is not seen whose beam, of the user's usual energy (`usual_energy_j`), would not be resolved
+/// from those that are; `spot_error` is the share of a spot's light by which it may differ from its model.
 pub(super) fn mark_unresolvable(
     claims: &mut [ActiveClaim],
-    association: &Association,
     tracker: &Tracker,
     view: &View,
+    spot_error: f64,
     usual_energy_j: impl Fn(&str) -> Option<f64>,
 ) {
-    for (i, claim) in claims.iter_mut().enumerate() {
-        if association.track_id(i).is_none() {
-            claim.is_unresolvable = is_unresolvable(claim, tracker, view, &usual_energy_j);
-        }
+    for claim in claims {
+        let own = claim.before.current().and_then(|id| tracker.get(id));
+        claim.is_unresolvable =
+            !own.is_some_and(|track| track.hit) && is_unresolvable(claim, tracker, view, spot_error, &usual_energy_j);
     }
 }
 
@@ -59,19 +61,28 @@ fn is_unresolvable(
     claim: &ActiveClaim,
     tracker: &Tracker,
     view: &View,
+    spot_error: f64,
     usual_energy_j: impl Fn(&str) -> Option<f64>,
 ) -> bool {
     let spot_m = spot_m(view);
     let seen = || tracker.tracks.iter().filter(|t| t.hit).map(|t| &t.detection);
-    let mut near: Vec<Vector2<f64>> = seen().map(|d| (d.position - claim.position) / spot_m).collect();
-    near.retain(|p| p.norm() < OVERLAP);
+    let mut near: Vec<Vector2<f64>> = Vec::new();
+    // What the lens may add to a pixel there, in units of the noise.
+    let mut halo = 0.0;
+    for d in seen() {
+        let away = (d.position - claim.position) / spot_m;
+        if away.norm() < OVERLAP {
+            halo += spot_error * snr(&view.camera, d.energy_j) / (1.0 + away.norm_squared() / (HALO * HALO));
+            near.push(away);
+        }
+    }
     near.sort_by(|p, q| p.norm().total_cmp(&q.norm()));
     near.truncate(MAX_NEIGHBOURS);
     let Some(neighbours) = Neighbours::new(&near) else {
         return false;
     };
     let usual = usual_energy_j(&claim.claim.user).or_else(|| median_high(seen().map(|d| d.energy_j)));
-    let snr = snr(&view.camera, usual.unwrap_or(0.0));
+    let snr = snr(&view.camera, usual.unwrap_or(0.0)) / (1.0 + halo * halo).sqrt();
     let off = CLAIM_REACH * claim.variance.sqrt() / spot_m;
     [[0.0, 0.0], [off, 0.0], [-off, 0.0], [0.0, off], [0.0, -off]]
         .into_iter()
@@ -190,13 +201,15 @@ mod tests {
     fn a_claim_on_top_of_a_seen_beam_cannot_be_resolved() {
         let view = View::level(&optics::Config::default().camera().unwrap());
         let (tracker, _) = two_beams(60.0, Flags::empty());
-        let mark = |x: f64| {
+        let mark = |x: f64, spot_error: f64| {
             let mut claims = [active_claim("a", x, 0.0)];
             // Half a millijoule: a signal-to-noise ratio of some 66.
-            mark_unresolvable(&mut claims, &Association::none(1), &tracker, &view, |_| Some(5e-4));
+            mark_unresolvable(&mut claims, &tracker, &view, spot_error, |_| Some(5e-4));
             claims[0].is_unresolvable
         };
-        assert!(mark(0.5));
-        assert!(!mark(30.0));
+        assert!(mark(0.5, 0.0));
+        assert!(!mark(30.0, 0.0) && !mark(8.0, 0.0));
+        // A lens that may differ from its model by a twentieth hides who is a σ beside another.
+        assert!(mark(8.0, 0.05) && !mark(30.0, 0.05));
     }
 }

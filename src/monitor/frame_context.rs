@@ -387,4 +387,13 @@ impl FrameContext {
     pub fn confusion_m(&self, track: &Track) -> f64 {
         ambiguity::confusion_m(track, &self.tracker, &self.association, self.overlap_m())
     }
+
+    /// Whether another user than that of claim `i` claims to be at `p`.
+    pub fn is_anothers_place(&self, i: usize, p: Vector2<f64>) -> bool {
+        let is_there = |c: &ActiveClaim| (p - c.position).norm() <= c.reach_m(self.tolerated_distance_m(c.position));
+        let others = self.claims.iter().enumerate().filter(|(j, _)| *j != i);
+        others
+            .filter(|(_, c)| self.crowding.is_evidence(c))
+            .any(|(_, c)| is_there(c))
+    }
 }

@@ -235,6 +235,14 @@ impl Monitor {
         for (claim, displacement) in frame.claims.iter_mut().zip(displacements) {
             claim.position += displacement;
         }
+        let usual_energy_j = |user: &str| self.memory.co_located.usual_energy_j(user);
+        mark_unresolvable(
+            &mut frame.claims,
+            &frame.tracker,
+            &frame.view,
+            estimate.spot_error,
+            usual_energy_j,
+        );
         let of_lights = frame.lights.tracks();
         let eligibility = Eligibility {
             now: frame.time,
@@ -247,14 +255,6 @@ impl Monitor {
         };
         frame.association = associate(&frame.claims, &frame.tracker, &eligibility);
         frame.associate_lights();
-        let usual_energy_j = |user: &str| self.memory.co_located.usual_energy_j(user);
-        mark_unresolvable(
-            &mut frame.claims,
-            &frame.association,
-            &frame.tracker,
-            &frame.view,
-            usual_energy_j,
-        );
     }
 
     /// Adds the frame's evidence to what is remembered of each user and track, and forgets users who no longer matter: those

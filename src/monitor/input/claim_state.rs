@@ -50,7 +50,7 @@ pub struct ActiveClaim {
     /// The beam must be seen if the claim holds.
     pub expected: bool,
     pub ended: bool,
-    /// No beam is associated, and one at the claimed place would not be resolved from its neighbours.
+    /// The user's own beam is not seen, and one at the claimed place would not be resolved from its neighbours.
     pub is_unresolvable: bool,
     /// Seconds between the user's last two claims.
     pub period_s: Option<f64>,
@@ -174,9 +174,9 @@ impl Scope<'_> {
 
     /// Whether even a user as far off as is tolerated would show at least part of a spot.
     fn must_be_seen(&self, claim: &ActiveClaim) -> bool {
-        let pose_m = claim.pose_variance.sqrt();
-        let off = self.config.tolerated_distance_m + claim.slack_m + 3.0 * (claim.variance.sqrt() + pose_m);
+        let off = claim.reach_m(self.config.tolerated_distance_m);
         is_near_view(self.view, claim.position, (spot_m(self.view) - off).min(0.0))
+            && self.view.is_ground_known(claim.position, off)
     }
 }
 
@@ -201,6 +201,11 @@ impl ActiveClaim {
             before,
             claim: claim.clone(),
         }
+    }
+
+    /// How far from the claim its user's beam may be seen, m.
+    pub fn reach_m(&self, tolerated_m: f64) -> f64 {
+        tolerated_m + self.slack_m + 3.0 * (self.variance.sqrt() + self.pose_variance.sqrt())
     }
 
     /// Covariance for the association with a beam: half of what the user may have gone and may be off counts as a standard

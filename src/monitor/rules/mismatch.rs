@@ -90,10 +90,13 @@ impl Memory {
                 }
             }
             let cov = track.filter.position_cov() + claim.cov + frame.systematic_cov(claim.position);
-            let offset = track.filter.position() - claim.position;
+            let here = track.filter.position();
+            let offset = here - claim.position;
+            // Where nobody else claims to be, it is nobody else's beam.
+            let is_a_guess = confusion_m > 0.0 && frame.is_anothers_place(i, here);
             let reach = frame.tolerated_distance_m(claim.position)
                 + claim.slack_m
-                + confusion_m
+                + if is_a_guess { confusion_m } else { 0.0 }
                 + clock_uncertainty_s * track.filter.velocity().norm();
             let is_outside = track.hit && track.confirmed && neg_log_p_outside(offset, &cov, reach) > gate;
             user.outside = if is_outside { user.outside + 1 } else { 0 };
@@ -166,7 +169,10 @@ impl User {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::estimate::Flags;
     use crate::monitor::fixture::{Scene, absent, present};
+    use crate::monitor::track::detection::Detection;
+    use crate::monitor::track::detection::fixture::detection;
 
     /// One user whose beam is at the origin.
     struct Watch {
@@ -232,6 +238,28 @@ mod tests {
         for k in 0..10 {
             watch.move_claim(if k % 3 == 0 { 0.0 } else { 9.0 });
             assert!(watch.show().is_empty());
+        }
+    }
+
+    /// Two beams whose fit is in doubt, the user of the second 18 m from their claim, and a third who is missed.
+    #[test]
+    fn a_doubtful_beam_is_excused_only_where_another_user_claims_to_be() {
+        for (third_m, is_excused) in [(20.0, true), (60.0, false)] {
+            let mut scene = Scene::of_users(&[[0.0, 0.0], [18.0, 0.0], [third_m, 0.0]]);
+            let mut memory = Memory::default();
+            scene.claim(1, 0.0, 0.0);
+            let mut found = Vec::new();
+            for _ in 0..OUTSIDE_FRAMES {
+                let doubtful = [0.0, 18.0].map(|x| Detection {
+                    flags: Flags::UNRESOLVED,
+                    ..detection(x, 0.0)
+                });
+                scene.detect(&doubtful);
+                memory.update(scene.context());
+                found = evaluate(scene.context(), &mut memory);
+            }
+            let of_second = Cause::User(AlertKind::PositionMismatch, "u-1".into());
+            assert_eq!(present(&found).contains(&&of_second), !is_excused, "{third_m}");
         }
     }
 

@@ -43,8 +43,10 @@ impl Eligibility<'_> {
         if claim.before.track != Some(track.id) && claim.age_s > self.freshness_s(claim) {
             return false;
         }
+        // Who may be hidden beside others, as who may be out of view, is not where a beam comes on elsewhere.
+        let must_be_seen = claim.expected && !claim.is_unresolvable;
         let is_anothers = owner.is_some_and(|o| o.claim.user != claim.claim.user);
-        if claim.before.track != Some(track.id) && !claim.expected && !self.may_have_come(claim, track, owner) {
+        if claim.before.track != Some(track.id) && !must_be_seen && !self.may_have_come(claim, track, owner) {
             return false;
         }
         // Who claims to be where a known light is must bring a beam of their own.
@@ -64,11 +66,10 @@ impl Eligibility<'_> {
         !is_alerted && !is_anothers && (beam - claim.position).norm() <= self.crowding.reach_m()
     }
 
-    /// Whether who may be out of view can be where the beam is, nearer to it than whose it was.
+    /// Whether who may be out of view, or hidden, can be where the beam is, nearer to it than whose it was.
     fn may_have_come(&self, claim: &ActiveClaim, track: &Track, owner: Option<&ActiveClaim>) -> bool {
         let away_m = |from: &ActiveClaim| (track.filter.position() - from.position).norm();
-        let sigmas_m = 3.0 * (claim.variance.sqrt() + claim.pose_variance.sqrt());
-        let reach_m = self.config.tolerated_distance_m + claim.slack_m + sigmas_m;
+        let reach_m = claim.reach_m(self.config.tolerated_distance_m);
         away_m(claim) <= owner.map_or(reach_m, |owner| reach_m.min(away_m(owner)))
     }
 
@@ -153,15 +154,17 @@ mod tests {
     }
 
     #[test]
-    fn who_claims_to_be_out_of_view_can_have_come_only_so_far() {
+    fn who_claims_to_be_out_of_view_or_may_be_hidden_can_have_come_only_so_far() {
         let mut scene = scene();
         let mut claim = newcomer(&mut scene, STRANGER[0] + 12.0);
         claim.before = scene.claims[0].before;
         assert!(claim.before.is_established() && allows(&scene, &claim, false));
-        claim.expected = false;
-        assert!(!allows(&scene, &claim, false));
-        claim.slack_m = 7.0;
-        assert!(allows(&scene, &claim, false));
+        for (expected, is_unresolvable) in [(false, false), (true, true)] {
+            (claim.expected, claim.is_unresolvable, claim.slack_m) = (expected, is_unresolvable, 0.0);
+            assert!(!allows(&scene, &claim, false));
+            claim.slack_m = 7.0;
+            assert!(allows(&scene, &claim, false));
+        }
     }
 
     #[test]
