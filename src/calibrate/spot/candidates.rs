@@ -46,7 +46,7 @@ pub fn best<'a>(first: Learner<'a>, held: &[&Image], is_field_covered: bool, run
     let on_held = |learner: &Learner| {
         let held = Learner::with_model(learner.camera, held, learner.noise_j, &learner.model, learner.misfit);
         let score = held.chi2_of_images() + (2 * PER_SPOT * held.sources()) as f64;
-        (score, statistics::unexplained(&held))
+        (score, statistics::unexplained(&held, 0.0))
     };
     let (mut least, _) = on_held(&first);
     let mut learned = |varies: bool| {

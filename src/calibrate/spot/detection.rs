@@ -1,5 +1,8 @@
 //! Finds spots without knowing their shape, and what only looks like one: hot pixels and the halo of a brighter spot.
 
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
 use super::patch::Source;
 use crate::optics::{Axis, Camera, psf};
 
@@ -203,10 +206,12 @@ const NARROWEST: f64 = 0.7;
 /// beside it, and the median leaves out those that are not.
 pub fn pixel_noise<'a>(camera: &Camera, frames: impl Iterator<Item = &'a [f64]>) -> f64 {
     let (ny, nx) = camera.shape();
+    let mut dither = Dither::of(camera);
     let mut each: Vec<f64> = frames
         .filter_map(|image| {
             let mut rough = Vec::with_capacity(ny * nx);
-            for row in image.chunks_exact(nx) {
+            let dithered: Vec<f64> = image.iter().map(|v| v + dither.next_j()).collect();
+            for row in dithered.chunks_exact(nx) {
                 for w in row.windows(3) {
                     rough.push((w[1] - 0.5 * (w[0] + w[2])).abs());
                 }
@@ -217,5 +222,55 @@ pub fn pixel_noise<'a>(camera: &Camera, frames: impl Iterator<Item = &'a [f64]>)
         .map(|m| m / 0.6745 / 1.5_f64.sqrt())
         .collect();
     each.sort_by(f64::total_cmp);
-    each.get(each.len() / 2).copied().unwrap_or(0.0)
+    dither.taken_off(each.get(each.len() / 2).copied().unwrap_or(0.0))
+}
+
+/// Even noise of one count, by which whole counts become values whose median says how they scatter (Schuchman, 1964).
+pub struct Dither {
+    rng: ChaCha8Rng,
+    step_j: f64,
+}
+
+impl Dither {
+    pub fn of(camera: &Camera) -> Self {
+        Self {
+            rng: ChaCha8Rng::seed_from_u64(0),
+            step_j: camera.joules_per_count.unwrap_or(0.0),
+        }
+    }
+
+    pub fn next_j(&mut self) -> f64 {
+        self.step_j * self.rng.random_range(-0.5..0.5)
+    }
+
+    /// A standard deviation of dithered values without the dither, J.
+    pub fn taken_off(&self, std_j: f64) -> f64 {
+        (std_j * std_j - self.step_j * self.step_j / 12.0).max(0.0).sqrt()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use rand_distr::{Distribution, Normal};
+
+    use super::*;
+
+    #[test]
+    fn the_noise_of_whole_counts_is_theirs_however_coarse() {
+        for counts in [0.4, 1.0, 5.0] {
+            let config = crate::optics::Config {
+                joules_per_count: Some(1e-6),
+                ..Default::default()
+            };
+            let camera = config.camera().unwrap();
+            let (ny, nx) = camera.shape();
+            let mut rng = ChaCha8Rng::seed_from_u64(3);
+            let normal: Normal<f64> = Normal::new(20.3, counts).unwrap();
+            let image: Vec<f64> = (0..ny * nx).map(|_| 1e-6 * normal.sample(&mut rng).round()).collect();
+            let found = pixel_noise(&camera, [image.as_slice()].into_iter());
+            let mean = image.iter().sum::<f64>() / image.len() as f64;
+            let truth = (image.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / image.len() as f64).sqrt();
+            assert!((found / truth - 1.0).abs() < 0.1, "{counts}: {found} {truth}");
+        }
+    }
 }

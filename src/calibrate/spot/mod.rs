@@ -2,10 +2,12 @@
 
 mod band;
 mod candidates;
+mod checks;
 mod constraints;
 mod coverage;
 mod detection;
 mod error;
+mod fixed_pattern;
 mod flashes;
 mod grouping;
 mod learn;
@@ -13,7 +15,6 @@ mod patch;
 mod pixel_maps;
 mod prepare;
 mod pupil;
-
 mod solve;
 mod statistics;
 mod stray_light;
@@ -30,7 +31,7 @@ use crate::optics::{Calibration, Camera, PixelMaps, SpotShape};
 use candidates::BETTER;
 pub use coverage::{CELLS, Coverage};
 pub use error::Error;
-use error::{MIN_FRAMES, MIN_SPOTS};
+use error::MIN_FRAMES;
 use grouping::Image;
 use learn::Learner;
 pub use pupil::Wavefront;
@@ -105,11 +106,6 @@ const NOISE_CHANGE: f64 = 0.03;
 const MOST_FRAMES: usize = 250;
 /// One frame in this many is held out.
 const HELD_OUT: usize = 5;
-/// Misfit of most spots in training, and of all that are not odd on the held-out frames, beyond which spots have no common shape.
-const UNLIKE: f64 = 0.25;
-const UNEXPLAINED: f64 = 0.05;
-/// Least share of a spot's light within two of its widths.
-const COMPACT: f64 = 0.4;
 
 /// Progress of the learning.
 #[derive(Clone, Copy, Debug)]
@@ -132,7 +128,7 @@ pub fn learn(
     let step = frames.len().div_ceil(MOST_FRAMES);
     let chosen: Vec<(usize, &Array2<f64>)> = frames.iter().step_by(step).copied().collect();
     let mut prepared = prepare::prepare(camera, &chosen);
-    check_pixels(&prepared, &chosen)?;
+    checks::pixels(&prepared, &chosen)?;
     // Each pass shows what the flashes that it masks have hidden.
     for _ in 0..FLASH_PASSES {
         let images = every(&prepared.images);
@@ -156,11 +152,11 @@ pub fn learn(
     };
     let (train, _) = split(&prepared.images);
     let detected = Learner::new(camera, &train, prepared.noise_j);
-    check_spots(&detected, &prepared, chosen.len())?;
+    checks::spots(&detected, &prepared, chosen.len())?;
     let detected_at = Coverage::of(&detected);
     let learner = candidates::first(detected, &mut run, &|learner| {
-        check_spots(learner, &prepared, chosen.len())?;
-        check_shape(learner, &detected_at)
+        checks::spots(learner, &prepared, chosen.len())?;
+        checks::shape(learner, &detected_at)
     })?;
     let coverage = Coverage::of(&learner);
 
@@ -175,6 +171,19 @@ pub fn learn(
     let noise_j = prepared.noise_j;
     let flashes = Learner::with_model(camera, &every(&prepared.images), noise_j, &model, misfit).mask_flashes();
     prepared.mask_flashes(&flashes);
+    if prepared.pattern_j.is_some() {
+        // What is left of a pattern would be taken for a shape that changes over the field.
+        let found = pixel_maps::of_frames(camera, &mut prepared, &model, misfit, is_held, BETTER);
+        if let Some(maps) = found.maps {
+            prepared.take_off(&maps.dark_j);
+            let images = every(&prepared.images);
+            let mut learner = Learner::with_model(camera, &images, noise_j, &model, misfit);
+            learner.fit(6);
+            let factor = statistics::residual_scale(&learner);
+            prepared.scale_noise(factor);
+        }
+    }
+    let noise_j = prepared.noise_j;
     let (train, held) = split(&prepared.images);
     let learner = Learner::with_model(camera, &train, noise_j, &model, misfit);
     let learner = candidates::best(learner, &held, coverage.is_field_covered(), &mut run);
@@ -186,17 +195,15 @@ pub fn learn(
     let noise_j = prepared.noise_j;
 
     let pixels = pixel_maps::of_frames(camera, &mut prepared, &model, misfit, is_held, BETTER);
-    let maps = pixels.maps;
-    let images = match &maps {
-        Some(maps) => prepare::corrected(prepared.images, maps),
-        None => prepared.images,
-    };
-    let (train, held) = split(&images);
-    if maps.is_some() {
+    if let Some(maps) = &pixels.maps {
+        prepared.correct(maps);
+        let (train, _) = split(&prepared.images);
         let mut again = Learner::with_model(camera, &train, noise_j, &model, misfit);
         run(&mut again, AGAIN_ROUNDS, "the shape with corrected pixels");
         model = again.model;
     }
+    let maps = pixel_maps::with_pattern(camera, pixels.maps, prepared.pattern_j.as_deref());
+    let (_, held) = split(&prepared.images);
 
     // The held-out frames decide.
     let mut after = Learner::with_model(camera, &held, noise_j, &model, misfit);
@@ -212,8 +219,9 @@ pub fn learn(
         degrees_of_freedom: learner.patches.iter().map(|p| p.degrees_of_freedom()).sum(),
     };
     let (before_fit, after_fit) = (fit(&before), fit(&after));
-    let unexplained = statistics::unexplained(&after);
-    if unexplained > UNEXPLAINED || odd_held > after.sources() {
+    let shot = statistics::variance(&after).quantum_j;
+    let unexplained = statistics::unexplained(&after, shot.unwrap_or(0.0));
+    if unexplained > checks::UNEXPLAINED || odd_held > after.sources() {
         return Err(Error::NotAlike {
             share: 100.0 * unexplained,
         });
@@ -225,14 +233,14 @@ pub fn learn(
     drop((after, before));
 
     // What is written is learned from all frames.
-    let images = every(&images);
+    let images = every(&prepared.images);
     let mut last = Learner::with_model(camera, &images, noise_j, &model, misfit);
     run(&mut last, LAST_ROUNDS, "all frames");
     let information = statistics::information(&last);
     let separable = Separable::of(camera, &last.model, count).ok_or_else(dark)?;
     let shape = separable.shape(&last.model).ok_or_else(dark)?;
     if is_shape_better {
-        check_compact(&shape)?;
+        checks::compact(&shape)?;
     }
     let peak_snr = statistics::peak_snr(&last);
     let spots = last.sources();
@@ -279,7 +287,7 @@ pub fn learn(
         bad_pixels: maps
             .as_ref()
             .map_or(0, |m: &PixelMaps| m.bad.iter().filter(|b| **b).count()),
-        are_pixels_better: pixels.are_better,
+        are_pixels_better: pixels.are_better || prepared.pattern_j.is_some(),
         flashes: prepared.flashes,
         gain_scatter,
         saturation_j: prepared.saturation_j,
@@ -315,80 +323,3 @@ const FLASH_PASSES: usize = 3;
 const LEFT: f64 = 2.0;
 const AGAIN_ROUNDS: usize = 4;
 const LAST_ROUNDS: usize = 3;
-
-fn check_shape(learner: &Learner, detected: &Coverage) -> Result<(), Error> {
-    let (covered, needed) = (Coverage::of(learner).phases, Coverage::needed(learner.camera));
-    // Places that were spread over the pixel and are not any more follow a template that is none.
-    let unexplained = statistics::unexplained(learner);
-    let is_locked = covered < needed && detected.phases >= needed && unexplained > UNEXPLAINED;
-    if learner.misfit > UNLIKE || is_locked {
-        return Err(Error::NotAlike {
-            share: 100.0 * learner.misfit.max(unexplained),
-        });
-    }
-    if covered < needed {
-        return Err(Error::Phases { covered, needed });
-    }
-    Ok(())
-}
-
-/// Gains and shape are free together, so that a needle amid ripples may explain the held-out frames too. Spots of lenses have more than 70 %
-/// of their light within two widths.
-fn check_compact(shape: &SpotShape) -> Result<(), Error> {
-    let within = shape.encircled_energy([0.0; 2], 2.0 * shape.sigma_equivalent_m());
-    match within < COMPACT {
-        true => Err(Error::Scattered { share: 100.0 * within }),
-        false => Ok(()),
-    }
-}
-
-fn check_pixels(prepared: &prepare::Prepared, frames: &[(usize, &Array2<f64>)]) -> Result<(), Error> {
-    let is_finite = frames.iter().any(|(_, pixels)| pixels.iter().any(|v| v.is_finite()));
-    if !is_finite {
-        return Err(Error::NotFinite { frames: frames.len() });
-    }
-    if prepared.noise_j <= f64::MIN_POSITIVE {
-        return Err(Error::NoNoise { frames: frames.len() });
-    }
-    Ok(())
-}
-
-fn check_spots(learner: &Learner, prepared: &prepare::Prepared, frames: usize) -> Result<(), Error> {
-    let spots = learner.sources();
-    if spots >= MIN_SPOTS {
-        return Ok(());
-    }
-    if 2 * prepared.saturated_frames > frames {
-        return Err(Error::Saturated {
-            frames,
-            saturated: prepared.saturated_frames,
-        });
-    }
-    Err(match spots {
-        0 => Error::NoSpots {
-            frames,
-            noise_j: prepared.noise_j,
-        },
-        _ => Error::TooFewSpots { frames, spots },
-    })
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::optics::spot::{Field, FieldPolynomial};
-
-    #[test]
-    fn a_needle_amid_ripples_is_no_spot() {
-        let field = Field {
-            half_sensor_m: [0.01; 2],
-        };
-        let profile = |core: f64, rest: f64| (0..41).map(|k| if k == 20 { core } else { rest }).collect::<Vec<f64>>();
-        let shape = |core: f64, rest: f64| {
-            let term = (FieldPolynomial::constant(1.0), profile(core, rest), profile(core, rest));
-            SpotShape::from_terms(field, 1e-4, [term]).expect("light")
-        };
-        assert!(check_compact(&shape(1.0, 0.0)).is_ok());
-        assert!(matches!(check_compact(&shape(1.0, 0.04)), Err(Error::Scattered { share }) if share < 40.0));
-    }
-}

@@ -258,6 +258,16 @@ fn chi2(learner: &Learner, patches: &[Patch], maps: &PixelMaps) -> f64 {
     chi2.iter().sum()
 }
 
+/// Maps of pixels from which a pattern of dark levels had been taken off, J.
+pub fn with_pattern(camera: &Camera, maps: Option<PixelMaps>, pattern_j: Option<&[f64]>) -> Option<PixelMaps> {
+    let Some(pattern) = pattern_j else {
+        return maps;
+    };
+    let mut maps = maps.unwrap_or_else(|| PixelMaps::ideal(camera.shape()));
+    maps.dark_j.iter_mut().zip(pattern).for_each(|(dark, own)| *dark += own);
+    Some(maps)
+}
+
 /// Relative scatter of the gains; none where they are alike.
 pub fn gain_scatter(maps: &PixelMaps) -> Option<f64> {
     let n = maps.gain.len() as f64;

@@ -4,6 +4,7 @@ use ndarray::Array2;
 
 use super::band::pixels_within;
 use super::detection;
+use super::fixed_pattern;
 use super::grouping::Image;
 use super::stray_light;
 use crate::optics::{Camera, PixelMaps};
@@ -19,6 +20,10 @@ const REPEATED: usize = 12;
 pub struct Prepared {
     pub images: Vec<Image>,
     pub noise_j: f64,
+    /// What whole counts add at least, J.
+    least_noise_j: f64,
+    /// Dark levels that were taken off, J, row by row; none where pixels are alike.
+    pub pattern_j: Option<Vec<f64>>,
     /// Level at which pixels saturate, J, from the config or seen.
     pub saturation_j: Option<f64>,
     /// Frames with a saturated pixel.
@@ -50,8 +55,28 @@ impl Prepared {
         !new.is_empty()
     }
 
+    /// Takes more of the dark levels off, J.
+    pub fn take_off(&mut self, dark_j: &Array2<f64>) {
+        let pattern = self.pattern_j.get_or_insert_with(|| vec![0.0; dark_j.len()]);
+        let pixels = self.images.iter_mut().map(|image| &mut image.pixels);
+        pixels.for_each(|pixels| pixels.iter_mut().zip(dark_j).for_each(|(v, own)| *v -= own));
+        pattern.iter_mut().zip(dark_j).for_each(|(v, own)| *v += own);
+    }
+
+    /// Corrects all images by pixel maps: gain, dark level, bad pixels.
+    pub fn correct(&mut self, maps: &PixelMaps) {
+        for image in &mut self.images {
+            for (p, ((gain, dark), bad)) in maps.gain.iter().zip(&maps.dark_j).zip(&maps.bad).enumerate() {
+                image.pixels[p] = (image.pixels[p] - dark) / gain;
+                // A pixel of low gain has its noise raised by the division.
+                image.weight[p] *= if *bad { 0.0 } else { *gain };
+            }
+        }
+    }
+
     /// Replaces the noise by `factor` times what it was taken for.
     pub fn scale_noise(&mut self, factor: f64) {
+        let factor = factor.max(self.least_noise_j / self.noise_j);
         self.noise_j *= factor;
         let weights = self.images.iter_mut().flat_map(|image| &mut image.weight);
         weights.for_each(|w| *w /= factor);
@@ -77,19 +102,32 @@ pub fn prepare(camera: &Camera, frames: &[(usize, &Array2<f64>)]) -> Prepared {
             }
         })
         .collect();
-    let least = camera
+    let least_noise_j = camera
         .joules_per_count
         .map_or(f64::MIN_POSITIVE, |c| c / 12.0_f64.sqrt());
-    let noise_j = detection::pixel_noise(camera, images.iter().map(|i| i.pixels.as_slice())).max(least);
+    let pixel_noise = |images: &[Image]| {
+        detection::pixel_noise(camera, images.iter().map(|i| i.pixels.as_slice())).max(least_noise_j)
+    };
+    let mut noise_j = pixel_noise(&images);
 
     let saturated_frames = images
         .iter_mut()
         .filter_map(|image| spare_saturated(camera, image, limit))
         .count();
     let mut middle = middle_image(&images);
-    if let Some(stray) = stray_light::of(camera, &middle, noise_j) {
-        let pixels = images.iter_mut().map(|image| &mut image.pixels).chain([&mut middle]);
-        pixels.for_each(|pixels| pixels.iter_mut().zip(&stray).for_each(|(v, stray)| *v -= stray));
+    let light = |image: &Image| image.pixels.iter().map(|v| v - image.level).sum::<f64>() / image.pixels.len() as f64;
+    let light_j = images.iter().map(light).sum::<f64>() / images.len() as f64;
+    let take_off = |images: &mut [Image], middle: &mut Vec<f64>, all: &[f64]| {
+        let pixels = images.iter_mut().map(|image| &mut image.pixels).chain([middle]);
+        pixels.for_each(|pixels| pixels.iter_mut().zip(all).for_each(|(v, own)| *v -= own));
+    };
+    if let Some(stray) = stray_light::of(camera, &middle, noise_j, light_j) {
+        take_off(&mut images, &mut middle, &stray);
+    }
+    let pattern_j = fixed_pattern::of(camera.x.n, &images, &middle, least_noise_j);
+    if let Some(pattern) = &pattern_j {
+        take_off(&mut images, &mut middle, pattern);
+        noise_j = pixel_noise(&images);
     }
     // The standard deviation of a median is 1.25 σ/√T.
     let std = 1.25 * noise_j / (images.len() as f64).sqrt();
@@ -109,6 +147,8 @@ pub fn prepare(camera: &Camera, frames: &[(usize, &Array2<f64>)]) -> Prepared {
     Prepared {
         images,
         noise_j,
+        least_noise_j,
+        pattern_j,
         saturation_j,
         saturated_frames,
         cut_off_frames: frames
@@ -159,18 +199,6 @@ fn middle_image(images: &[Image]) -> Vec<f64> {
         .collect()
 }
 
-/// Corrects images by pixel maps: gain, dark level, bad pixels.
-pub fn corrected(mut images: Vec<Image>, maps: &PixelMaps) -> Vec<Image> {
-    for image in &mut images {
-        for (p, ((gain, dark), bad)) in maps.gain.iter().zip(&maps.dark_j).zip(&maps.bad).enumerate() {
-            image.pixels[p] = (image.pixels[p] - dark) / gain;
-            // A pixel of low gain has its noise raised by the division.
-            image.weight[p] *= if *bad { 0.0 } else { *gain };
-        }
-    }
-    images
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -185,6 +213,8 @@ mod tests {
         let mut prepared = Prepared {
             images: vec![image; 3],
             noise_j: 1.0,
+            least_noise_j: 0.0,
+            pattern_j: None,
             saturation_j: None,
             saturated_frames: 0,
             cut_off_frames: 0,

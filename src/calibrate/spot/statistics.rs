@@ -4,6 +4,7 @@ use faer::Mat;
 use ndarray::Array2;
 
 use super::constraints::{HALO, norm, sigma_equivalent_m};
+use super::detection::Dither;
 use super::learn::Learner;
 use crate::calibrate::exposure::ScaledCholesky;
 use crate::stats::median;
@@ -206,13 +207,17 @@ pub fn mean_residual(learner: &Learner, norm: f64) -> Array2<f64> {
 /// Standard deviation of most pixels' weighted residuals, 1 where the noise is as assumed.
 pub fn residual_scale(learner: &Learner) -> f64 {
     let (camera, model) = (learner.camera, &learner.model);
+    let mut dither = Dither::of(camera);
     let magnitudes = learner.patches.iter().flat_map(|patch| {
         let expected = patch.expected(camera, model).into_iter().zip(&patch.data);
         let weighted = expected.zip(&patch.weight).filter(|(_, w)| **w > 0.0);
-        weighted.map(|((e, d), w)| ((d - e) * w).abs()).collect::<Vec<f64>>()
+        weighted
+            .map(|((e, d), w)| ((d - e + dither.next_j()) * w).abs())
+            .collect::<Vec<f64>>()
     });
     // A median magnitude is 0.6745 standard deviations of a Gaussian.
-    median(magnitudes.collect()).map_or(1.0, |m| m / 0.6745).max(1e-6)
+    let scale = median(magnitudes.collect()).map_or(1.0, |m| m / 0.6745);
+    (dither.taken_off(scale * learner.noise_j) / learner.noise_j).max(1e-6)
 }
 
 /// Matched signal-to-noise ratio of all spots together.
@@ -242,14 +247,16 @@ pub fn peak_snr(learner: &Learner) -> [f64; 2] {
     [median(energies).unwrap_or(0.0), largest].map(|e| e * (peak * pixel).min(1.0) / learner.noise_j)
 }
 
-/// Share of the spots' light, root mean square over their pixels, that the template leaves unexplained beyond the noise.
-pub fn unexplained(learner: &Learner) -> f64 {
+/// Share of the spots' light, root mean square over their pixels, that the template leaves unexplained beyond the noise, whose variance grows
+/// by `quantum_j` per joule.
+pub fn unexplained(learner: &Learner, quantum_j: f64) -> f64 {
     let (mut excess, mut own) = (0.0, 0.0);
     for patch in &learner.patches {
         let expected = patch.expected(learner.camera, &learner.model);
         for ((e, d), w) in expected.iter().zip(&patch.data).zip(&patch.weight) {
-            excess += ((d - e) * w).powi(2) - f64::from(u8::from(*w > 0.0));
-            own += ((e - patch.background) * w).powi(2);
+            let light = e - patch.background;
+            excess += ((d - e) * w).powi(2) - f64::from(u8::from(*w > 0.0)) - quantum_j * light.max(0.0) * w * w;
+            own += (light * w).powi(2);
         }
     }
     (excess.max(0.0) / own.max(1.0)).sqrt()

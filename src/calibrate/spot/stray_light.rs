@@ -12,10 +12,13 @@ const ROUNDS: usize = 20;
 const HALF_WEIGHT: f64 = 2.0;
 /// Share of the median deviation that a surface may leave: light of spots is none.
 const LEAVES: f64 = 0.5;
+/// Widths of a spot within which an array holds nothing but halos: their light over its mean falls as the array grows, an Airy disc's with the
+/// distance. Larger leaves faint stray light beside bright spots, smaller takes rings for it.
+const HALO: f64 = 10.0;
 
 /// The quadratic surface through the median of each pixel, (Ny, Nx) row by row, J, zero in its middle; `None` where none shows beyond a pixel's
-/// noise.
-pub fn of(camera: &Camera, middle: &[f64], noise_j: f64) -> Option<Vec<f64>> {
+/// noise and what halos of spots of `light_j` a pixel may be.
+pub fn of(camera: &Camera, middle: &[f64], noise_j: f64, light_j: f64) -> Option<Vec<f64>> {
     let (ny, nx) = camera.shape();
     let along = |k: usize, n: usize| 2.0 * (k as f64 + 0.5) / n as f64 - 1.0;
     let row = |x: f64, y: f64| Vector6::new(1.0, x, y, 1.5 * x * x - 0.5, x * y, 1.5 * y * y - 0.5);
@@ -43,7 +46,9 @@ pub fn of(camera: &Camera, middle: &[f64], noise_j: f64) -> Option<Vec<f64>> {
     let level = row(0.0, 0.0).dot(&surface);
     let rises: Vec<f64> = rows.iter().map(|row| row.dot(&surface) - level).collect();
     let [low, high] = [f64::min, f64::max].map(|of| rises.iter().copied().fold(0.0, of));
-    (high - low > noise_j && scale < LEAVES * before).then_some(rises)
+    let extent_m = camera.x.half_width().min(camera.y.half_width()) * 2.0;
+    let halos_j = light_j * HALO * camera.spot_sigma_m / extent_m;
+    (high - low > noise_j.max(halos_j) && scale < LEAVES * before).then_some(rises)
 }
 
 #[cfg(test)]
@@ -65,11 +70,12 @@ mod tests {
             };
             (0..ny * nx).map(pixel).collect()
         };
-        assert_eq!(of(&camera, &image(0.0, 0.0), 1.0), None);
-        let found = of(&camera, &image(8.0, 0.0), 1.0).expect("a slope of eight times the noise");
+        assert_eq!(of(&camera, &image(0.0, 0.0), 1.0, 0.0), None);
+        assert_eq!(of(&camera, &image(8.0, 0.0), 1.0, 50.0), None);
+        let found = of(&camera, &image(8.0, 0.0), 1.0, 1.0).expect("a slope of eight times the noise");
         let corner = found[0] - found[nx * ny - 1];
         assert!((corner + 12.0).abs() < 0.5, "{corner}");
-        let found = of(&camera, &image(0.0, -8.0), 1.0).expect("corners darker by four times the noise");
+        let found = of(&camera, &image(0.0, -8.0), 1.0, 1.0).expect("corners darker by four times the noise");
         let fall = found[0] - found[ny / 2 * nx + nx / 2];
         assert!((fall + 4.0).abs() < 0.3, "{fall}");
     }

@@ -123,6 +123,9 @@ fn read(args: &Args, camera: &Camera) -> Result<Vec<Array2<f64>>, Failure> {
     Ok(frames)
 }
 
+/// Reduced χ² of held-out frames that raises no doubt: overlapping spots and bright ones add to it, nothing honest lowers it by as much.
+const AS_EXPECTED: std::ops::Range<f64> = 0.8..1.5;
+
 fn report(camera: &Camera, l: &Learned) -> Vec<String> {
     let shape = &l.shape;
     let sigma = shape.sigma_equivalent_m();
@@ -176,6 +179,13 @@ fn report(camera: &Camera, l: &Learned) -> Vec<String> {
             false => ": the config's is as good and stays",
         }
     ));
+    if !AS_EXPECTED.contains(&l.after.reduced()) {
+        lines.push(
+            "warning: the learned spot and noise do not explain the held-out frames as they should (reduced χ² 1); do dark levels, stray light or \
+             the focus change while frames are taken, or is there a light that is no beam? Look at what `locate` finds with the calibration"
+                .to_owned(),
+        );
+    }
     let error = l.calibration.spot_error.unwrap_or_default();
     let beyond = l
         .shape
