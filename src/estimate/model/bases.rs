@@ -7,6 +7,9 @@ use crate::optics::Camera;
 /// Width of a sensor, σ, up to which one or two spots show no shape beside a width: on narrower ones spots are all core. Smaller takes melted
 /// spots of another width for a lens's, larger leaves two spots of a lens on 20 × 20 pixels to invented sources.
 const NARROW: f64 = 8.5;
+/// Width, σ, up to which the halo of a measured spot is light on most of the sensor. Larger leaves curved daylight through a calibrated lens to
+/// invented sources, smaller takes an Airy disc's rings for daylight, and sources to make up for it.
+const HALO: f64 = 20.0;
 
 /// What a frame is compressed into and predicted in.
 pub(crate) struct Bases {
@@ -53,7 +56,16 @@ impl Bases {
 
     /// Whether spots are all core on this sensor.
     pub fn is_narrow(&self) -> bool {
-        self.axes().iter().any(|b| b.edges[b.n] - b.edges[0] < NARROW)
+        self.is_within(NARROW)
+    }
+
+    /// Whether a curvature of the light on this sensor is a spot's: its core's, or that of a halo that was measured.
+    pub fn is_curved_by_spots(&self) -> bool {
+        self.is_within(if self.shape.is_some() { HALO } else { NARROW })
+    }
+
+    fn is_within(&self, width: f64) -> bool {
+        self.axes().iter().any(|b| b.edges[b.n] - b.edges[0] < width)
     }
 
     /// The wider pixel pitch of the two axes, σ.

@@ -149,8 +149,7 @@ impl<'a> Search<'a, '_> {
     pub fn visible_background(&self) -> Background {
         if !self.frame.has_visible_background() {
             Background::None
-        } else if self.context.bases.is_narrow() {
-            // A curvature is a spot's there.
+        } else if self.context.bases.is_curved_by_spots() {
             Background::Plane
         } else {
             Background::Curved
