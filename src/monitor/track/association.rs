@@ -64,6 +64,12 @@ pub fn associate(claims: &[ActiveClaim], tracker: &Tracker, eligibility: &Eligib
         track.is_some_and(Track::is_just_missed)
     };
     let held: Vec<bool> = claims.iter().map(is_held).collect();
+    // A user's beam that goes on is theirs: no claim makes another's of it that it cannot have been taken for.
+    let has_own = |a: &ActiveClaim, track: &Track| {
+        let own = a.before.current().and_then(|id| tracker.get(id));
+        let own = own.filter(|own| own.id != track.id && own.hit && own.confirmed && own.unresolved_from.is_none());
+        own.is_some_and(|own| a.before.is_established() && own.is_old() && !own.has_met(track, eligibility.overlap_m))
+    };
     let mut association = Association::none(claims.len());
     for tracks in [&hit, &merged] {
         let open: Vec<usize> = (0..claims.len())
@@ -74,7 +80,7 @@ pub fn associate(claims: &[ActiveClaim], tracker: &Tracker, eligibility: &Eligib
             let offset = track.filter.position() - claim.position;
             let cov = track.filter.position_cov() + claim.association_cov(eligibility.config.tolerated_distance_m);
             let d2 = mahalanobis2(offset, cov);
-            if d2 > GATE || !eligibility.allows(claim, track, owners.get(&track.id).copied()) {
+            if d2 > GATE || !eligibility.allows(claim, track, owners.get(&track.id).copied()) || has_own(claim, track) {
                 f64::INFINITY
             } else if claim.before.track == Some(track.id) {
                 d2
@@ -130,6 +136,7 @@ mod tests {
             crowding: Crowding::default(),
             alerts: &AlertLifecycle::new("replay".into(), None, 60.0),
             of_lights: &BTreeSet::new(),
+            overlap_m: 25.0,
             store: &Store::new(&claims::Config::default()),
         };
         associate(claims, tracker, &eligibility).track_of
@@ -159,6 +166,31 @@ mod tests {
         // Even beside the other beam; not 7 m from its own and 3 m from the other.
         for (x, track) in [(2.3, 1), (4.0, 1), (7.0, 2)] {
             assert_eq!(ids(&[known(x, 1)], &tracker), [Some(track)], "{x}");
+        }
+    }
+
+    #[test]
+    fn users_who_exchange_their_claims_keep_their_beams_unless_these_have_met() {
+        for (apart, exchanged) in [(60.0, false), (20.0, true)] {
+            let mut tracker = Tracker::new(50.0);
+            for k in 0..50 {
+                // From here on 60 m apart, whether they have met or not.
+                let x = if k < 20 {
+                    apart
+                } else {
+                    60.0f64.min(apart + f64::from(k - 20) * 2.0)
+                };
+                let time = Timestamp::from_millisecond(100 * i64::from(k)).unwrap();
+                tracker.step(time, &[detection(0.0, 0.0), detection(x, 0.0)], 0.1);
+            }
+            let now = Timestamp::from_second(5).unwrap();
+            let exchanging = [known(60.0, 1), known(0.0, 2)].map(|mut claim| {
+                claim.before.first_seen = Some(Timestamp::UNIX_EPOCH);
+                claim.before.last_seen = Some(now);
+                claim
+            });
+            let kept = [Some(1), Some(2)];
+            assert_eq!(ids(&exchanging, &tracker) != kept, exchanged, "{apart}");
         }
     }
 

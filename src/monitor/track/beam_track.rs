@@ -7,6 +7,7 @@ use nalgebra::Vector2;
 
 use super::detection::{Detection, Earlier};
 use super::manoeuvring::ManoeuvringFilter;
+use super::user_track::ESTABLISHED_S;
 use crate::monitor::stats::gaussian::largest_eigenvalue;
 use crate::time::seconds;
 
@@ -33,6 +34,8 @@ const MERGED_MISS_SHARE: f64 = 0.2;
 /// memory (30 kB for a minute); finer steps follow turns more exactly. Not tuned.
 const TRAIL_S: f64 = 60.0;
 const TRAIL_STEP_S: f64 = 0.05;
+/// Every how many steps of it are looked at for whether two beams have met: two cars are within three spot widths of each other for longer.
+const MET_EVERY: usize = 5;
 /// Probability that an emitter in view is detected in a frame. Low, so that misses cost an eavesdropper's score little. Assumed.
 const DETECTION_PROBABILITY: f64 = 0.9;
 
@@ -99,6 +102,20 @@ impl Track {
             (Some((t, p)), None) if seconds(t, time) < 2.0 * TRAIL_STEP_S => Some(p),
             _ => None,
         }
+    }
+
+    /// Known for as long as it takes to be a user's.
+    pub fn is_old(&self) -> bool {
+        seconds(self.since, self.last_hit) >= ESTABLISHED_S
+    }
+
+    /// Whether two beams have been within a distance of each other, m, as far back as both are known.
+    pub fn has_met(&self, other: &Self, within_m: f64) -> bool {
+        let is_near = |(time, here): &(Timestamp, Vector2<f64>)| {
+            let there = other.at(*time);
+            there.is_some_and(|there| (there - here).norm() < within_m)
+        };
+        self.trail.iter().rev().step_by(MET_EVERY).any(is_near)
     }
 
     /// Takes a detection. One that another beam `is_merged` into lies between the two: neither takes its place or its velocity

@@ -6,7 +6,7 @@ use crate::time::seconds;
 
 /// Time for which a beam must have been associated with a user's claims before the two are taken to belong together, s: longer than a
 /// chance meeting of two who walk lasts. Longer keeps honest newcomers unknown during a flood of claims. Not measured.
-const ESTABLISHED_S: f64 = 3.0;
+pub const ESTABLISHED_S: f64 = 3.0;
 
 #[derive(Clone, Copy, Debug, Default)]
 pub struct UserTrack {
