@@ -171,17 +171,26 @@ pub fn learn(
     let noise_j = prepared.noise_j;
     let flashes = Learner::with_model(camera, &every(&prepared.images), noise_j, &model, misfit).mask_flashes();
     prepared.mask_flashes(&flashes);
-    if prepared.pattern_j.is_some() {
+    let (mut model, passes) = (
+        model,
+        if prepared.pattern_j.is_some() {
+            PATTERN_PASSES
+        } else {
+            0
+        },
+    );
+    for _ in 0..passes {
         // What is left of a pattern would be taken for a shape that changes over the field.
-        let found = pixel_maps::of_frames(camera, &mut prepared, &model, misfit, is_held, BETTER);
-        if let Some(maps) = found.maps {
-            prepared.take_off(&maps.dark_j);
-            let images = every(&prepared.images);
-            let mut learner = Learner::with_model(camera, &images, noise_j, &model, misfit);
-            learner.fit(6);
-            let factor = statistics::residual_scale(&learner);
-            prepared.scale_noise(factor);
-        }
+        let Some(maps) = pixel_maps::of_frames(camera, &mut prepared, &model, misfit, is_held, BETTER).maps else {
+            break;
+        };
+        prepared.take_off(&maps.dark_j);
+        let (train, _) = split(&prepared.images);
+        let mut again = Learner::with_model(camera, &train, prepared.noise_j, &model, misfit);
+        run(&mut again, AGAIN_ROUNDS, "the shape without the pattern of dark levels");
+        let factor = statistics::residual_scale(&again);
+        model = again.model;
+        prepared.scale_noise(factor);
     }
     let noise_j = prepared.noise_j;
     let (train, held) = split(&prepared.images);
@@ -318,6 +327,8 @@ fn is_held(k: usize) -> bool {
 }
 
 const FLASH_PASSES: usize = 3;
+/// Passes of dark levels and shape in turns: each is as exact as the other lets it be.
+const PATTERN_PASSES: usize = 3;
 /// Significance that light beyond the learned support keeps under the weights of a spot error, as in the estimator: well below an
 /// emitter's threshold.
 const LEFT: f64 = 2.0;
