@@ -58,8 +58,7 @@ impl Prepared {
     /// Takes more of the dark levels off, J.
     pub fn take_off(&mut self, dark_j: &Array2<f64>) {
         let pattern = self.pattern_j.get_or_insert_with(|| vec![0.0; dark_j.len()]);
-        let pixels = self.images.iter_mut().map(|image| &mut image.pixels);
-        pixels.for_each(|pixels| pixels.iter_mut().zip(dark_j).for_each(|(v, own)| *v -= own));
+        subtract(self.images.iter_mut().map(|image| &mut image.pixels), dark_j);
         pattern.iter_mut().zip(dark_j).for_each(|(v, own)| *v += own);
     }
 
@@ -117,16 +116,12 @@ pub fn prepare(camera: &Camera, frames: &[(usize, &Array2<f64>)]) -> Prepared {
     let mut middle = middle_image(&images);
     let light = |image: &Image| image.pixels.iter().map(|v| v - image.level).sum::<f64>() / image.pixels.len() as f64;
     let light_j = images.iter().map(light).sum::<f64>() / images.len() as f64;
-    let take_off = |images: &mut [Image], middle: &mut Vec<f64>, all: &[f64]| {
-        let pixels = images.iter_mut().map(|image| &mut image.pixels).chain([middle]);
-        pixels.for_each(|pixels| pixels.iter_mut().zip(all).for_each(|(v, own)| *v -= own));
-    };
     if let Some(stray) = stray_light::of(camera, &middle, noise_j, light_j) {
-        take_off(&mut images, &mut middle, &stray);
+        subtract(images.iter_mut().map(|i| &mut i.pixels).chain([&mut middle]), &stray);
     }
     let pattern_j = fixed_pattern::of(camera.x.n, &images, &middle, least_noise_j);
     if let Some(pattern) = &pattern_j {
-        take_off(&mut images, &mut middle, pattern);
+        subtract(images.iter_mut().map(|i| &mut i.pixels).chain([&mut middle]), pattern);
         noise_j = pixel_noise(&images);
     }
     // The standard deviation of a median is 1.25 σ/√T.
@@ -158,6 +153,13 @@ pub fn prepare(camera: &Camera, frames: &[(usize, &Array2<f64>)]) -> Prepared {
         hot,
         flashes,
     }
+}
+
+fn subtract<'a, 'b>(
+    images: impl Iterator<Item = &'a mut Vec<f64>>,
+    from_each: impl IntoIterator<Item = &'b f64> + Copy,
+) {
+    images.for_each(|pixels| pixels.iter_mut().zip(from_each).for_each(|(v, own)| *v -= own));
 }
 
 /// The largest value of all frames where pixels have it again and again, as no noise would.

@@ -99,17 +99,21 @@ impl SecondMomentTest {
     /// The mean of all frames, where they are enough.
     fn mean(&self) -> Option<Vector3<f64>> {
         let recent = self.recent.len() as u32;
-        let mut sum = self.blocks.sum;
-        sum.add(self.past.filling());
+        let mut sum = self.past_sum();
         self.recent.iter().for_each(|m| sum.add(m));
         let (mean, _) = (self.past.frames() + recent >= MIN_FRAMES_BEFORE).then(|| sum.solved())??;
         Some(mean)
     }
 
-    /// Everything before the newest frames of each window, where that is enough.
-    fn before(&self) -> [Option<MomentScore>; WINDOWS.len()] {
+    fn past_sum(&self) -> MomentScore {
         let mut sum = self.blocks.sum;
         sum.add(self.past.filling());
+        sum
+    }
+
+    /// Everything before the newest frames of each window, where that is enough.
+    fn before(&self) -> [Option<MomentScore>; WINDOWS.len()] {
+        let mut sum = self.past_sum();
         let mut frames = self.recent.iter();
         let mut before = [None; WINDOWS.len()];
         for (n, before) in WINDOWS.iter().zip(&mut before).rev() {
