@@ -294,7 +294,7 @@ impl FrameContext {
             let prior = is_fresh.then(|| sight.cov());
             self.bias.update(&residuals, prior, dt, period_s);
             let shared = self.bias.shared_offset(&residuals).filter(|_| is_fresh);
-            self.wander.update(shared, dt, period_s);
+            self.wander.update(shared, &self.course.cov(), dt, period_s);
         }
     }
 

@@ -3,7 +3,7 @@
 
 use std::collections::VecDeque;
 
-use nalgebra::{Matrix2x6, Vector2, Vector6};
+use nalgebra::{Matrix2x6, Matrix6, Vector2, Vector6};
 
 use super::bias::SharedOffset;
 use crate::monitor::stats::claim_consistency::share_after_averaging;
@@ -31,7 +31,7 @@ pub struct PoseWander {
     variance: f64,
     /// What the newest was, and when.
     earlier: VecDeque<(f64, Mean)>,
-    /// Mean square, per axis, of what the lasting error leaves of the newest, less the claims' own, m².
+    /// Mean square, per axis, of what the lasting error leaves of the newest, less the claims' own and that of the tracks' course, m².
     wandered: f64,
     known_s: f64,
     unknown_s: f64,
@@ -43,6 +43,8 @@ struct Mean {
     left: Vector2<f64>,
     error: Vector6<f64>,
     by_pose: Matrix2x6<f64>,
+    /// Variance per axis that tracks' common course explains, m².
+    by_course: f64,
 }
 
 impl Mean {
@@ -50,13 +52,14 @@ impl Mean {
         self.left += (next.left - self.left) * gain;
         self.error += (next.error - self.error) * gain;
         self.by_pose += (next.by_pose - self.by_pose) * gain;
+        self.by_course += (next.by_course - self.by_course) * gain;
     }
 }
 
 impl PoseWander {
     /// Takes the displacement that users share in a frame, `dt` seconds after the one before; each claims every `period_s`. None where
-    /// they cannot tell: after that for longer than the memory it begins anew.
-    pub fn update(&mut self, shared: Option<SharedOffset>, dt: f64, period_s: f64) {
+    /// they cannot tell: after that for longer than the memory it begins anew. `course` is the covariance of the tracks' common course.
+    pub fn update(&mut self, shared: Option<SharedOffset>, course: &Matrix6<f64>, dt: f64, period_s: f64) {
         let Some(SharedOffset {
             left,
             error,
@@ -73,7 +76,13 @@ impl PoseWander {
         self.unknown_s = 0.0;
         self.known_s += dt;
         let gain = (dt / self.known_s.min(NEWEST_S)).min(1.0);
-        self.newest.follow(&Mean { left, error, by_pose }, gain);
+        let seen = Mean {
+            left,
+            error,
+            by_pose,
+            by_course: 0.5 * (by_pose * course * by_pose.transpose()).trace(),
+        };
+        self.newest.follow(&seen, gain);
         self.variance = variance * share_after_averaging(NEWEST_S, period_s);
         let now = self.known_s;
         if self.earlier.back().is_none_or(|(at, _)| now - at >= STEP_S) {
@@ -81,7 +90,7 @@ impl PoseWander {
         }
         while let Some((at, was)) = self.earlier.front().filter(|(at, _)| now - at > MEMORY_S + AROUND_S) {
             if *at > LEARNED_S {
-                let wandered = 0.5 * was.left.norm_squared() - self.variance;
+                let wandered = 0.5 * was.left.norm_squared() - self.variance - was.by_course;
                 self.wandered += (wandered - self.wandered) * (STEP_S / (at - LEARNED_S).min(WANDER_S)).min(1.0);
             }
             self.earlier.pop_front();
@@ -127,6 +136,13 @@ impl PoseWander {
 mod tests {
     use super::*;
 
+    impl PoseWander {
+        /// Takes a tenth of a second, tracks that go straight, and claims once a second.
+        fn see(&mut self, shared: Option<SharedOffset>) {
+            self.update(shared, &Matrix6::zeros(), 0.1, 1.0);
+        }
+    }
+
     #[test]
     fn a_drag_is_a_change_and_a_lasting_error_is_none() {
         let shared = |x: f64| {
@@ -138,12 +154,12 @@ mod tests {
         };
         let mut wander = PoseWander::default();
         // Before the first frame no time has passed.
-        wander.update(shared(0.0), 0.0, 1.0);
+        wander.update(shared(0.0), &Matrix6::zeros(), 0.0, 1.0);
         let mut push = |x: f64, seconds: usize, speed: f64| {
             let mut at = x;
             for _ in 0..10 * seconds {
                 at += 0.1 * speed;
-                wander.update(shared(at), 0.1, 1.0);
+                wander.see(shared(at));
             }
             wander.change().x
         };
@@ -152,31 +168,35 @@ mod tests {
         assert!(push(8.0, 60, 0.0).abs() < 0.1);
         // 1 m/s: as many metres as seconds, less the two over which the newest are averaged.
         assert!((push(8.0, 6, 1.0) - 4.1).abs() < 0.1);
-        (0..50).for_each(|_| wander.update(None, 0.1, 1.0));
+        (0..50).for_each(|_| wander.see(None));
         assert!(wander.change().x > 4.0);
-        (0..60).for_each(|_| wander.update(None, 0.1, 1.0));
+        (0..60).for_each(|_| wander.see(None));
         assert_eq!(wander.change(), Vector2::zeros());
     }
 
     #[test]
     fn what_comes_and_goes_is_a_wander_and_what_claims_scatter_by_is_none() {
-        let swing = |amplitude: f64| {
+        let by_pose = Matrix2x6::from_fn(|row, column| f64::from(u8::from(column == 3 + row)));
+        let swing = |amplitude: f64, course: f64| {
             let mut wander = PoseWander::default();
             for k in 0..1800 {
                 let x = amplitude * (std::f64::consts::TAU * f64::from(k) / 300.0).sin();
                 let shared = SharedOffset {
                     left: Vector2::new(x, 0.0),
                     variance: 0.03,
+                    by_pose,
                     ..SharedOffset::default()
                 };
-                wander.update(Some(shared), 0.1, 1.0);
+                wander.update(Some(shared), &(Matrix6::identity() * course), 0.1, 1.0);
             }
             wander.wandered()
         };
         // A quarter of the amplitude's square per axis, a little less as the newest two seconds are averaged.
-        let found = swing(2.0);
+        let found = swing(2.0, 0.0);
         assert!((0.8..1.0).contains(&found), "{found}");
-        assert_eq!(swing(0.1), 0.0);
+        assert_eq!(swing(0.1, 0.0), 0.0);
+        // What the tracks' common course explains is stated already.
+        assert!((found - swing(2.0, 0.5) - 0.5).abs() < 1e-9);
     }
 
     #[test]
@@ -192,12 +212,12 @@ mod tests {
         let mut wander = PoseWander::default();
         for k in 0..900 {
             let x = 100.0 * (0.03 * f64::from(k)).sin();
-            wander.update(Some(seen_at(x, error)), 0.1, 1.0);
+            wander.see(Some(seen_at(x, error)));
             assert!(wander.change().norm() < 1e-9);
         }
         // One that turns by as much within five seconds does.
-        (0..200).for_each(|_| wander.update(Some(seen_at(100.0, error)), 0.1, 1.0));
-        (0..50).for_each(|_| wander.update(Some(seen_at(100.0, 2.0 * error)), 0.1, 1.0));
+        (0..200).for_each(|_| wander.see(Some(seen_at(100.0, error))));
+        (0..50).for_each(|_| wander.see(Some(seen_at(100.0, 2.0 * error))));
         assert!(wander.change().norm() > 1.0, "{}", wander.change());
     }
 }

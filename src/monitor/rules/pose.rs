@@ -159,7 +159,7 @@ mod tests {
                     variance: 0.03,
                     ..SharedOffset::default()
                 };
-                scene.wander.update(Some(shared), 0.1, 1.0);
+                scene.wander.update(Some(shared), &nalgebra::Matrix6::zeros(), 0.1, 1.0);
             }
             evaluate(scene.context())
         };
