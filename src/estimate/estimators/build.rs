@@ -7,7 +7,7 @@ use crate::estimate::estimators::list::{DEFAULT, Learned, Method, find};
 use crate::estimate::estimators::network::NetworkEstimator;
 use crate::estimate::estimators::pixel_correction::PixelCorrected;
 use crate::estimate::estimators::windowed::WindowedEstimator;
-use crate::estimate::sequence::{LensWatch, SequenceEstimator};
+use crate::estimate::sequence::{LensWatch, SensorWatch, SequenceEstimator};
 use crate::optics::Camera;
 
 /// Builds the configured estimator for a camera.
@@ -48,11 +48,15 @@ pub fn build(config: &Config, camera: &Camera) -> Result<Box<dyn Estimator>, Con
                 Method::Sequence => {
                     let rules = config.rules;
                     let together = SequenceEstimator::new(spec, single(), camera, config.memory_s(), rules);
-                    if rules.watch_lens && !WindowedEstimator::suits(camera, rules) {
+                    let watched: Box<dyn Estimator> = if rules.watch_lens && !WindowedEstimator::suits(camera, rules) {
                         let alone = AnalyticEstimator::new(find(DEFAULT)?, camera, None, rules);
                         Box::new(LensWatch::new(together, alone))
                     } else {
                         Box::new(together)
+                    };
+                    match rules.watch_sensor && camera.spot_shape.is_none() {
+                        true => Box::new(SensorWatch::new(watched, camera)),
+                        false => watched,
                     }
                 }
                 Method::MaximumLikelihood if WindowedEstimator::suits(camera, config.rules) => {
