@@ -22,7 +22,7 @@ pub struct Args {
     /// Seed of the first story; the others follow
     #[arg(long, value_name = "S", default_value_t = 1000)]
     seed: u64,
-    /// Of lens, lens-calibrated, lens-alerts: only the rows whose name begins so ("airy disc 300"); may be repeated
+    /// Of lens, lens-calibrated, lens-alerts, sensor-alerts: only the rows whose name begins so ("airy disc 300"); may be repeated
     #[arg(long, value_name = "ROW")]
     only: Vec<String>,
     /// Of honest-pixels to flights and the lens studies: the estimator

@@ -132,8 +132,8 @@ rules! {
     hide_dark,
     /// Frames through another lens than the configured one are answered one by one. Needed in `oapwatch study lens-alerts`.
     watch_lens,
-    /// A steady background is taken off and odd pixels are masked, through a lens whose spots are Gaussians. Needed where they are too faint for
-    /// one frame to show.
+    /// A steady background is taken off and odd pixels are masked, through a lens whose spots are Gaussians. Needed in
+    /// `oapwatch study sensor-alerts`.
     watch_sensor,
     }
 }

@@ -9,6 +9,7 @@ mod crowds;
 mod flights;
 mod formats;
 mod handover;
+mod honest_cameras;
 mod lamps;
 mod lens;
 mod light;
@@ -77,7 +78,8 @@ pub const ALL: &[Measurement] = &[
     measurement("calibration", 5, calibration::error_left),
     rows("lens", 40, lens::uncalibrated),
     rows("lens-calibrated", 40, lens::calibrated),
-    rows("lens-alerts", 30, lens::honest),
+    rows("lens-alerts", 30, honest_cameras::lenses),
+    rows("sensor-alerts", 30, honest_cameras::sensors),
     with("sequence", 8, sequence::frames_together),
     measurement("smear", 100, smear::smears),
     measurement("formats", 200, formats::cost),

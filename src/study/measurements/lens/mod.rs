@@ -1,6 +1,5 @@
 //! What the estimator makes of spots that are no Gaussians: without a calibration, and with one that was learned blind.
 
-mod alerts;
 pub mod bench;
 pub mod shapes;
 mod tally;
@@ -10,7 +9,6 @@ use std::time::Instant;
 use super::measured::{Measured, Say};
 use crate::estimate;
 use crate::optics::Camera;
-pub use alerts::honest;
 use bench::{Bench, Layout};
 use shapes::{LENSES, Lens};
 use tally::Tally;
@@ -77,7 +75,7 @@ fn rows(only: &[String]) -> impl Iterator<Item = (Lens, f64)> {
 }
 
 /// Whether the name begins with one of `only`, in whole words; true where there is none.
-fn is_named(name: &str, only: &[String]) -> bool {
+pub fn is_named(name: &str, only: &[String]) -> bool {
     let name = name.to_lowercase();
     let begins = |text: &String| {
         let rest = name.strip_prefix(&text.to_lowercase());

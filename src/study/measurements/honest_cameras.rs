@@ -1,8 +1,9 @@
-//! Honest users through a lens that the config does not describe: nobody is to be alerted.
+//! Honest users through a lens or on a sensor that the config does not describe: nobody is to be alerted.
 
 use rayon::prelude::*;
 
-use super::super::measured::{Measured, Say, exceptions};
+use super::lens::is_named;
+use super::measured::{Measured, Say, exceptions};
 use crate::estimate;
 use crate::study::stories::pixels::{PixelStory, RATE_HZ, review};
 
@@ -32,17 +33,63 @@ const SPOTS: [(&str, &str); 8] = [
 /// Seconds of a story.
 const HONEST_S: f64 = 120.0;
 
+/// What a sensor adds to all frames; the noise is 1e-6 J.
+const SENSORS: [(&str, &str); 7] = [
+    ("as the config says", ""),
+    (
+        "background of 0.1 of the noise",
+        "[effects.background]\nuniform_j = 1e-7",
+    ),
+    (
+        "background of 0.3 of the noise",
+        "[effects.background]\nuniform_j = 3e-7",
+    ),
+    (
+        "background of 1 to 3 of the noise",
+        "[effects.background]\nuniform_j = 2e-6\ngradient_j = [1e-6, 0.0]",
+    ),
+    (
+        "background of 20 of the noise",
+        "[effects.background]\nuniform_j = 2e-5",
+    ),
+    (
+        "one pixel in 800 hot by 4 of the noise",
+        "[effects.defects]\nhot = 0.00125\nhot_j = 4e-6",
+    ),
+    (
+        "one pixel in 800 hot by 15 of the noise",
+        "[effects.defects]\nhot = 0.00125\nhot_j = 1.5e-5",
+    ),
+];
+
 /// Four honest users through each lens, so many stories of two minutes: thirty make an hour.
-pub fn honest(stories: u64, seed: u64, only: &[String], estimator: &estimate::Config, say: Say) -> Measured {
+pub fn lenses(stories: u64, seed: u64, only: &[String], estimator: &estimate::Config, say: Say) -> Measured {
+    let table = |(name, spot): (&'static str, &str)| match spot {
+        "" => (name, String::new()),
+        _ => (name, format!("[effects.spot]\n{spot}\n")),
+    };
     say("| lens | honest frames | alerts |\n|---|---|---|");
+    through(SPOTS.map(table), stories, seed, only, estimator, say)
+}
+
+/// The same on each sensor.
+pub fn sensors(stories: u64, seed: u64, only: &[String], estimator: &estimate::Config, say: Say) -> Measured {
+    say("| sensor | honest frames | alerts |\n|---|---|---|");
+    let tables = SENSORS.map(|(name, table)| (name, format!("{table}\n")));
+    through(tables, stories, seed, only, estimator, say)
+}
+
+fn through(
+    effects: impl IntoIterator<Item = (&'static str, String)>,
+    stories: u64,
+    seed: u64,
+    only: &[String],
+    estimator: &estimate::Config,
+    say: Say,
+) -> Measured {
     let mut all = Vec::new();
-    for (name, spot) in SPOTS.into_iter().filter(|(name, _)| super::is_named(name, only)) {
+    for (name, table) in effects.into_iter().filter(|(name, _)| is_named(name, only)) {
         let tell = |k| {
-            let table = if spot.is_empty() {
-                String::new()
-            } else {
-                format!("[effects.spot]\n{spot}\n")
-            };
             let mut story = PixelStory::with(k, &table);
             story.seconds = HONEST_S;
             story.config.estimator = estimator.clone();
