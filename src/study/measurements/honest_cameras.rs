@@ -34,7 +34,7 @@ const SPOTS: [(&str, &str); 8] = [
 const HONEST_S: f64 = 120.0;
 
 /// What a sensor adds to all frames; the noise is 1e-6 J.
-const SENSORS: [(&str, &str); 7] = [
+const SENSORS: [(&str, &str); 9] = [
     ("as the config says", ""),
     (
         "background of 0.1 of the noise",
@@ -60,6 +60,11 @@ const SENSORS: [(&str, &str); 7] = [
         "one pixel in 800 hot by 15 of the noise",
         "[effects.defects]\nhot = 0.00125\nhot_j = 1.5e-5",
     ),
+    (
+        "dark levels that scatter by 0.3 of the noise",
+        "[effects.dark_current]\nenergy_j = 1e-6\nspread = 0.3",
+    ),
+    ("gains that scatter by 2 %", "[effects.gain]\nstd = 0.02"),
 ];
 
 /// Four honest users through each lens, so many stories of two minutes: thirty make an hour.
