@@ -4,6 +4,7 @@ use ndarray::Array2;
 
 use crate::optics::psf::pixel_fraction;
 use crate::optics::{Axis, Camera};
+use crate::stats::median;
 
 /// Frames over which light is summed. More find fainter pixels, fewer forget sooner what has passed. Not tuned.
 const FRAMES: f64 = 32.0;
@@ -15,6 +16,11 @@ const STAYS: f64 = 12.0;
 const ABOVE_NEIGHBOURS: f64 = 2.0;
 /// How much more a spot on a pixel's middle is than its light there, for spots and pixels to be told apart.
 const LEAST_SPREAD: f64 = 1.5;
+/// Median size of the pixels' light over that of noise from which on all of them are odd. Lower takes noise that is larger than configured for
+/// a pattern.
+const PATTERNED: f64 = 1.35;
+/// The median of |z|, z standard normal.
+const MEDIAN_OF_NOISE: f64 = 0.6745;
 /// Half the size of the comparison, σ.
 const REACH: f64 = 2.0;
 
@@ -23,6 +29,8 @@ pub(crate) struct OddPixels {
     /// In standard deviations of one frame's noise.
     light: Array2<f64>,
     frames: f64,
+    /// Variance of that sum where it is noise.
+    variance: f64,
     is_odd: Array2<bool>,
     count: usize,
     /// A spot on a pixel's middle along x and y, from there outwards.
@@ -41,6 +49,7 @@ impl OddPixels {
         Self {
             light: Array2::zeros(camera.shape()),
             frames: 0.0,
+            variance: 0.0,
             is_odd: Array2::default(camera.shape()),
             count: 0,
             profiles: [profile(&camera.x), profile(&camera.y)],
@@ -53,6 +62,13 @@ impl OddPixels {
 
     pub fn are_any(&self) -> bool {
         self.count > 0
+    }
+
+    /// Whether most dark pixels have a light of their own: to many frames together such a pattern is emitters, and no surface describes it.
+    pub fn are_all(&self, is_lit: &Array2<bool>) -> bool {
+        let dark = self.light.iter().zip(is_lit).filter(|(_, lit)| !**lit);
+        let middle = median(dark.map(|(light, _)| light.abs()).collect());
+        middle.is_some_and(|middle| middle > PATTERNED * MEDIAN_OF_NOISE * self.variance.sqrt())
     }
 
     /// These and the frame's own masked pixels.
@@ -68,6 +84,7 @@ impl OddPixels {
     pub fn learn(&mut self, values: &Array2<f64>) {
         let keep = 1.0 - 1.0 / FRAMES;
         self.frames = keep * self.frames + 1.0;
+        self.variance = keep * keep * self.variance + 1.0;
         self.light.zip_mut_with(values, |sum, v| {
             *sum = keep * *sum + if v.is_nan() { 0.0 } else { *v };
         });
@@ -154,6 +171,26 @@ mod tests {
         }
         let found = odd.pixels().indexed_iter().filter(|(_, odd)| **odd);
         found.map(|(at, _)| at).collect()
+    }
+
+    #[test]
+    fn a_pattern_of_all_pixels_is_told_from_noise() {
+        let mut rng = ChaCha8Rng::seed_from_u64(3);
+        let config = Config {
+            pixels: [PIXELS; 2],
+            ..Config::default()
+        };
+        let camera = config.camera().expect("a sound config");
+        let mut noise = || -> f64 { StandardNormal.sample(&mut rng) };
+        let shape = (PIXELS, PIXELS);
+        let pattern = Array2::from_shape_simple_fn(shape, &mut noise);
+        for (scatter, scale, expected) in [(0.0, 1.0, false), (0.0, 1.2, false), (0.2, 1.0, true)] {
+            let mut odd = OddPixels::new(&camera);
+            for _ in 0..100 {
+                odd.learn(&(Array2::from_shape_simple_fn(shape, &mut noise) * scale + &pattern * scatter));
+            }
+            assert_eq!(odd.are_all(&Array2::default(shape)), expected, "{scatter} {scale}");
+        }
     }
 
     #[test]

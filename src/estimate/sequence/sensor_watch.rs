@@ -69,7 +69,7 @@ impl SensorWatch {
     /// The frame without what is known; none where nothing is.
     fn cleaned(&self, frame: &Frame) -> Option<Frame> {
         let surface = self.background.known();
-        if surface.is_none() && !self.odd.are_any() {
+        if surface.is_none() && !self.odd.are_any() || surface.is_some() && self.odd.are_all(&self.is_lit) {
             return None;
         }
         let mut pixels = frame.pixels.clone();
