@@ -3,6 +3,7 @@
 use nalgebra::{Matrix6, Vector6};
 use ndarray::Array2;
 
+use crate::estimate::model::hypothesis::BACKGROUND_TERMS;
 use crate::stats::median;
 
 /// Frames over which it is averaged. More are more exact, fewer follow a cloud sooner. Not tuned.
@@ -18,9 +19,6 @@ const LEAST_DARK: f64 = 0.2;
 /// Standard deviations by which the mean square of what a surface leaves may exceed that of the differences between neighbours: the edge of a
 /// shadow does, and so does noise that the pixels of a row share.
 const SMOOTH: f64 = 6.0;
-
-/// Powers of x and y of each term.
-const TERMS: [(usize, usize); 6] = [(0, 0), (1, 0), (0, 1), (2, 0), (1, 1), (0, 2)];
 
 /// A second-order surface over the sensor, x and y from −1 to 1, in standard deviations of the noise.
 #[derive(Clone, Copy, Debug)]
@@ -114,7 +112,7 @@ impl SteadyBackground {
                     power *= y;
                 }
             }
-            for (k, (a, b)) in TERMS.iter().enumerate() {
+            for (k, [a, b]) in BACKGROUND_TERMS.iter().enumerate() {
                 vector[k] += of_values[*a] * y.powi(*b as i32);
             }
         }
@@ -122,7 +120,10 @@ impl SteadyBackground {
         if dark < LEAST_DARK * values.len() as f64 {
             return;
         }
-        let information = Matrix6::from_fn(|r, c| moments[TERMS[r].0 + TERMS[c].0][TERMS[r].1 + TERMS[c].1]);
+        let information = Matrix6::from_fn(|r, c| {
+            let [a, b] = [0, 1].map(|axis| BACKGROUND_TERMS[r][axis] + BACKGROUND_TERMS[c][axis]);
+            moments[a][b]
+        });
         let Some(factor) = information.cholesky() else { return };
         let change = factor.solve(&vector).dot(&vector);
         let noise = 0.5 * differences / f64::max(pairs, 1.0);
