@@ -2,8 +2,7 @@
 
 use rayon::prelude::*;
 
-use super::lens::is_named;
-use super::measured::{Measured, Say, exceptions};
+use super::measured::{Measured, Say, exceptions, is_named};
 use crate::estimate;
 use crate::study::stories::pixels::{PixelStory, RATE_HZ, review};
 

@@ -21,3 +21,13 @@ pub fn exceptions(stories: &[(u64, Raised)]) -> String {
     let line = |(seed, raised): &(u64, Raised)| format!("story {seed}: {raised:?}\n");
     stories.iter().map(line).collect()
 }
+
+/// Whether the name begins with one of `only`, in whole words; true where there is none.
+pub fn is_named(name: &str, only: &[String]) -> bool {
+    let name = name.to_lowercase();
+    let begins = |text: &String| {
+        let rest = name.strip_prefix(&text.to_lowercase());
+        rest.is_some_and(|rest| !rest.starts_with(char::is_alphanumeric))
+    };
+    only.is_empty() || only.iter().any(begins)
+}

@@ -6,7 +6,7 @@ mod tally;
 
 use std::time::Instant;
 
-use super::measured::{Measured, Say};
+use super::measured::{Measured, Say, is_named};
 use crate::estimate;
 use crate::optics::Camera;
 use bench::{Bench, Layout};
@@ -72,16 +72,6 @@ pub fn calibrated(frames: u64, seed: u64, only: &[String], estimator: &estimate:
 fn rows(only: &[String]) -> impl Iterator<Item = (Lens, f64)> {
     let all = LENSES.iter().flat_map(|lens| SNRS.map(|snr| (*lens, snr)));
     all.filter(move |(lens, snr)| is_named(&format!("{} {snr}", lens.name), only))
-}
-
-/// Whether the name begins with one of `only`, in whole words; true where there is none.
-pub fn is_named(name: &str, only: &[String]) -> bool {
-    let name = name.to_lowercase();
-    let begins = |text: &String| {
-        let rest = name.strip_prefix(&text.to_lowercase());
-        rest.is_some_and(|rest| !rest.starts_with(char::is_alphanumeric))
-    };
-    only.is_empty() || only.iter().any(begins)
 }
 
 /// The camera after `oapwatch calibrate`, and what that found; the camera as it is where that refused or found nothing better.
