@@ -1,6 +1,6 @@
 //! Pixels whose light is no spot's: hot ones, ones that flicker, and those of a line that is off.
 
-use ndarray::Array2;
+use ndarray::{Array2, ArrayView1};
 
 use crate::optics::psf::pixel_fraction;
 use crate::optics::{Axis, Camera};
@@ -12,6 +12,8 @@ const FRAMES: f64 = 32.0;
 /// million frames.
 const LEAST: f64 = 45.0;
 const STAYS: f64 = 12.0;
+/// How much more of the deviance a pixel or a line explains than a spot there: what noise adds to one of the two.
+const MARGIN: f64 = 12.0;
 /// How much brighter than its diagonal neighbours a pixel is that may be odd: saves the comparison with spots.
 const ABOVE_NEIGHBOURS: f64 = 2.0;
 /// How much more a spot on a pixel's middle is than its light there, for spots and pixels to be told apart.
@@ -21,13 +23,20 @@ const LEAST_SPREAD: f64 = 1.5;
 const PATTERNED: f64 = 1.35;
 /// The median of |z|, z standard normal.
 const MEDIAN_OF_NOISE: f64 = 0.6745;
-/// Half the size of the comparison, σ.
+/// Half the size of the comparison, and beyond which a spot has no light, σ.
 const REACH: f64 = 2.0;
+const LIT: f64 = 5.0;
+/// Share of what emitters explain of a pixel's light that may be missing where their spots are not quite as wide as they are taken to be.
+const MISFIT: f64 = 0.1;
 
 /// The light of each pixel, summed over frames, older ones fading.
 pub(crate) struct OddPixels {
     /// In standard deviations of one frame's noise.
     light: Array2<f64>,
+    /// What emitters explain of it.
+    explained: Array2<f64>,
+    /// All light of those found on a pixel or beside it: they may be its own.
+    beside: Array2<f64>,
     frames: f64,
     /// Variance of that sum where it is noise.
     variance: f64,
@@ -48,6 +57,8 @@ impl OddPixels {
         };
         Self {
             light: Array2::zeros(camera.shape()),
+            explained: Array2::zeros(camera.shape()),
+            beside: Array2::zeros(camera.shape()),
             frames: 0.0,
             variance: 0.0,
             is_odd: Array2::default(camera.shape()),
@@ -80,19 +91,23 @@ impl OddPixels {
         }
     }
 
-    /// Learns from a frame's pixels (ny, nx), in standard deviations of the noise, NaN where they are not usable.
-    pub fn learn(&mut self, values: &Array2<f64>) {
+    /// Learns from a frame's pixels (ny, nx), in standard deviations of the noise, NaN where they are not usable, and from where spots were
+    /// found in it, m, and their whole light.
+    pub fn learn(&mut self, values: &Array2<f64>, camera: &Camera, spots: impl Iterator<Item = ([f64; 2], f64)>) {
         let keep = 1.0 - 1.0 / FRAMES;
         self.frames = keep * self.frames + 1.0;
         self.variance = keep * keep * self.variance + 1.0;
         self.light.zip_mut_with(values, |sum, v| {
             *sum = keep * *sum + if v.is_nan() { 0.0 } else { *v };
         });
+        self.explained *= keep;
+        self.beside *= keep;
+        spots.for_each(|(at, light)| self.explain(values, camera, at, light));
         let [least, stays] = [LEAST, STAYS].map(|share| share * self.frames);
         for at in self.asked(least) {
             let was_odd = self.is_odd[at];
             let is_odd = match was_odd {
-                true => self.light[at].powi(2) > stays,
+                true => self.rest(at).powi(2) > stays,
                 false => self.is_no_spot(at),
             };
             self.is_odd[at] = is_odd;
@@ -101,19 +116,47 @@ impl OddPixels {
         }
     }
 
+    fn explain(&mut self, values: &Array2<f64>, camera: &Camera, at: [f64; 2], light: f64) {
+        let sigma = camera.spot_sigma_at(at);
+        let axes = [(&camera.x, at[0]), (&camera.y, at[1])];
+        let [(first_x, x), (first_y, y)] = axes.map(|(axis, at)| lit(axis, at, sigma));
+        for (row, share_y) in (first_y..).zip(&y) {
+            for (column, share_x) in (first_x..).zip(&x) {
+                if !values[(row, column)].is_nan() {
+                    self.explained[(row, column)] += light * share_x * share_y;
+                }
+            }
+        }
+        let [columns, rows] = axes.map(|(axis, at)| {
+            let at = (at - axis.min_m) / axis.pitch_m;
+            ((at - 1.5).ceil().max(0.0) as usize)..((at + 0.5).ceil().clamp(0.0, axis.n as f64) as usize)
+        });
+        for row in rows {
+            columns.clone().for_each(|column| self.beside[(row, column)] += light);
+        }
+    }
+
+    /// A pixel's light that no emitter explains.
+    fn rest(&self, at: (usize, usize)) -> f64 {
+        self.light[at] - self.explained[at]
+    }
+
     /// Odd pixels, and those of more light than noise has that are brighter than their diagonal neighbours.
     fn asked(&self, least: f64) -> Vec<(usize, usize)> {
         let (ny, nx) = self.light.dim();
+        let peak = self.profiles[0][0] * self.profiles[1][0];
         let mut asked = Vec::new();
         for y in 0..ny {
-            let (row, odd) = (self.light.row(y), self.is_odd.row(y));
-            let [above, below] = [y.saturating_sub(1), (y + 1).min(ny - 1)].map(|y| self.light.row(y));
+            let [above, below] = [y.saturating_sub(1), (y + 1).min(ny - 1)];
             for x in 0..nx {
                 let [left, right] = [x.saturating_sub(1), (x + 1).min(nx - 1)];
-                let diagonal = || above[left] + above[right] + below[left] + below[right];
-                let light = row[x];
-                let is_above = || 4.0 * light.abs() > ABOVE_NEIGHBOURS * f64::abs(diagonal());
-                if odd[x] || light * light > least && is_above() {
+                let diagonal = || -> f64 {
+                    let corners = [(above, left), (above, right), (below, left), (below, right)];
+                    corners.iter().map(|at| self.rest(*at)).sum()
+                };
+                let light = self.rest((y, x)) + self.beside[(y, x)] * peak;
+                let is_above = || 4.0 * light.abs() > ABOVE_NEIGHBOURS * diagonal().abs();
+                if self.is_odd[(y, x)] || light * light > least && is_above() {
                     asked.push((y, x));
                 }
             }
@@ -121,25 +164,45 @@ impl OddPixels {
         asked
     }
 
-    /// Whether a pixel's own light, or that of its row or column, explains more than a spot's there.
-    fn is_no_spot(&self, (y, x): (usize, usize)) -> bool {
+    /// Whether a pixel's own light, or what its row or column has, explains more than a spot's there. The light of emitters beside it may be
+    /// either; that of others is neither.
+    fn is_no_spot(&self, at: (usize, usize)) -> bool {
+        let (y, x) = at;
         let (ny, nx) = self.light.dim();
         let [along, across] = &self.profiles;
         let (mut fits, mut norm) = (0.0, 0.0);
         for row in (y + 1).saturating_sub(across.len())..(y + across.len()).min(ny) {
             for column in (x + 1).saturating_sub(along.len())..(x + along.len()).min(nx) {
                 let share = along[x.abs_diff(column)] * across[y.abs_diff(row)];
-                fits += share * self.light[(row, column)];
+                fits += share * self.rest((row, column));
                 norm += share * share;
             }
         }
-        let peak = along[0] * across[0];
-        let squared = |sum: f64, pixels: usize| sum * sum / pixels as f64;
-        let own = squared(self.light[(y, x)], 1)
-            .max(squared(self.light.row(y).sum(), nx))
-            .max(squared(self.light.column(x).sum(), ny));
-        norm > LEAST_SPREAD * peak * peak && own > fits * fits / norm
+        let (beside, peak) = (self.beside[at], along[0] * across[0]);
+        fits += beside * norm;
+        let others = (self.explained[at] - beside * peak).max(0.0);
+        let light = ((self.rest(at) + beside * peak).abs() - MISFIT * others).max(0.0);
+        let lines = [self.light.row(y), self.light.column(x)].map(light_of);
+        let own = light.powi(2).max(lines[0]).max(lines[1]);
+        norm > LEAST_SPREAD * peak * peak && own > fits * fits / norm + MARGIN * self.frames
     }
+}
+
+/// The first pixel of an axis that a spot at `at` lights, and its shares of this and the following ones.
+fn lit(axis: &Axis, at: f64, sigma: f64) -> (usize, Vec<f64>) {
+    let pixel = |v: f64| ((v - axis.min_m) / axis.pitch_m).clamp(0.0, axis.n as f64);
+    let first = pixel(at - LIT * sigma) as usize;
+    let share = |k: usize| pixel_fraction(axis.edge(k), axis.edge(k + 1), at, sigma);
+    let end = pixel(at + LIT * sigma).ceil() as usize;
+    (first, (first..end).map(share).collect())
+}
+
+/// The decrease of the deviance by what three quarters of a line's pixels have at least: spots on a line are not its own light.
+fn light_of(line: ArrayView1<f64>) -> f64 {
+    let mut sorted = line.to_vec();
+    sorted.sort_unstable_by(f64::total_cmp);
+    let [low, high] = [sorted.len() / 4, sorted.len() - 1 - sorted.len() / 4].map(|k| sorted[k]);
+    low.max(0.0).max(-high).powi(2) * sorted.len() as f64
 }
 
 #[cfg(test)]
@@ -154,20 +217,44 @@ mod tests {
     const PIXELS: usize = 40;
     const AT: (usize, usize) = (20, 12);
 
-    /// The pixels that are odd after so many frames in which `light(frame, y, x)` is added to noise.
-    fn odd(light: impl Fn(usize, usize, usize) -> f64, frames: usize) -> Vec<(usize, usize)> {
+    /// σ of a spot, pixels.
+    const SIGMA: f64 = 0.8;
+
+    fn camera() -> Camera {
         let config = Config {
             pixels: [PIXELS; 2],
-            spot_sigma_m: Some(1e-3),
+            sensor_size_m: [0.03; 2],
+            spot_sigma_m: Some(SIGMA * 0.03 / PIXELS as f64),
             ..Config::default()
         };
-        let mut odd = OddPixels::new(&config.camera().expect("a sound config"));
+        config.camera().expect("a sound config")
+    }
+
+    /// The pixels that are odd after so many frames in which `light(frame, y, x)` is added to noise.
+    fn odd(light: impl Fn(usize, usize, usize) -> f64, frames: usize) -> Vec<(usize, usize)> {
+        odd_beside(&[], light, frames)
+    }
+
+    /// The same where spots are found at these places (y, x), pixels, with this peak.
+    fn odd_beside(
+        spots: &[([f64; 2], f64)],
+        light: impl Fn(usize, usize, usize) -> f64,
+        frames: usize,
+    ) -> Vec<(usize, usize)> {
+        let camera = camera();
+        let mut odd = OddPixels::new(&camera);
+        let place = |axis: &Axis, at: f64| axis.min_m + (at + 0.5) * axis.pitch_m;
+        let whole = pixel_fraction(-0.5, 0.5, 0.0, SIGMA).powi(-2);
+        let found = spots
+            .iter()
+            .map(|([y, x], peak)| ([place(&camera.x, *x), place(&camera.y, *y)], peak * whole));
         let mut rng = ChaCha8Rng::seed_from_u64(2);
         for k in 0..frames {
-            odd.learn(&Array2::from_shape_fn((PIXELS, PIXELS), |(y, x)| {
+            let values = Array2::from_shape_fn((PIXELS, PIXELS), |(y, x)| {
                 let noise: f64 = StandardNormal.sample(&mut rng);
                 noise + light(k, y, x)
-            }));
+            });
+            odd.learn(&values, &camera, found.clone());
         }
         let found = odd.pixels().indexed_iter().filter(|(_, odd)| **odd);
         found.map(|(at, _)| at).collect()
@@ -176,21 +263,40 @@ mod tests {
     #[test]
     fn a_pattern_of_all_pixels_is_told_from_noise() {
         let mut rng = ChaCha8Rng::seed_from_u64(3);
-        let config = Config {
-            pixels: [PIXELS; 2],
-            ..Config::default()
-        };
-        let camera = config.camera().expect("a sound config");
         let mut noise = || -> f64 { StandardNormal.sample(&mut rng) };
         let shape = (PIXELS, PIXELS);
         let pattern = Array2::from_shape_simple_fn(shape, &mut noise);
         for (scatter, scale, expected) in [(0.0, 1.0, false), (0.0, 1.2, false), (0.2, 1.0, true)] {
-            let mut odd = OddPixels::new(&camera);
+            let mut odd = OddPixels::new(&camera());
             for _ in 0..100 {
-                odd.learn(&(Array2::from_shape_simple_fn(shape, &mut noise) * scale + &pattern * scatter));
+                let values = Array2::from_shape_simple_fn(shape, &mut noise) * scale + &pattern * scatter;
+                odd.learn(&values, &camera(), std::iter::empty());
             }
             assert_eq!(odd.are_all(&Array2::default(shape)), expected, "{scatter} {scale}");
         }
+    }
+
+    fn spot(y: usize, x: usize, [at_y, at_x]: [f64; 2], peak: f64) -> f64 {
+        let along = |k: usize, at: f64| pixel_fraction(k as f64 - 0.5, k as f64 + 0.5, at, SIGMA);
+        peak * along(y, at_y) * along(x, at_x) / along(0, 0.0).powi(2)
+    }
+
+    #[test]
+    fn what_is_beside_a_spot_is_told_from_it() {
+        let (user, away) = (([20.2, 15.3], 3000.0), 3);
+        let hot = (AT.0, 15 + away);
+        let with = |light: f64| {
+            move |_: usize, y: usize, x: usize| spot(y, x, user.0, user.1) + if (y, x) == hot { light } else { 0.0 }
+        };
+        assert_eq!(odd_beside(&[user], with(0.0), 100), []);
+        assert_eq!(odd_beside(&[user], with(15.0), 5), [hot]);
+        // The pixel was taken for an emitter.
+        let taken = ([hot.0 as f64, hot.1 as f64], 12.0);
+        assert_eq!(odd_beside(&[user, taken], with(15.0), 5), [hot]);
+        // An emitter is there, and its user's spot is wider than it is taken to be.
+        let two = |_: usize, y: usize, x: usize| 1.05 * spot(y, x, user.0, user.1) + spot(y, x, taken.0, 12.0);
+        assert_eq!(odd_beside(&[user, taken], two, 100), []);
+        assert_eq!(odd_beside(&[user], two, 100), []);
     }
 
     #[test]
@@ -206,14 +312,15 @@ mod tests {
         );
         assert_eq!(odd(|k, y, x| if k < 50 { 15.0 * is_there(y, x) } else { 0.0 }, 300), []);
         assert_eq!(odd(|_, _, x| if x == 7 { 5.0 } else { 0.0 }, 10).len(), PIXELS);
-        // σ is 1.3 pixels; a middle between pixels, and one on a pixel.
-        for middle in [20.0, 20.5] {
-            for peak in [1.0, 10.0, 1000.0] {
-                let spot = |y: usize, x: usize| {
-                    let away2 = (y as f64 - middle).powi(2) + (x as f64 - middle).powi(2);
-                    peak * (-0.5 * away2 / 1.33f64.powi(2)).exp()
+        // On a pixel, between two and between four; the faint one in a row with bright ones.
+        for [y, x] in [[20.0, 20.0], [20.0, 20.5], [20.5, 20.5]] {
+            for (peak, frames) in [(1.0, 400), (5.0, 400), (1000.0, 100)] {
+                let beside = |at_x: f64| move |row: usize, column: usize| spot(row, column, [y, at_x], 3000.0);
+                let light = |_: usize, row: usize, column: usize| {
+                    let bright: f64 = [6.0, 30.0, 34.0].map(|at_x| beside(at_x)(row, column)).iter().sum();
+                    bright + spot(row, column, [y, x], peak)
                 };
-                assert_eq!(odd(|_, y, x| spot(y, x), 100), [], "{middle} {peak}");
+                assert_eq!(odd(light, frames), [], "{y} {x} {peak}");
             }
         }
     }

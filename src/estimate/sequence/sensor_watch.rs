@@ -47,7 +47,7 @@ impl SensorWatch {
         }
     }
 
-    /// Takes a frame's values without the background that is known, and finds odd pixels among them.
+    /// Takes a frame's values without the background that is known.
     fn read(&mut self, frame: &Frame) {
         let scale = 1.0 / self.camera.noise_std_j;
         let ceiling = self.camera.saturation_limit_j();
@@ -63,7 +63,6 @@ impl SensorWatch {
             pixels.filter(|(_, masked)| **masked).for_each(|(v, _)| *v = f64::NAN);
         }
         self.background.follow(&mut self.values, &self.is_lit);
-        self.odd.learn(&self.values);
     }
 
     /// The frame without what is known; none where nothing is.
@@ -141,6 +140,12 @@ impl Estimator for SensorWatch {
         self.read(frame);
         let cleaned = self.cleaned(frame);
         let found = self.inner.estimate_until(cleaned.as_ref().unwrap_or(frame), is_over)?;
+        let scale = 1.0 / self.camera.noise_std_j;
+        let spots = found
+            .emitters
+            .iter()
+            .map(|emitter| (emitter.sensor_m, emitter.energy_j * scale));
+        self.odd.learn(&self.values, &self.camera, spots);
         self.learn_background(frame, &found);
         self.found = Some(found.clone());
         Ok(found)
