@@ -14,6 +14,8 @@ const WAVEFRONT_ROUNDS: usize = 30;
 const FIELD_ROUNDS: usize = 4;
 /// Degrees that are tried in turn while the held-out frames gain by them.
 const FIELD_DEGREES: [usize; 3] = [2, 3, 4];
+/// Support of what changes over the field, σ: aberrations that change widely are near the core.
+const FIELD_RADIUS: f64 = 7.0;
 /// Fall of χ², or of a score of it, that is more than chance.
 pub const BETTER: f64 = 30.0;
 /// Share of the light that a wavefront may leave unexplained for no other shape to be tried.
@@ -70,8 +72,7 @@ pub fn best<'a>(first: Learner<'a>, held: &[&Image], is_field_covered: bool, run
     let degrees = if is_field_covered { &FIELD_DEGREES[..] } else { &[] };
     for degree in degrees {
         let mut varied = Learner::with_model(best.camera, best.images, best.noise_j, &best.model, best.misfit);
-        let radius_m = varied.field_radius_m();
-        varied.model.vary(*degree, radius_m);
+        varied.model.vary(*degree, FIELD_RADIUS * best.camera.spot_sigma_m);
         run(&mut varied, FIELD_ROUNDS, "its change over the field");
         let (score, _) = on_held(&varied);
         if least - score < BETTER {

@@ -31,8 +31,6 @@ const WIDEST: f64 = 1.8;
 /// Light at the edge that matters: of the brightest spot, in standard deviations of one pixel. The tails of five spots at this height add
 /// up to a quarter of an emitter's threshold, by estimate; more leaves them to the spot error, less takes longer. Not measured.
 const EDGE_LIGHT: f64 = 0.1;
-/// Support of what changes over the field, σ: aberrations that change widely are near the core.
-const FIELD_RADIUS: f64 = 7.0;
 /// Relative fall of χ² per degree of freedom below which there are no more rounds.
 const SETTLED: f64 = 1e-3;
 /// Least matched signal-to-noise ratio of a source that a patch is used for.
@@ -314,7 +312,7 @@ impl<'a> Learner<'a> {
     }
 
     /// One step of the template and of everything else at once.
-    fn step(&mut self, is_first: bool) {
+    pub fn step(&mut self, is_first: bool) {
         match self.model.pupil {
             Some(pupil) => {
                 if let Some(model) = wavefront::step(self.camera, &self.model, pupil, &self.patches) {
@@ -374,24 +372,25 @@ impl<'a> Learner<'a> {
         }
     }
 
-    /// Half the support of what changes over the field, m.
-    pub fn field_radius_m(&self) -> f64 {
-        FIELD_RADIUS * self.camera.spot_sigma_m
-    }
-
     /// The same spots on the same pixels, fitted with another model of the same support.
     pub fn refitted(&self, model: TemplateModel) -> Self {
-        let mut other = Self {
-            model,
-            patches: self.patches.clone(),
-            filter: MatchedFilter::new(self.camera),
-            ..*self
-        };
+        let mut other = self.of_patches(self.patches.clone());
+        other.model = model;
         let (camera, model) = (other.camera, &other.model);
         other
             .patches
             .par_iter_mut()
             .for_each(|patch| patch.fit(camera, model, 15));
         other
+    }
+
+    /// The same images with other patches of them.
+    pub fn of_patches(&self, patches: Vec<Patch>) -> Self {
+        Self {
+            model: self.model.clone(),
+            patches,
+            filter: MatchedFilter::new(self.camera),
+            ..*self
+        }
     }
 }

@@ -6,6 +6,7 @@ mod checks;
 mod constraints;
 mod coverage;
 mod detection;
+mod elsewhere;
 mod error;
 mod fixed_pattern;
 mod flashes;
@@ -260,6 +261,7 @@ pub fn learn(
     }));
     let spot_error = variance
         .spot_error
+        .max(elsewhere::spot_error(&last, &variance))
         .max(1.0 / information)
         .max(if is_shape_better { 0.0 } else { left_out })
         .min(Camera::LARGEST_SPOT_ERROR);

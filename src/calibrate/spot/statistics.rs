@@ -36,11 +36,13 @@ struct Pixel {
     halo2: f64,
     /// Of the nearest spot, σ.
     distance: f64,
+    /// Whether that spot is one of those judged.
+    is_judged: bool,
 }
 
 /// Regresses r² = σ² + g·E + (s·H)², H = E·‖spot‖/(1 + (d/3σ)²) over the pixels in use, each less what the spots' own parameters absorb.
 pub fn variance(learner: &Learner) -> Variance {
-    let pixels = pixels(learner);
+    let pixels = pixels(learner, |_, _| true);
     let noise2 = learner.noise_j.powi(2);
     let typical: f64 = pixels
         .iter()
@@ -87,6 +89,17 @@ pub fn variance(learner: &Learner) -> Variance {
     }
 }
 
+/// The spot error of the spots of frames and places that `is_judged` says, where the variance is known.
+pub fn spot_error_at(learner: &Learner, variance: &Variance, is_judged: impl Fn(usize, [f64; 2]) -> bool) -> f64 {
+    let mut pixels = pixels(learner, is_judged);
+    pixels.retain(|p| p.is_judged);
+    spot_error(
+        &pixels,
+        variance.read_noise_j.powi(2),
+        variance.quantum_j.unwrap_or(0.0),
+    )
+}
+
 /// Largest over the rings of √(excess of r² over the noise / H²), where it is significant.
 fn spot_error(pixels: &[Pixel], read2: f64, gain: f64) -> f64 {
     let rings = RINGS.windows(2).map(|ring| {
@@ -110,7 +123,7 @@ fn spot_error(pixels: &[Pixel], read2: f64, gain: f64) -> f64 {
     rings.fold(0.0, f64::max)
 }
 
-fn pixels(learner: &Learner) -> Vec<Pixel> {
+fn pixels(learner: &Learner, is_judged: impl Fn(usize, [f64; 2]) -> bool) -> Vec<Pixel> {
     let camera = learner.camera;
     let sigma = sigma_equivalent_m(camera, &learner.model);
     let norm = norm(camera, &learner.model);
@@ -120,15 +133,17 @@ fn pixels(learner: &Learner) -> Vec<Pixel> {
             continue;
         };
         let expected = patch.expected(camera, &learner.model);
-        let (causes, distances): (Vec<[f64; 3]>, Vec<f64>) = (expected.iter().enumerate())
+        let (causes, nearest): (Vec<[f64; 3]>, Vec<(f64, bool)>) = (expected.iter().enumerate())
             .map(|(k, e)| {
                 let x = camera.x.centre(patch.x.start + k % patch.x.len());
                 let y = camera.y.centre(patch.y.start + k / patch.x.len());
-                let (mut halo, mut nearest) = (0.0, f64::INFINITY);
+                let (mut halo, mut nearest) = (0.0, (f64::INFINITY, false));
                 for s in &patch.sources {
                     let d = (s.at[0] - x).hypot(s.at[1] - y) / sigma;
                     halo += s.energy_j * norm / (1.0 + (d / HALO).powi(2));
-                    nearest = nearest.min(d);
+                    if d < nearest.0 {
+                        nearest = (d, is_judged(patch.frame, s.at));
+                    }
                 }
                 ([1.0, (e - patch.background).max(0.0), halo * halo], nearest)
             })
@@ -140,7 +155,8 @@ fn pixels(learner: &Learner) -> Vec<Pixel> {
                 read,
                 light,
                 halo2,
-                distance: distances[k],
+                distance: nearest[k].0,
+                is_judged: nearest[k].1,
             });
         }
     }

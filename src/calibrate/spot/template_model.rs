@@ -45,6 +45,11 @@ impl TemplateModel {
         }
     }
 
+    /// Whether the shape may change over the field.
+    pub fn varies(&self) -> bool {
+        self.pupil.map_or(self.degree > 0, |pupil| pupil.varies)
+    }
+
     /// The spot that a camera assumes, its own shape or a Gaussian, on the knots of another model.
     pub fn of_camera(camera: &Camera, like: &Self) -> Self {
         let at = |sensor_m: [f64; 2]| {
