@@ -19,6 +19,7 @@ pub mod logging;
 pub mod metric;
 pub mod optics;
 pub mod pose;
+pub mod small_file;
 pub mod stats;
 pub mod supervisor;
 pub mod time;

@@ -4,6 +4,8 @@ use std::fmt::Debug;
 use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 
+use crate::small_file;
+
 /// Why a TOML file cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
@@ -32,7 +34,7 @@ impl std::fmt::Display for Nearest {
 
 /// Reads a TOML file into `T`, naming line, column and, for an unknown key, the nearest known one.
 pub fn read<T: serde::de::DeserializeOwned>(path: &Path) -> Result<T, Error> {
-    let text = std::fs::read_to_string(path).map_err(|source| Error::Unreadable {
+    let text = small_file::read(path).map_err(|source| Error::Unreadable {
         path: path.to_owned(),
         source,
     })?;

@@ -6,6 +6,7 @@ use std::path::Path;
 
 /// Modules from the lowest up: each imports only from those before it.
 const LAYERS: &[&str] = &[
+    "small_file",
     "toml_file",
     "hash",
     "stats",

@@ -10,6 +10,7 @@ use subtle::ConstantTimeEq;
 use tokio::sync::watch;
 
 use super::config::Config;
+use crate::small_file;
 
 /// A shorter token can be guessed within the request limit; it is refused.
 const SHORTEST_TOKEN: usize = 6;
@@ -124,7 +125,7 @@ impl TokenFile {
 
     /// At the start a file must be there and every line must be right.
     fn load(&mut self) -> Result<(), TokenError> {
-        let text = std::fs::read_to_string(&self.path).map_err(|source| TokenError::Unreadable {
+        let text = small_file::read(&self.path).map_err(|source| TokenError::Unreadable {
             field: self.field,
             path: self.path.clone(),
             source,
@@ -163,7 +164,7 @@ impl TokenFile {
     fn reload(&mut self) -> Vec<TokenError> {
         let (field, path) = (self.field, self.path.clone());
         let unreadable = |source| TokenError::Unreadable { field, path, source };
-        match std::fs::read_to_string(&self.path) {
+        match small_file::read(&self.path) {
             Ok(text) => {
                 let (tokens, wrong) = self.parse(&text);
                 self.replace(tokens);

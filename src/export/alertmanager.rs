@@ -18,6 +18,7 @@ use super::updates::{Context, RESEND, Updates};
 use super::words::{sentence, title, word};
 use crate::monitor::{Alert, AlertEventKind, AlertKind, Severity};
 use crate::notify::{Channel, Failure, Message, Verdict, is_loopback, judge};
+use crate::small_file;
 
 /// An open alert that is not sent again for this long is over, as far as Alertmanager knows: four times what one lost request costs, as in
 /// Prometheus.
@@ -179,7 +180,7 @@ fn bearer(path: &Path) -> Result<HeaderValue, String> {
             path.display()
         )
     };
-    let text = std::fs::read_to_string(path).map_err(|e| wrong(e.to_string()))?;
+    let text = small_file::read(path).map_err(|e| wrong(e.to_string()))?;
     let token = text.trim();
     if token.is_empty() || token.lines().count() > 1 {
         return Err(wrong(format!("{} lines", token.lines().count())));

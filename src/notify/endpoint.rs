@@ -13,6 +13,7 @@ use super::signature::Signer;
 use super::{Config, http};
 use crate::journal::Subscription;
 use crate::monitor::AlertKind;
+use crate::small_file;
 
 /// A receiver that alert events can be sent to: a `[[webhook]]` or an `[[export]]`.
 #[derive(Debug)]
@@ -154,7 +155,7 @@ fn read_secrets(index: usize, config: &Config) -> Result<Signer, Error> {
         path: path.clone(),
         cause,
     };
-    let text = std::fs::read_to_string(path).map_err(unreadable)?;
+    let text = small_file::read(path).map_err(unreadable)?;
     let signer = Signer::parse(&text).map_err(|(line, cause)| Error::Secret {
         index,
         path: path.clone(),
