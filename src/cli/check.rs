@@ -10,7 +10,7 @@ use crate::config::Config;
 use crate::notify::Endpoint;
 use crate::pipeline::Pipeline;
 use crate::scene::{Plan, Scene};
-use crate::{api, export, frames, hub, notify, toml_file};
+use crate::{api, export, fleet, frames, hub, notify, toml_file};
 
 /// Keys of a scene that no config has.
 const OF_SCENES: [&str; 7] = [
@@ -167,7 +167,7 @@ fn hub_config(config: &Config, receivers: Vec<Endpoint>) -> Result<Checked, Fail
 }
 
 fn station_config(config: &Config, receivers: Vec<Endpoint>) -> Result<Checked, Failure> {
-    config.fleet.station().map_err(Failure::config)?;
+    fleet::Station::new(&config.fleet).map_err(Failure::config)?;
     let camera = config.camera().map_err(Failure::config)?;
     let pipeline = Pipeline::new(config, &camera).map_err(Failure::config)?;
     frames::open(&config.source, &camera).map_err(Failure::config)?;

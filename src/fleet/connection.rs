@@ -1,15 +1,19 @@
 //! The connection to the NATS server and the stream that keeps alerts.
 
-use std::path::Path;
+use std::num::NonZeroU32;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::Duration;
 
 use async_nats::jetstream::stream;
-use async_nats::{Client, ConnectOptions, jetstream};
+use async_nats::{Client, ConnectOptions, Event, jetstream};
+use governor::{DefaultDirectRateLimiter, Quota, RateLimiter};
 use metrics::counter;
+use nkeys::KeyPair;
 
-use super::config::Config;
+use super::config::{Config, ConfigError};
 use super::subject::{Subject, Topic};
-use crate::metric;
+use crate::{metric, small_file};
 
 /// The stream of all alerts.
 const STREAM: &str = "OAPWATCH";
@@ -29,14 +33,26 @@ pub const CAPACITY: usize = 1 << 16;
 /// Longest wait between two attempts to connect.
 const SLOWEST_RETRY: Duration = Duration::from_secs(5);
 
+/// Messages of the server's refusals that are logged: a burst, then one a minute.
+const REFUSALS: Quota = Quota::per_minute(NonZeroU32::MIN).allow_burst(NonZeroU32::new(3).expect("some"));
+
 /// Why there is no connection.
 #[derive(Debug, thiserror::Error)]
 pub enum Error {
+    #[error(transparent)]
+    Config(#[from] ConfigError),
     #[error("fleet.{key}: {path}: {source}")]
     File {
         key: &'static str,
-        path: std::path::PathBuf,
+        path: PathBuf,
         source: std::io::Error,
+    },
+    #[error("fleet.{key}: {path}: expected {expected}, found: {found}")]
+    Proof {
+        key: &'static str,
+        path: PathBuf,
+        expected: &'static str,
+        found: String,
     },
     #[error("fleet.url: {0}")]
     Connect(#[from] async_nats::ConnectError),
@@ -44,56 +60,97 @@ pub enum Error {
     Stream(String),
 }
 
-/// Connects in the background, for ever: the client is usable at once, and a link that is lost is taken up again. Answers come to
-/// subjects below `_INBOX.<name>`, so that the server can keep those of others from us. Of each subscription `capacity` messages wait
-/// at most.
-pub async fn connect(config: &Config, name: String, capacity: usize) -> Result<Client, Error> {
-    let unreadable = |key: &'static str, path: &Path| {
-        let path = path.to_owned();
-        move |source| Error::File { key, path, source }
-    };
-    let mut options = ConnectOptions::new()
-        .custom_inbox_prefix(format!("_INBOX.{name}"))
-        .name(name)
-        .retry_on_initial_connect()
-        .subscription_capacity(capacity)
-        .ping_interval(PING)
-        .reconnect_delay_callback(|attempts| {
-            let attempts = u32::try_from(attempts).unwrap_or(u32::MAX);
-            Duration::from_millis(100)
-                .saturating_mul(2u32.saturating_pow(attempts.min(10)))
-                .min(SLOWEST_RETRY)
+/// The server, and what proves who we are to it: the files that the config names have been read.
+#[derive(Clone)]
+pub struct Access {
+    url: String,
+    options: ConnectOptions,
+}
+
+impl Access {
+    pub fn read(config: &Config) -> Result<Self, Error> {
+        let mut options = ConnectOptions::new();
+        if let Some(path) = &config.credentials_file {
+            let key = "credentials_file";
+            options = options.credentials(&read(key, path)?).map_err(|error| Error::Proof {
+                key,
+                path: path.clone(),
+                expected: "a user's credentials as `nsc` writes them",
+                found: error.to_string(),
+            })?;
+        }
+        if let Some(path) = &config.nkey_file {
+            let key = "nkey_file";
+            let seed = read(key, path)?.trim().to_owned();
+            KeyPair::from_seed(&seed).map_err(|error| Error::Proof {
+                key,
+                path: path.clone(),
+                expected: "a seed as `oapwatch nkey` writes it",
+                found: error.to_string(),
+            })?;
+            options = options.nkey(seed);
+        }
+        if let Some(path) = &config.ca_file {
+            read("ca_file", path)?;
+            options = options.add_root_certificates(path.clone()).require_tls(true);
+        }
+        Ok(Self {
+            url: config.url.clone().unwrap_or_default(),
+            options,
         })
-        .event_callback(|event| async move {
-            match event {
-                async_nats::Event::Connected => tracing::info!("connected to the NATS server"),
-                async_nats::Event::Disconnected => {
-                    tracing::warn!("the NATS server is gone; alerts wait in the journal")
-                }
-                async_nats::Event::SlowConsumer(_) => {
-                    counter!(metric::FLEET_MESSAGES, "topic" => "heard", "outcome" => "dropped").increment(1);
-                }
-                // Such as a subject that the server's config leaves to another station.
-                async_nats::Event::ServerError(error) => tracing::warn!(%error, "the NATS server refuses"),
-                other => tracing::debug!(%other, "NATS"),
+    }
+
+    /// Connects in the background, for ever: the client is usable at once, and a link that is lost is taken up again. Answers come to
+    /// subjects below `_INBOX.<name>`, so that the server can keep those of others from us. Of each subscription `capacity` messages wait
+    /// at most.
+    pub async fn connect(&self, name: String, capacity: usize) -> Result<Client, Error> {
+        let refusals: Arc<DefaultDirectRateLimiter> = Arc::new(RateLimiter::direct(REFUSALS));
+        let url = self.url.clone();
+        let options = self.options.clone();
+        let options = options
+            .custom_inbox_prefix(format!("_INBOX.{name}"))
+            .name(name)
+            .retry_on_initial_connect()
+            .subscription_capacity(capacity)
+            .ping_interval(PING)
+            .reconnect_delay_callback(|attempts| {
+                let attempts = u32::try_from(attempts).unwrap_or(u32::MAX);
+                Duration::from_millis(100)
+                    .saturating_mul(2u32.saturating_pow(attempts.min(10)))
+                    .min(SLOWEST_RETRY)
+            })
+            .event_callback(move |event| {
+                say(&event, &url, &refusals);
+                std::future::ready(())
+            });
+        Ok(options.connect(&self.url).await?)
+    }
+}
+
+fn read(key: &'static str, path: &Path) -> Result<String, Error> {
+    small_file::read(path).map_err(|source| Error::File {
+        key,
+        path: path.to_owned(),
+        source,
+    })
+}
+
+fn say(event: &Event, url: &str, refusals: &DefaultDirectRateLimiter) {
+    match event {
+        Event::Connected => tracing::info!(url, "connected to the NATS server"),
+        Event::Disconnected => tracing::warn!(url, "the NATS server is gone; alerts wait in the journal"),
+        Event::SlowConsumer(_) => {
+            counter!(metric::FLEET_MESSAGES, "topic" => "heard", "outcome" => "dropped").increment(1);
+        }
+        // Such as a subject that the server's config leaves to another station: one for each message.
+        Event::ServerError(error) => {
+            counter!(metric::FLEET_MESSAGES, "topic" => "any", "outcome" => "refused").increment(1);
+            if refusals.check().is_ok() {
+                tracing::warn!(url, %error, "the NATS server refuses (told once a minute): does it know the key of this site and station?");
             }
-        });
-    if let Some(path) = &config.credentials_file {
-        options = options
-            .credentials_file(path)
-            .await
-            .map_err(unreadable("credentials_file", path))?;
+        }
+        other => tracing::debug!(url, %other, "NATS"),
     }
-    if let Some(path) = &config.nkey_file {
-        let seed = std::fs::read_to_string(path).map_err(unreadable("nkey_file", path))?;
-        options = options.nkey(seed.trim().to_owned());
-    }
-    if let Some(path) = &config.ca_file {
-        std::fs::metadata(path).map_err(unreadable("ca_file", path))?;
-        options = options.add_root_certificates(path.clone()).require_tls(true);
-    }
-    let url = config.url.as_deref().unwrap_or_default();
-    Ok(options.connect(url).await?)
 }
 
 /// The stream of alerts, made where it is missing and may be made.

@@ -1,7 +1,8 @@
 //! What stations publish, as JSON. A reader refuses other versions.
 
 use jiff::Timestamp;
-use serde::{Deserialize, Serialize};
+use serde::de::Error as _;
+use serde::{Deserialize, Deserializer, Serialize};
 
 use crate::api::PoseStatus;
 use crate::claim::Claim;
@@ -20,11 +21,24 @@ pub struct AlertMessage {
     /// The station's journal; a station that starts with a new one begins to count anew.
     pub journal: String,
     /// Grows with every event of this journal.
+    #[serde(deserialize_with = "sequence_number")]
     pub seq: u64,
     /// When it happened, on the frames' clock.
     pub at: Timestamp,
     #[serde(flatten)]
     pub event: AlertEvent,
+}
+
+/// One that a journal can hold: the hub's would refuse others, and all that comes with them.
+fn sequence_number<'de, D: Deserializer<'de>>(input: D) -> Result<u64, D::Error> {
+    let seq = u64::deserialize(input)?;
+    match i64::try_from(seq) {
+        Ok(_) => Ok(seq),
+        Err(_) => Err(D::Error::custom(format_args!(
+            "expected at most {}, found {seq}",
+            i64::MAX
+        ))),
+    }
 }
 
 /// Of topic `positions`: the newest frame, or one of the newest where frames come faster than they are published.

@@ -14,6 +14,6 @@ mod subject;
 
 pub use claims::Intake;
 pub use config::{Config, ConfigError};
-pub use connection::{CAPACITY, Error, connect, ensure_stream};
+pub use connection::{Access, CAPACITY, Error, ensure_stream};
 pub use station::{ENDPOINT, Station};
 pub use subject::{Subject, Topic};

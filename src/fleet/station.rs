@@ -11,8 +11,8 @@ use tokio::time::MissedTickBehavior;
 
 use super::claimed_height::at_claimed_height;
 use super::claims::{self, Intake};
-use super::config::{Config, ConfigError};
-use super::connection::{self, Error};
+use super::config::Config;
+use super::connection::{self, Access, Error};
 use super::message::{AlertMessage, HealthMessage, PoseMessage, PositionsMessage, VERSION};
 use super::subject::{Subject, Topic};
 use crate::api::{Feed, Published};
@@ -36,15 +36,17 @@ const SLOWEST_RETRY: Duration = Duration::from_secs(5);
 pub struct Station {
     name: StationName,
     config: Config,
+    access: Access,
 }
 
 impl Station {
     /// `None` where nothing is to be published.
-    pub fn new(config: &Config) -> Result<Option<Self>, ConfigError> {
-        let station = config.station()?;
-        Ok(station.map(|name| Self {
+    pub fn new(config: &Config) -> Result<Option<Self>, Error> {
+        let Some(name) = config.station()? else { return Ok(None) };
+        Ok(Some(Self {
             name,
             config: config.clone(),
+            access: Access::read(config)?,
         }))
     }
 
@@ -66,7 +68,7 @@ impl Station {
         intake: Option<Intake>,
         shutdown: impl Future<Output = ()>,
     ) -> Result<(), Error> {
-        let client = connection::connect(&self.config, self.name.to_string(), connection::CAPACITY).await?;
+        let client = self.access.connect(self.name.to_string(), connection::CAPACITY).await?;
         tokio::select! {
             () = shutdown => {}
             () = self.alerts(&client, &journal) => {}
@@ -81,7 +83,7 @@ impl Station {
     async fn claims(&self, intake: Option<Intake>) -> Result<(), Error> {
         if let Some((subject, intake)) = self.config.claims_subject.as_deref().zip(intake) {
             let name = format!("{}.claims", self.name);
-            let client = connection::connect(&self.config, name, claims::CAPACITY).await?;
+            let client = self.access.connect(name, claims::CAPACITY).await?;
             claims::receive(&client, subject, &intake).await;
         }
         std::future::pending().await

@@ -34,16 +34,17 @@ use run::Run;
 /// Requests that wait for the hub; further ones are answered 503.
 const COMMANDS: usize = 64;
 
-/// Checks that a config is a hub's; its files are not opened.
-pub fn validate(config: &Config) -> Result<()> {
+/// Checks that a config is a hub's, and reads what proves that to the server; its other files are not opened.
+pub fn validate(config: &Config) -> Result<fleet::Access> {
     config.fleet.validate_hub()?;
     config.journal.validate()?;
-    Ok(())
+    Ok(fleet::Access::read(&config.fleet)?)
 }
 
 /// A hub whose config has been checked and whose files have been opened; no port is bound yet.
 pub struct Hub {
     config: Config,
+    access: fleet::Access,
     server: api::Server,
     background: Option<api::Background>,
     endpoints: Vec<notify::Endpoint>,
@@ -55,7 +56,7 @@ pub struct Hub {
 impl Hub {
     /// Checks and opens everything a config names.
     pub fn new(config: Config) -> Result<Self> {
-        validate(&config)?;
+        let access = validate(&config)?;
         let recorder = metric::recorder()?;
         let metrics = recorder.handle();
         // A second daemon in one process (a test) counts into the first one's recorder.
@@ -70,6 +71,7 @@ impl Hub {
         let journal = Journal::open(&config.journal, subscriptions)?;
         Ok(Self {
             config,
+            access,
             server,
             background,
             endpoints,
@@ -84,7 +86,7 @@ impl Hub {
     pub async fn run(self, _logging: logging::Handle) -> Result<()> {
         let listen = &self.config.api.listen;
         let listener = api::Listener::bind(listen).with_context(|| format!("api.listen: cannot listen on {listen}"))?;
-        let client = fleet::connect(&self.config.fleet, "hub".to_owned(), fleet::CAPACITY).await?;
+        let client = self.access.connect("hub".to_owned(), fleet::CAPACITY).await?;
         let started_at = Timestamp::now();
         let (stop, stopped) = watch::channel(false);
         let stops = || {
