@@ -35,7 +35,7 @@ use disk::Disk;
 use outbox::Subscriptions;
 use retention::Retention;
 use store::{Store, Write};
-use writer::{Link, Shared, Writer, lock};
+use writer::{Link, Overlay, Shared, Writer, lock};
 
 pub use audit::{AuditAction, AuditEntry, AuditRecord};
 pub use config::{Config, ConfigError};
@@ -109,7 +109,7 @@ impl Journal {
                     disk = Some(store);
                     health.working(health::size(path), 0);
                 }
-                Err(Error::Unusable { source, path }) if error::is_passing(&source) => {
+                Err(Error::Unusable { source, path }) if error::is_passing(&source) || is_read_only(&path) => {
                     tracing::error!(path = %path.display(), error = %source, "the journal cannot be written; alerts are held in memory");
                     if let Ok(known) = Store::open_readable(&path).and_then(|store| store.identity()) {
                         identity = known;
@@ -120,6 +120,10 @@ impl Journal {
             }
         }
         let (id, last_seq) = identity;
+        let overlay = Overlay {
+            store: overlay,
+            since: disk.is_none().then_some(last_seq),
+        };
         let retention = Retention::new(config);
         let shared = Arc::new(Shared::new(
             config.path.clone(),
@@ -291,11 +295,10 @@ fn thread(name: &str, config: &Config, run: impl FnOnce() + Send + 'static) -> R
 
 /// Locks the journal for this process. On a disk where no lock file can be made, no other process can write either.
 fn claim_file(path: &Path) -> Result<Option<File>, Error> {
-    let mut name = path.as_os_str().to_owned();
-    name.push(".lock");
+    let name = schema::beside(path, ".lock");
     let mut options = OpenOptions::new();
     options.create(true).truncate(false).write(true).mode(schema::PRIVATE);
-    let Ok(file) = options.open(&name) else {
+    let Ok(file) = options.open(name) else {
         return Ok(None);
     };
     match file.try_lock() {
@@ -306,4 +309,9 @@ fn claim_file(path: &Path) -> Result<Option<File>, Error> {
             Ok(None)
         }
     }
+}
+
+fn is_read_only(path: &Path) -> bool {
+    let opened = OpenOptions::new().append(true).open(path);
+    opened.is_err_and(|e| e.kind() == std::io::ErrorKind::ReadOnlyFilesystem)
 }

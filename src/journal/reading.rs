@@ -2,6 +2,7 @@
 
 use std::collections::{BTreeMap, HashSet};
 
+use super::schema;
 use super::store::Store;
 use super::writer::lock;
 use super::{
@@ -173,7 +174,7 @@ impl Journal {
         Ok((held, self.read_disk(ask)?))
     }
 
-    /// `None` for a journal in memory.
+    /// `None` for a journal in memory, and where the disk has none yet.
     fn read_disk<T>(&self, ask: impl Fn(&Store) -> Result<T, rusqlite::Error>) -> Result<Option<T>, Error> {
         let Some(path) = &self.shared.path else {
             return Ok(None);
@@ -183,9 +184,12 @@ impl Journal {
             Some(reader) => reader,
             None => Store::open_readable(path)?,
         };
+        if schema::is_blank(&reader.db)? {
+            return Ok(None);
+        }
         let found = ask(&reader)?;
         let mut readers = lock(&self.readers);
-        if readers.len() < READERS {
+        if reader.sees_changes && readers.len() < READERS {
             readers.push(reader);
         }
         Ok(Some(found))

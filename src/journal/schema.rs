@@ -1,11 +1,13 @@
 //! Opening a journal file: permissions, ownership check, migrations and pragmas.
 
 use std::fs::{OpenOptions, Permissions};
+use std::io::ErrorKind;
 use std::os::unix::fs::{OpenOptionsExt, PermissionsExt};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use rusqlite::{Connection, OpenFlags, TransactionBehavior};
+use url::Url;
 
 use super::Error;
 
@@ -137,22 +139,52 @@ fn create_private(path: &Path) {
 /// Removes permissions that an earlier version, or a copy, gave to other users.
 fn make_private(path: &Path) {
     for suffix in ["", "-wal", "-shm", ".lock"] {
-        let mut name = path.as_os_str().to_owned();
-        name.push(suffix);
-        let file = Path::new(&name);
-        let is_open = std::fs::metadata(file).is_ok_and(|meta| meta.permissions().mode() & 0o077 != 0);
-        if is_open && let Err(error) = std::fs::set_permissions(file, Permissions::from_mode(PRIVATE)) {
+        let file = beside(path, suffix);
+        let is_open = std::fs::metadata(&file).is_ok_and(|meta| meta.permissions().mode() & 0o077 != 0);
+        if is_open && let Err(error) = std::fs::set_permissions(&file, Permissions::from_mode(PRIVATE)) {
             tracing::warn!(path = %file.display(), %error, "other users of this machine can read the journal");
         }
     }
 }
 
-/// Opens a journal that exists for reading beside its writer.
-pub(super) fn open_readable(path: &Path) -> Result<Connection, rusqlite::Error> {
-    let db = Connection::open_with_flags(path, OpenFlags::SQLITE_OPEN_READ_ONLY | OpenFlags::SQLITE_OPEN_NO_MUTEX)?;
-    db.busy_timeout(BUSY)?;
-    db.pragma_update(None, "cache_size", -CACHE_KIB)?;
-    Ok(db)
+/// Opens a journal that exists for reading beside its writer; whether it sees what is written later. On a full or read-only disk there cannot be
+/// the files that tell it: what a journal held when it was closed is read all the same.
+pub(super) fn open_readable(path: &Path) -> Result<(Connection, bool), rusqlite::Error> {
+    let flags = OpenFlags::SQLITE_OPEN_READ_ONLY | OpenFlags::SQLITE_OPEN_NO_MUTEX;
+    let open = |name: &Path, flags| {
+        let db = Connection::open_with_flags(name, flags)?;
+        db.busy_timeout(BUSY)?;
+        db.pragma_update(None, "cache_size", -CACHE_KIB)?;
+        pragma(&db, "user_version")?;
+        Ok(db)
+    };
+    let failed = match open(path, flags) {
+        Ok(db) => return Ok((db, true)),
+        Err(error) => error,
+    };
+    let log = std::fs::metadata(beside(path, "-wal"));
+    let is_closed = log.map_or_else(|e| e.kind() == ErrorKind::NotFound, |meta| meta.len() == 0);
+    let url = std::path::absolute(path)
+        .ok()
+        .and_then(|path| Url::from_file_path(path).ok());
+    match url.filter(|_| is_closed) {
+        Some(mut url) => {
+            url.set_query(Some("immutable=1"));
+            open(Path::new(url.as_str()), flags | OpenFlags::SQLITE_OPEN_URI).map(|db| (db, false))
+        }
+        None => Err(failed),
+    }
+}
+
+/// Whether no step of the schema was taken yet.
+pub(super) fn is_blank(db: &Connection) -> Result<bool, rusqlite::Error> {
+    Ok(pragma(db, "user_version")? == 0)
+}
+
+pub(super) fn beside(path: &Path, suffix: &str) -> PathBuf {
+    let mut name = path.as_os_str().to_owned();
+    name.push(suffix);
+    name.into()
 }
 
 fn pragma(db: &Connection, name: &str) -> Result<i64, rusqlite::Error> {

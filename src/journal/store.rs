@@ -66,18 +66,26 @@ impl Write {
 pub(super) struct Store {
     pub(super) db: Connection,
     pub(super) subscriptions: Subscriptions,
+    /// Whether what another connection writes is seen.
+    pub(super) sees_changes: bool,
 }
 
 impl Store {
     pub(super) fn open(path: Option<&Path>, subscriptions: Subscriptions) -> Result<Self, Error> {
         let db = schema::open_writable(path)?;
-        Ok(Self { db, subscriptions })
+        Ok(Self {
+            db,
+            subscriptions,
+            sees_changes: true,
+        })
     }
 
     pub(super) fn open_readable(path: &Path) -> Result<Self, rusqlite::Error> {
+        let (db, sees_changes) = schema::open_readable(path)?;
         Ok(Self {
-            db: schema::open_readable(path)?,
+            db,
             subscriptions: Subscriptions::default(),
+            sees_changes,
         })
     }
 

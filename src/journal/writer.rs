@@ -76,15 +76,12 @@ impl Shared {
         path: Option<PathBuf>,
         subscriptions: Subscriptions,
         retention: Retention,
-        overlay: Store,
+        overlay: Overlay,
         last_seq: u64,
         health: Health,
     ) -> Self {
         Self {
-            overlay: Mutex::new(Overlay {
-                store: overlay,
-                since: path.is_none().then_some(0),
-            }),
+            overlay: Mutex::new(overlay),
             path,
             subscriptions,
             retention,
