@@ -1,8 +1,10 @@
 //! Logging: text to a terminal, structured fields to journald, JSON to any other stderr.
 
 use std::io::IsTerminal;
+use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
+use tracing_appender::non_blocking::{NonBlockingBuilder, WorkerGuard};
 use tracing_subscriber::filter::{LevelFilter, Targets};
 use tracing_subscriber::layer::SubscriberExt;
 use tracing_subscriber::util::SubscriberInitExt;
@@ -41,9 +43,15 @@ const LEVELS: [&str; 6] = ["off", "error", "warn", "info", "debug", "trace"];
 /// The target of the NATS client's own events.
 const NATS_CLIENT: &str = "async_nats";
 
-/// Changes the level of a running daemon.
+/// Lines that wait for a reader of stderr who stalls; further ones are lost, and nothing waits for them.
+const WAITING: usize = 1 << 14;
+
+/// Changes the level of a running daemon; with the last one what waits is written, if it can be within a second.
 #[derive(Clone)]
-pub struct Handle(reload::Handle<Targets, Registry>);
+pub struct Handle {
+    level: reload::Handle<Targets, Registry>,
+    _stderr: Arc<WorkerGuard>,
+}
 
 impl Config {
     /// The filter that `level` describes.
@@ -85,30 +93,37 @@ pub fn install(config: &Config) -> Result<Handle, Error> {
         Ok(level) => Config { level }.filter()?,
         Err(_) => config.filter()?,
     };
-    let (filter, handle) = reload::Layer::new(filter);
+    let (filter, level) = reload::Layer::new(filter);
+    let (stderr, guard) = NonBlockingBuilder::default()
+        .buffered_lines_limit(WAITING)
+        .thread_name("log")
+        .finish(std::io::stderr());
     // systemd sets JOURNAL_STREAM when our stderr is the journal.
     let journald = std::env::var_os("JOURNAL_STREAM").and_then(|_| tracing_journald::layer().ok());
     let output: Box<dyn Layer<_> + Send + Sync> = match journald {
         Some(layer) => layer.boxed(),
         None if std::io::stderr().is_terminal() => tracing_subscriber::fmt::layer()
-            .with_writer(std::io::stderr)
+            .with_writer(stderr)
             .with_target(false)
             .boxed(),
         None => tracing_subscriber::fmt::layer()
             .json()
             .flatten_event(true)
-            .with_writer(std::io::stderr)
+            .with_writer(stderr)
             .boxed(),
     };
     tracing_subscriber::registry().with(filter).with(output).init();
-    Ok(Handle(handle))
+    Ok(Handle {
+        level,
+        _stderr: Arc::new(guard),
+    })
 }
 
 impl Handle {
     pub fn set(&self, config: &Config) -> Result<(), Error> {
         let filter = config.filter()?;
         if std::env::var_os("OAPWATCH_LOG").is_none() {
-            self.0
+            self.level
                 .reload(filter)
                 .expect("the subscriber lives as long as the process");
         }
