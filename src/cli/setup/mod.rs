@@ -38,8 +38,16 @@ pub struct Args {
     #[command(flatten)]
     geometry: questions::Args,
     /// Count from which a pixel of the recording is saturated; the largest of the fewest bits that hold it when left out
-    #[arg(long, value_name = "COUNTS")]
+    #[arg(long, value_name = "COUNTS", value_parser = counts)]
     saturation_counts: Option<f64>,
+}
+
+fn counts(text: &str) -> Result<f64, String> {
+    let counts = text
+        .parse::<f64>()
+        .ok()
+        .filter(|counts| *counts > 0.0 && counts.is_finite());
+    counts.ok_or_else(|| "expected a number above 0".to_owned())
 }
 
 /// First line of a config written here; one without it belongs to the user and is kept.
@@ -54,12 +62,12 @@ pub fn run(args: Args) -> Outcome {
         (None, None) => return Err(Failure::Input(anyhow!("expected --device or --frames, found neither"))),
     };
     let mut new = NewConfig::new(&view, &geometry);
-    let shape = Shape::learn(&view, &new);
+    let shape = Shape::learn(&view, &new, new.camera().map_err(Failure::input)?);
     if let Some(sigma_m) = shape.sigma_m() {
         new.spot_sigma_m = sigma_m;
     }
     let calibration_path = args.out.with_extension("calibration.toml");
-    let camera = new.camera();
+    let camera = new.camera().map_err(Failure::input)?;
     let maps = new.calibration(&view, &camera).map_err(Failure::other)?;
     let calibration = shape.calibration(&camera, maps)?;
     if let Some(calibration) = &calibration {

@@ -137,8 +137,8 @@ impl NewConfig {
     }
 
     /// As the config will describe it, without a calibration.
-    pub fn camera(&self) -> Camera {
-        self.optics().camera().expect("checked numbers make a camera")
+    pub fn camera(&self) -> Result<Camera, optics::Error> {
+        self.optics().camera()
     }
 
     fn optics(&self) -> optics::Config {

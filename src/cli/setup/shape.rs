@@ -56,7 +56,7 @@ fn centre(frames: &[Array2<f64>], spot: &FoundSpot) -> [f64; 2] {
 }
 
 impl Shape {
-    pub fn learn(view: &View, new: &NewConfig) -> Self {
+    pub fn learn(view: &View, new: &NewConfig, mut camera: Camera) -> Self {
         if view.look.spots.is_empty() {
             return Self::NoSpots;
         }
@@ -71,7 +71,6 @@ impl Shape {
                 steps.next(&format!("the spot's shape: {}, round {}", p.stage, p.round));
             })
         };
-        let mut camera = new.camera();
         let mut learned = learn(&camera);
         // The width seen so far is the mean frame's, in which a beam that moves is wider.
         if let Ok(wider) = learned.as_ref()
