@@ -27,7 +27,7 @@ pub struct Exposure {
     pub frame: usize,
     /// Energies as recorded, J, row by row.
     pub pixels: Vec<f64>,
-    /// Usable pixels: finite and not saturated.
+    /// Usable pixels: neither immense nor saturated.
     pub valid: Vec<bool>,
     pub spots: Vec<Spot>,
     /// Background: level per pixel, J, and its change from the array's centre to its edge in x and y; none when not modelled.

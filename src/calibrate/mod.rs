@@ -16,7 +16,7 @@ pub mod truth;
 
 use ndarray::Array2;
 
-use crate::estimate::{self, Estimator};
+use crate::estimate::{self, Estimator, is_usable};
 use crate::optics::{Calibration, CalibrationError, Camera};
 pub use cross_validation::Score;
 use exposure::Exposure;
@@ -139,13 +139,14 @@ pub fn fit(
     beacons: &[Beacon],
     progress: &mut dyn FnMut(usize, f64, f64),
 ) -> Fitted {
-    let saturated = camera.saturation_limit_j();
+    let ceiling = camera.saturation_limit_j();
+    let usable = |v: f64| is_usable(v, 1.0 / camera.noise_std_j, ceiling);
     let exposures = frames
         .iter()
         .map(|(frame, pixels)| Exposure {
             frame: *frame,
-            pixels: pixels.iter().map(|v| if v.is_finite() { *v } else { 0.0 }).collect(),
-            valid: pixels.iter().map(|v| v.is_finite() && *v < saturated).collect(),
+            pixels: pixels.iter().map(|v| if usable(*v) { *v } else { 0.0 }).collect(),
+            valid: pixels.iter().map(|v| usable(*v)).collect(),
             spots: Vec::new(),
             background: Some([0.0; 3]),
             chi2: 0.0,

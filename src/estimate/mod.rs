@@ -31,5 +31,6 @@ pub use error::Error;
 pub use estimator::Estimator;
 pub use estimators::build::build;
 pub use estimators::list::{DEFAULT, ESTIMATORS, EstimatorSpec, Learned, find};
+pub(crate) use preprocess::screening::is_usable;
 pub use rules::Rules;
 pub use uncertainty::cramer_rao::{BoundAssumptions, PsfShape, position_bound, position_bound_with};

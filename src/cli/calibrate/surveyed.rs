@@ -49,7 +49,7 @@ pub fn run(args: &Args, truth_file: &Path, config: &Config, camera: &Camera) -> 
         writeln!(out, "{lines}").map_err(Failure::other)?;
     }
     let (before, after) = (calibrated.before, calibrated.after);
-    if after.cost_m2 >= before.cost_m2 {
+    if !(after.cost_m2 < before.cost_m2) {
         return Err(Failure::Other(anyhow!(
             "{} was not written: on the {} held-out positions the new calibration is no better \
              (mean squared error, misses counted as 25 m: {:.4} m² before, {:.4} m² after)",
