@@ -36,7 +36,9 @@ pub fn run(args: Args) -> Outcome {
     }
     let logging = logging::install(&config.log).map_err(Failure::config)?;
     let hub = Hub::new(config).map_err(Failure::Config)?;
-    run::runtime(0)?.block_on(hub.run(logging)).map_err(Failure::Other)
+    run::runtime(0)?
+        .block_on(hub.run(logging.clone()))
+        .map_err(Failure::Other)
 }
 
 /// The same recording gives the same bytes, and the events that the hub had.

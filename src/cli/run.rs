@@ -41,7 +41,9 @@ pub fn run(args: Args) -> Outcome {
     }
     let daemon = Daemon::new(config, args.config).map_err(Failure::Config)?;
     // One core is the compute thread's.
-    runtime(1)?.block_on(daemon.run(logging)).map_err(Failure::Other)
+    runtime(1)?
+        .block_on(daemon.run(logging.clone()))
+        .map_err(Failure::Other)
 }
 
 /// Where a daemon's tasks run: on all cores but `taken`.

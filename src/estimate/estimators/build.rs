@@ -54,7 +54,7 @@ pub fn build(config: &Config, camera: &Camera) -> Result<Box<dyn Estimator>, Con
                     } else {
                         Box::new(together)
                     };
-                    match rules.watch_sensor && camera.spot_shape.is_none() {
+                    match rules.watch_sensor {
                         true => Box::new(SensorWatch::new(watched, camera)),
                         false => watched,
                     }

@@ -1,9 +1,8 @@
 //! Pixels whose light is no spot's: hot ones, ones that flicker, and those of a line that is off.
 
-use ndarray::{Array2, ArrayView1};
+use ndarray::{Array2, ArrayView1, s};
 
-use crate::optics::psf::pixel_fraction;
-use crate::optics::{Axis, Camera};
+use crate::optics::{Axis, Camera, add_spot};
 use crate::stats::median;
 
 /// Frames over which light is summed. More find fainter pixels, fewer forget sooner what has passed. Not tuned.
@@ -23,9 +22,8 @@ const LEAST_SPREAD: f64 = 1.5;
 const PATTERNED: f64 = 1.35;
 /// The median of |z|, z standard normal.
 const MEDIAN_OF_NOISE: f64 = 0.6745;
-/// Half the size of the comparison, and beyond which a spot has no light, σ.
+/// Half the size of the comparison, σ.
 const REACH: f64 = 2.0;
-const LIT: f64 = 5.0;
 /// Share of what emitters explain of a pixel's light that may be missing where their spots are not quite as wide as they are taken to be.
 const MISFIT: f64 = 0.1;
 
@@ -42,19 +40,12 @@ pub(crate) struct OddPixels {
     variance: f64,
     is_odd: Array2<bool>,
     count: usize,
-    /// A spot on a pixel's middle along x and y, from there outwards.
-    profiles: [Vec<f64>; 2],
+    /// Shares of a spot on a pixel's middle, which is the middle one.
+    spot: Array2<f64>,
 }
 
 impl OddPixels {
     pub fn new(camera: &Camera) -> Self {
-        let profile = |axis: &Axis| {
-            let (sigma, pitch) = (camera.spot_sigma_m, axis.pitch_m);
-            let reach = (REACH * sigma / pitch).ceil().max(1.0) as usize;
-            let edge = |k: usize| (k as f64 - 0.5) * pitch;
-            let pixel = |k: usize| pixel_fraction(edge(k), edge(k + 1), 0.0, sigma);
-            (0..=reach).map(pixel).collect()
-        };
         Self {
             light: Array2::zeros(camera.shape()),
             explained: Array2::zeros(camera.shape()),
@@ -63,7 +54,7 @@ impl OddPixels {
             variance: 0.0,
             is_odd: Array2::default(camera.shape()),
             count: 0,
-            profiles: [profile(&camera.x), profile(&camera.y)],
+            spot: spot_shares(camera),
         }
     }
 
@@ -77,8 +68,9 @@ impl OddPixels {
 
     /// Whether most dark pixels have a light of their own: to many frames together such a pattern is emitters, and no surface describes it.
     pub fn are_all(&self, is_lit: &Array2<bool>) -> bool {
-        let dark = self.light.iter().zip(is_lit).filter(|(_, lit)| !**lit);
-        let middle = median(dark.map(|(light, _)| light.abs()).collect());
+        let rest = self.light.iter().zip(&self.explained).zip(is_lit);
+        let dark = rest.filter(|(_, lit)| !**lit);
+        let middle = median(dark.map(|((light, explained), _)| (light - explained).abs()).collect());
         middle.is_some_and(|middle| middle > PATTERNED * MEDIAN_OF_NOISE * self.variance.sqrt())
     }
 
@@ -91,18 +83,26 @@ impl OddPixels {
         }
     }
 
-    /// Learns from a frame's pixels (ny, nx), in standard deviations of the noise, NaN where they are not usable, and from where spots were
-    /// found in it, m, and their whole light.
-    pub fn learn(&mut self, values: &Array2<f64>, camera: &Camera, spots: impl Iterator<Item = ([f64; 2], f64)>) {
+    /// Learns from a frame's pixels (ny, nx), NaN where they are not usable, from what the emitters found in it explain of them, both in standard
+    /// deviations of the noise, and from where these are, m, and their whole light.
+    pub fn learn(
+        &mut self,
+        values: &Array2<f64>,
+        explained: &Array2<f64>,
+        axes: [&Axis; 2],
+        spots: impl Iterator<Item = ([f64; 2], f64)>,
+    ) {
         let keep = 1.0 - 1.0 / FRAMES;
         self.frames = keep * self.frames + 1.0;
         self.variance = keep * keep * self.variance + 1.0;
-        self.light.zip_mut_with(values, |sum, v| {
-            *sum = keep * *sum + if v.is_nan() { 0.0 } else { *v };
-        });
-        self.explained *= keep;
+        let sums = self.light.iter_mut().zip(&mut self.explained);
+        for ((light, sum), (value, explained)) in sums.zip(values.iter().zip(explained)) {
+            let is_used = !value.is_nan();
+            *light = keep * *light + if is_used { *value } else { 0.0 };
+            *sum = keep * *sum + if is_used { *explained } else { 0.0 };
+        }
         self.beside *= keep;
-        spots.for_each(|(at, light)| self.explain(values, camera, at, light));
+        spots.for_each(|(at, light)| self.note_beside(axes, at, light));
         let [least, stays] = [LEAST, STAYS].map(|share| share * self.frames);
         for at in self.asked(least) {
             let was_odd = self.is_odd[at];
@@ -116,24 +116,19 @@ impl OddPixels {
         }
     }
 
-    fn explain(&mut self, values: &Array2<f64>, camera: &Camera, at: [f64; 2], light: f64) {
-        let sigma = camera.spot_sigma_at(at);
-        let axes = [(&camera.x, at[0]), (&camera.y, at[1])];
-        let [(first_x, x), (first_y, y)] = axes.map(|(axis, at)| lit(axis, at, sigma));
-        for (row, share_y) in (first_y..).zip(&y) {
-            for (column, share_x) in (first_x..).zip(&x) {
-                if !values[(row, column)].is_nan() {
-                    self.explained[(row, column)] += light * share_x * share_y;
-                }
-            }
-        }
-        let [columns, rows] = axes.map(|(axis, at)| {
-            let at = (at - axis.min_m) / axis.pitch_m;
-            ((at - 1.5).ceil().max(0.0) as usize)..((at + 0.5).ceil().clamp(0.0, axis.n as f64) as usize)
+    fn note_beside(&mut self, axes: [&Axis; 2], at: [f64; 2], light: f64) {
+        let [columns, rows] = [0, 1].map(|k| {
+            let at = (at[k] - axes[k].min_m) / axes[k].pitch_m;
+            ((at - 1.5).ceil().max(0.0) as usize)..((at + 0.5).ceil().clamp(0.0, axes[k].n as f64) as usize)
         });
         for row in rows {
             columns.clone().for_each(|column| self.beside[(row, column)] += light);
         }
+    }
+
+    /// Share of a spot in the pixel on whose middle it is.
+    fn peak(&self) -> f64 {
+        self.spot[(self.spot.nrows() / 2, self.spot.ncols() / 2)]
     }
 
     /// A pixel's light that no emitter explains.
@@ -144,7 +139,7 @@ impl OddPixels {
     /// Odd pixels, and those of more light than noise has that are brighter than their diagonal neighbours.
     fn asked(&self, least: f64) -> Vec<(usize, usize)> {
         let (ny, nx) = self.light.dim();
-        let peak = self.profiles[0][0] * self.profiles[1][0];
+        let peak = self.peak();
         let mut asked = Vec::new();
         for y in 0..ny {
             let [above, below] = [y.saturating_sub(1), (y + 1).min(ny - 1)];
@@ -169,16 +164,16 @@ impl OddPixels {
     fn is_no_spot(&self, at: (usize, usize)) -> bool {
         let (y, x) = at;
         let (ny, nx) = self.light.dim();
-        let [along, across] = &self.profiles;
+        let (half_y, half_x) = (self.spot.nrows() / 2, self.spot.ncols() / 2);
         let (mut fits, mut norm) = (0.0, 0.0);
-        for row in (y + 1).saturating_sub(across.len())..(y + across.len()).min(ny) {
-            for column in (x + 1).saturating_sub(along.len())..(x + along.len()).min(nx) {
-                let share = along[x.abs_diff(column)] * across[y.abs_diff(row)];
+        for row in y.saturating_sub(half_y)..(y + half_y + 1).min(ny) {
+            for column in x.saturating_sub(half_x)..(x + half_x + 1).min(nx) {
+                let share = self.spot[(row + half_y - y, column + half_x - x)];
                 fits += share * self.rest((row, column));
                 norm += share * share;
             }
         }
-        let (beside, peak) = (self.beside[at], along[0] * across[0]);
+        let (beside, peak) = (self.beside[at], self.peak());
         fits += beside * norm;
         let others = (self.explained[at] - beside * peak).max(0.0);
         let light = ((self.rest(at) + beside * peak).abs() - MISFIT * others).max(0.0);
@@ -188,13 +183,19 @@ impl OddPixels {
     }
 }
 
-/// The first pixel of an axis that a spot at `at` lights, and its shares of this and the following ones.
-fn lit(axis: &Axis, at: f64, sigma: f64) -> (usize, Vec<f64>) {
-    let pixel = |v: f64| ((v - axis.min_m) / axis.pitch_m).clamp(0.0, axis.n as f64);
-    let first = pixel(at - LIT * sigma) as usize;
-    let share = |k: usize| pixel_fraction(axis.edge(k), axis.edge(k + 1), at, sigma);
-    let end = pixel(at + LIT * sigma).ceil() as usize;
-    (first, (first..end).map(share).collect())
+/// A spot in the middle of the sensor, on a pixel's middle, out to [`REACH`].
+fn spot_shares(camera: &Camera) -> Array2<f64> {
+    let axes = [&camera.y, &camera.x];
+    let middle = axes.map(|axis| axis.n / 2);
+    let half = [0, 1].map(|k| {
+        let reach = (REACH * camera.spot_sigma_m / axes[k].pitch_m).ceil().max(1.0) as usize;
+        reach.min(middle[k]).min(axes[k].n - 1 - middle[k])
+    });
+    let mut all = Array2::zeros(camera.shape());
+    let at = [camera.x.centre(middle[1]), camera.y.centre(middle[0])];
+    add_spot(camera, at, 1.0, all.as_slice_mut().expect("row by row"));
+    let [rows, columns] = [0, 1].map(|k| middle[k] - half[k]..middle[k] + half[k] + 1);
+    all.slice(s![rows, columns]).to_owned()
 }
 
 /// The decrease of the deviance by what three quarters of a line's pixels have at least: spots on a line are not its own light.
@@ -213,6 +214,7 @@ mod tests {
 
     use super::*;
     use crate::optics::Config;
+    use crate::optics::psf::pixel_fraction;
 
     const PIXELS: usize = 40;
     const AT: (usize, usize) = (20, 12);
@@ -248,13 +250,16 @@ mod tests {
         let found = spots
             .iter()
             .map(|([y, x], peak)| ([place(&camera.x, *x), place(&camera.y, *y)], peak * whole));
+        let explained = Array2::from_shape_fn((PIXELS, PIXELS), |(y, x)| {
+            spots.iter().map(|(at, peak)| spot(y, x, *at, *peak)).sum::<f64>()
+        });
         let mut rng = ChaCha8Rng::seed_from_u64(2);
         for k in 0..frames {
             let values = Array2::from_shape_fn((PIXELS, PIXELS), |(y, x)| {
                 let noise: f64 = StandardNormal.sample(&mut rng);
                 noise + light(k, y, x)
             });
-            odd.learn(&values, &camera, found.clone());
+            odd.learn(&values, &explained, [&camera.x, &camera.y], found.clone());
         }
         let found = odd.pixels().indexed_iter().filter(|(_, odd)| **odd);
         found.map(|(at, _)| at).collect()
@@ -270,7 +275,13 @@ mod tests {
             let mut odd = OddPixels::new(&camera());
             for _ in 0..100 {
                 let values = Array2::from_shape_simple_fn(shape, &mut noise) * scale + &pattern * scatter;
-                odd.learn(&values, &camera(), std::iter::empty());
+                let camera = camera();
+                odd.learn(
+                    &values,
+                    &Array2::zeros(shape),
+                    [&camera.x, &camera.y],
+                    std::iter::empty(),
+                );
             }
             assert_eq!(odd.are_all(&Array2::default(shape)), expected, "{scatter} {scale}");
         }

@@ -10,11 +10,16 @@ use crate::estimate::sequence::odd_pixels::OddPixels;
 use crate::estimate::sequence::steady_background::SteadyBackground;
 use crate::frame::Frame;
 use crate::geo::Sight;
-use crate::optics::{Axis, Camera, Smear};
+use crate::optics::psf::pixel_fraction;
+use crate::optics::{Axis, Camera, Smear, add_spot};
 use crate::stats::is_cut_off;
 
-/// Light of emitters, in standard deviations of the noise, below which a pixel is dark.
+/// Light of emitters, in standard deviations of the noise, below which a pixel is dark; through a measured lens, whose halos are everywhere, the light
+/// that its calibration explains to a hundredth of it.
 const DARK: f64 = 0.01;
+const DARK_MEASURED: f64 = 1.0;
+/// Beyond which a Gaussian spot has no light, σ.
+const LIT: f64 = 5.0;
 /// Reduced χ² beyond which a frame may hold emitters that were not found.
 const EXPLAINED: f64 = 2.0;
 
@@ -24,6 +29,8 @@ pub(crate) struct SensorWatch {
     camera: Camera,
     background: SteadyBackground,
     odd: OddPixels,
+    /// What the emitters of the newest frame explain of it, in standard deviations of the noise.
+    explained: Array2<f64>,
     is_lit: Array2<bool>,
     /// The newest frame without the background, in standard deviations of the noise, NaN where it is not usable.
     values: Array2<f64>,
@@ -33,13 +40,13 @@ pub(crate) struct SensorWatch {
 }
 
 impl SensorWatch {
-    /// `camera`'s spots are Gaussians.
     pub fn new(inner: Box<dyn Estimator>, camera: &Camera) -> Self {
         Self {
             inner,
             camera: camera.clone(),
             background: SteadyBackground::default(),
             odd: OddPixels::new(camera),
+            explained: Array2::zeros(camera.shape()),
             is_lit: Array2::default(camera.shape()),
             values: Array2::zeros(camera.shape()),
             newest: Array2::zeros(camera.shape()),
@@ -62,7 +69,9 @@ impl SensorWatch {
             let pixels = self.values.iter_mut().zip(masked);
             pixels.filter(|(_, masked)| **masked).for_each(|(v, _)| *v = f64::NAN);
         }
-        self.background.follow(&mut self.values, &self.is_lit);
+        let has_halos = self.camera.spot_shape.is_some();
+        self.background
+            .follow(&mut self.values, (!has_halos).then_some(&self.is_lit));
     }
 
     /// The frame without what is known; none where nothing is.
@@ -82,37 +91,52 @@ impl SensorWatch {
         })
     }
 
-    /// Learns the background of the frame that was read, in which these emitters were found.
-    fn learn_background(&mut self, frame: &Frame, found: &Estimate) {
+    /// Learns from the frame that was read, in which these emitters were found.
+    fn learn(&mut self, frame: &Frame, found: &Estimate) {
+        self.explain(found);
+        let scale = 1.0 / self.camera.noise_std_j;
+        let spots = found.emitters.iter().map(|e| (e.sensor_m, e.energy_j * scale));
+        let axes = [&self.camera.x, &self.camera.y];
+        self.odd.learn(&self.values, &self.explained, axes, spots);
         let is_explained = found.reduced_chi2 < EXPLAINED;
         if self.background.is_due() && is_explained && !is_cut_off(frame.pixels.iter().copied()) {
-            self.mark_lit(found);
+            let dark = self.camera.spot_shape.as_ref().map_or(DARK, |_| DARK_MEASURED);
+            self.is_lit.assign(self.odd.pixels());
+            self.is_lit
+                .zip_mut_with(&self.explained, |lit, light| *lit |= *light > dark);
+            self.values -= &self.explained;
             self.background.learn(&self.values, &self.is_lit);
         }
     }
 
-    /// Marks the odd pixels and those that these emitters light.
-    fn mark_lit(&mut self, found: &Estimate) {
+    fn explain(&mut self, found: &Estimate) {
         let camera = &self.camera;
-        let sigma = camera.spot_sigma_m * (1.0 + camera.spot_growth.max(0.0));
-        self.is_lit.assign(self.odd.pixels());
-        let density = camera.x.pitch_m * camera.y.pitch_m / (std::f64::consts::TAU * sigma * sigma);
+        self.explained.fill(0.0);
         for emitter in &found.emitters {
-            let peak = emitter.energy_j * density / camera.noise_std_j;
-            let reach = sigma * (2.0 * (peak / DARK).max(1.0).ln()).sqrt();
-            let within = |axis: &Axis, at: f64| {
-                let pixel = |v: f64| ((v - axis.min_m) / axis.pitch_m).clamp(0.0, axis.n as f64) as usize;
-                pixel(at - reach)..pixel(at + reach + axis.pitch_m)
-            };
-            let [x, y] = emitter.sensor_m;
-            for row in within(&camera.y, y) {
-                for column in within(&camera.x, x) {
-                    let away2 = (camera.x.centre(column) - x).powi(2) + (camera.y.centre(row) - y).powi(2);
-                    self.is_lit[(row, column)] |= away2 < reach * reach;
+            let (at, light) = (emitter.sensor_m, emitter.energy_j / camera.noise_std_j);
+            if camera.spot_shape.is_some() {
+                add_spot(camera, at, light, self.explained.as_slice_mut().expect("row by row"));
+                continue;
+            }
+            let sigma = camera.spot_sigma_at(at);
+            let [(first_x, x), (first_y, y)] =
+                [(&camera.x, at[0]), (&camera.y, at[1])].map(|(axis, at)| lit(axis, at, sigma));
+            for (row, share_y) in (first_y..).zip(&y) {
+                for (column, share_x) in (first_x..).zip(&x) {
+                    self.explained[(row, column)] += light * share_x * share_y;
                 }
             }
         }
     }
+}
+
+/// The first pixel of an axis that a Gaussian spot at `at` lights, and its shares of this and the following ones.
+fn lit(axis: &Axis, at: f64, sigma: f64) -> (usize, Vec<f64>) {
+    let pixel = |v: f64| ((v - axis.min_m) / axis.pitch_m).clamp(0.0, axis.n as f64);
+    let first = pixel(at - LIT * sigma) as usize;
+    let share = |k: usize| pixel_fraction(axis.edge(k), axis.edge(k + 1), at, sigma);
+    let end = pixel(at + LIT * sigma).ceil() as usize;
+    (first, (first..end).map(share).collect())
 }
 
 impl Estimator for SensorWatch {
@@ -140,13 +164,7 @@ impl Estimator for SensorWatch {
         self.read(frame);
         let cleaned = self.cleaned(frame);
         let found = self.inner.estimate_until(cleaned.as_ref().unwrap_or(frame), is_over)?;
-        let scale = 1.0 / self.camera.noise_std_j;
-        let spots = found
-            .emitters
-            .iter()
-            .map(|emitter| (emitter.sensor_m, emitter.energy_j * scale));
-        self.odd.learn(&self.values, &self.camera, spots);
-        self.learn_background(frame, &found);
+        self.learn(frame, &found);
         self.found = Some(found.clone());
         Ok(found)
     }

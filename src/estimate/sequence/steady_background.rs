@@ -58,10 +58,11 @@ impl SteadyBackground {
     }
 
     /// Takes what is known off a frame's pixels, in standard deviations of the noise, and what has been added evenly since: clouds are faster
-    /// than the mean. `is_lit`: where emitters were a frame ago.
-    pub fn follow(&mut self, values: &mut Array2<f64>, is_lit: &Array2<bool>) {
+    /// than the mean. `is_lit`: where emitters were a frame ago, where that leaves dark pixels.
+    pub fn follow(&mut self, values: &mut Array2<f64>, is_lit: Option<&Array2<bool>>) {
         let Some(surface) = &mut self.known else { return };
         surface.subtract(values, 1.0);
+        let Some(is_lit) = is_lit else { return };
         let of_dark = values.iter().zip(is_lit).filter(|(v, lit)| !**lit && !v.is_nan());
         let dark: Vec<f64> = of_dark.map(|(v, _)| *v).collect();
         let count = dark.len() as f64;
