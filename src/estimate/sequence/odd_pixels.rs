@@ -1,6 +1,6 @@
 //! Pixels whose light is no spot's: hot ones, ones that flicker, and those of a line that is off.
 
-use ndarray::{Array2, ArrayView1, s};
+use ndarray::{Array2, s};
 
 use crate::optics::{Axis, Camera, add_spot};
 use crate::stats::median;
@@ -177,8 +177,9 @@ impl OddPixels {
         fits += beside * norm;
         let others = (self.explained[at] - beside * peak).max(0.0);
         let light = ((self.rest(at) + beside * peak).abs() - MISFIT * others).max(0.0);
-        let lines = [self.light.row(y), self.light.column(x)].map(light_of);
-        let own = light.powi(2).max(lines[0]).max(lines[1]);
+        let row = light_of((0..nx).map(|x| self.rest((y, x))).collect());
+        let column = light_of((0..ny).map(|y| self.rest((y, x))).collect());
+        let own = light.powi(2).max(row).max(column);
         norm > LEAST_SPREAD * peak * peak && own > fits * fits / norm + MARGIN * self.frames
     }
 }
@@ -199,11 +200,10 @@ fn spot_shares(camera: &Camera) -> Array2<f64> {
 }
 
 /// The decrease of the deviance by what three quarters of a line's pixels have at least: spots on a line are not its own light.
-fn light_of(line: ArrayView1<f64>) -> f64 {
-    let mut sorted = line.to_vec();
-    sorted.sort_unstable_by(f64::total_cmp);
-    let [low, high] = [sorted.len() / 4, sorted.len() - 1 - sorted.len() / 4].map(|k| sorted[k]);
-    low.max(0.0).max(-high).powi(2) * sorted.len() as f64
+fn light_of(mut line: Vec<f64>) -> f64 {
+    line.sort_unstable_by(f64::total_cmp);
+    let [low, high] = [line.len() / 4, line.len() - 1 - line.len() / 4].map(|k| line[k]);
+    low.max(0.0).max(-high).powi(2) * line.len() as f64
 }
 
 #[cfg(test)]
