@@ -62,6 +62,10 @@ pub fn build(config: &Config, camera: &Camera) -> Result<Box<dyn Estimator>, Con
                 Method::MaximumLikelihood if WindowedEstimator::suits(camera, config.rules) => {
                     Box::new(WindowedEstimator::new(spec, camera, config.rules))
                 }
+                // Through a measured lens one pixel may be a spot.
+                Method::MaximumLikelihood if config.rules.watch_sensor && camera.spot_shape.is_some() => {
+                    Box::new(SensorWatch::of_pixels(Box::new(single()), camera))
+                }
                 _ => Box::new(single()),
             }
         }

@@ -27,7 +27,8 @@ const EXPLAINED: f64 = 2.0;
 pub(crate) struct SensorWatch {
     inner: Box<dyn Estimator>,
     camera: Camera,
-    background: SteadyBackground,
+    /// None where each frame tells its own.
+    background: Option<SteadyBackground>,
     odd: OddPixels,
     /// What the emitters of the newest frame explain of it, in standard deviations of the noise.
     explained: Array2<f64>,
@@ -42,9 +43,17 @@ pub(crate) struct SensorWatch {
 impl SensorWatch {
     pub fn new(inner: Box<dyn Estimator>, camera: &Camera) -> Self {
         Self {
+            background: Some(SteadyBackground::default()),
+            ..Self::of_pixels(inner, camera)
+        }
+    }
+
+    /// Only of odd pixels and repeated frames.
+    pub fn of_pixels(inner: Box<dyn Estimator>, camera: &Camera) -> Self {
+        Self {
             inner,
             camera: camera.clone(),
-            background: SteadyBackground::default(),
+            background: None,
             odd: OddPixels::new(camera),
             explained: Array2::zeros(camera.shape()),
             is_lit: Array2::default(camera.shape()),
@@ -69,14 +78,15 @@ impl SensorWatch {
             let pixels = self.values.iter_mut().zip(masked);
             pixels.filter(|(_, masked)| **masked).for_each(|(v, _)| *v = f64::NAN);
         }
-        let has_halos = self.camera.spot_shape.is_some();
-        self.background
-            .follow(&mut self.values, (!has_halos).then_some(&self.is_lit));
+        if let Some(background) = &mut self.background {
+            let has_halos = self.camera.spot_shape.is_some();
+            background.follow(&mut self.values, (!has_halos).then_some(&self.is_lit));
+        }
     }
 
     /// The frame without what is known; none where nothing is.
     fn cleaned(&self, frame: &Frame) -> Option<Frame> {
-        let surface = self.background.known();
+        let surface = self.background.as_ref().and_then(SteadyBackground::known);
         if surface.is_none() && !self.odd.are_any() || surface.is_some() && self.odd.are_all(&self.is_lit) {
             return None;
         }
@@ -98,14 +108,15 @@ impl SensorWatch {
         let spots = found.emitters.iter().map(|e| (e.sensor_m, e.energy_j * scale));
         let axes = [&self.camera.x, &self.camera.y];
         self.odd.learn(&self.values, &self.explained, axes, spots);
+        let Some(background) = &mut self.background else { return };
         let is_explained = found.reduced_chi2 < EXPLAINED;
-        if self.background.is_due() && is_explained && !is_cut_off(frame.pixels.iter().copied()) {
+        if background.is_due() && is_explained && !is_cut_off(frame.pixels.iter().copied()) {
             let dark = self.camera.spot_shape.as_ref().map_or(DARK, |_| DARK_MEASURED);
             self.is_lit.assign(self.odd.pixels());
             self.is_lit
                 .zip_mut_with(&self.explained, |lit, light| *lit |= *light > dark);
             self.values -= &self.explained;
-            self.background.learn(&self.values, &self.is_lit);
+            background.learn(&self.values, &self.is_lit);
         }
     }
 
