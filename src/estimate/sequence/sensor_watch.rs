@@ -18,8 +18,8 @@ use crate::stats::is_cut_off;
 /// that its calibration explains to a hundredth of it.
 const DARK: f64 = 0.01;
 const DARK_MEASURED: f64 = 1.0;
-/// Beyond which a Gaussian spot has no light, σ.
-const LIT: f64 = 5.0;
+/// Beyond which a Gaussian spot has less than a billionth of its peak, σ.
+const LIT: f64 = 6.5;
 /// Reduced χ² beyond which a frame may hold emitters that were not found.
 const EXPLAINED: f64 = 2.0;
 
