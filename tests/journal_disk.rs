@@ -106,6 +106,52 @@ async fn limited() {
     std::fs::write(Path::new(&dir).join("recorded"), recorded.to_string()).unwrap();
 }
 
+/// What runs on a disk that is full from the start.
+#[tokio::test]
+async fn started() {
+    let Ok(dir) = std::env::var("OAPWATCH_FULL_DISK_DIR") else {
+        return;
+    };
+    let journal = open(Path::new(&dir));
+    let before = journal.open_alerts().unwrap().len() as u64;
+    journal
+        .record(&[raised(before + 1)], Timestamp::UNIX_EPOCH, Timestamp::UNIX_EPOCH)
+        .unwrap();
+    journal.settled().await;
+    let health = journal.health();
+    assert!(!health.writable && health.lost == 0, "{health:?}");
+    assert_eq!(journal.open_alerts().unwrap().len() as u64, before + 1);
+    assert_eq!(journal.waiting("all", 0).unwrap().len() as u64, before + 1);
+    std::fs::remove_file(Path::new(&dir).join(format!("expects {before}"))).unwrap();
+}
+
+#[tokio::test]
+async fn a_journal_that_is_new_or_was_closed_starts_on_a_full_disk() {
+    for before in [0, 3] {
+        let dir = tempfile::tempdir().unwrap();
+        let expected = dir.path().join(format!("expects {before}"));
+        std::fs::write(&expected, "").unwrap();
+        if before > 0 {
+            let journal = open(dir.path());
+            let events: Vec<AlertEvent> = (1..=before).map(raised).collect();
+            journal
+                .record(&events, Timestamp::UNIX_EPOCH, Timestamp::UNIX_EPOCH)
+                .unwrap();
+            journal.settled().await;
+        }
+        let output = Command::new("sh")
+            .args([
+                "-c",
+                "trap '' XFSZ; ulimit -S -f 0; exec \"$0\" started --exact --nocapture 2>&1 | cat",
+            ])
+            .arg(std::env::current_exe().unwrap())
+            .env("OAPWATCH_FULL_DISK_DIR", dir.path())
+            .output()
+            .unwrap();
+        assert!(!expected.exists(), "{}", String::from_utf8_lossy(&output.stdout));
+    }
+}
+
 #[test]
 fn a_full_disk_loses_no_alert_and_stops_nothing() {
     if Command::new("prlimit").arg("--version").output().is_err() {

@@ -30,7 +30,7 @@ pub struct AlertMessage {
 }
 
 /// One that a journal can hold: the hub's would refuse others, and all that comes with them.
-fn sequence_number<'de, D: Deserializer<'de>>(input: D) -> Result<u64, D::Error> {
+pub(crate) fn sequence_number<'de, D: Deserializer<'de>>(input: D) -> Result<u64, D::Error> {
     let seq = u64::deserialize(input)?;
     match i64::try_from(seq) {
         Ok(_) => Ok(seq),

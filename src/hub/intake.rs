@@ -71,7 +71,7 @@ fn parse<T: DeserializeOwned + FromStation>(message: &Message, topic: Topic) -> 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::fleet::message::HealthMessage;
+    use crate::fleet::message::{HealthMessage, sequence_number};
 
     fn message(subject: &str, payload: &str) -> Message {
         Message {
@@ -83,6 +83,13 @@ mod tests {
             description: None,
             length: payload.len(),
         }
+    }
+
+    #[test]
+    fn a_number_that_no_journal_can_hold_is_refused() {
+        let read = |text: &str| sequence_number(&mut serde_json::Deserializer::from_str(text)).ok();
+        assert_eq!(read("9223372036854775807"), Some(i64::MAX as u64));
+        assert_eq!(read("9223372036854775808"), None);
     }
 
     #[test]
