@@ -157,6 +157,15 @@ pub fn own_spots(peaks: &[Peak], brighter: &[Peak], halo: impl Fn(f64) -> f64) -
     chosen
 }
 
+/// The share of its peak that a spot of an unknown shape may have `widths` from its centre.
+pub fn unknown_halo(widths: f64) -> f64 {
+    match widths {
+        d if d < 6.0 => 0.25,
+        d if d < 15.0 => 0.05,
+        _ => 0.02,
+    }
+}
+
 /// Pixels that are brighter than any spot's light could make them beside their neighbours: hot ones and cosmic rays. Needs spots
 /// wider than [`NARROWEST`] pixels.
 pub fn single_pixels(camera: &Camera, image: &[f64], background_j: f64, noise_j: f64) -> Vec<usize> {

@@ -109,15 +109,10 @@ impl<'a> Learner<'a> {
         self.model.radius_m()
     }
 
-    /// First sources: an unknown shape may have a quarter of its peak a few widths out and a twentieth further.
+    /// First sources.
     fn detect(&mut self) {
         let (camera, noise) = (self.camera, self.noise_j);
         let sigma = camera.spot_sigma_m;
-        let halo = |d: f64| match d / sigma {
-            d if d < 6.0 => 0.25,
-            d if d < 15.0 => 0.05,
-            _ => 0.02,
-        };
         let radius = self.radius_m();
         self.patches = self
             .images
@@ -131,7 +126,7 @@ impl<'a> Learner<'a> {
                     .map(|(v, w)| if *w > 0.0 { v - image.level } else { 0.0 })
                     .collect();
                 let peaks = self.filter.peaks(camera, &above, noise);
-                let own = detection::own_spots(&peaks, &[], halo);
+                let own = detection::own_spots(&peaks, &[], |d| detection::unknown_halo(d / sigma));
                 grouping::patches(camera, k, image, own.iter().map(Source::from).collect(), radius)
             })
             .collect();

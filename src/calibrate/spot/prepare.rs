@@ -114,9 +114,7 @@ pub fn prepare(camera: &Camera, frames: &[(usize, &Array2<f64>)]) -> Prepared {
         .filter_map(|image| spare_saturated(camera, image, limit))
         .count();
     let mut middle = middle_image(&images);
-    let light = |image: &Image| image.pixels.iter().map(|v| v - image.level).sum::<f64>() / image.pixels.len() as f64;
-    let light_j = images.iter().map(light).sum::<f64>() / images.len() as f64;
-    if let Some(stray) = stray_light::of(camera, &middle, noise_j, light_j) {
+    if let Some(stray) = stray_light::of(camera, &images, &middle, noise_j) {
         subtract(images.iter_mut().map(|i| &mut i.pixels).chain([&mut middle]), &stray);
     }
     let pattern_j = fixed_pattern::of(camera.x.n, &images, &middle, least_noise_j);
