@@ -5,6 +5,7 @@ mod alert;
 mod alert_ids;
 mod alert_lifecycle;
 mod ambiguity;
+mod beyond_view;
 mod by_user;
 mod cleared_causes;
 mod config;

@@ -6,6 +6,7 @@ use nalgebra::{Vector2, Vector6};
 
 use super::alert::{Acknowledgement, Alert, AlertEvent, AlertKind, Withdrawal};
 use super::ambiguity::mark_unresolvable;
+use super::beyond_view::leave_out_halos;
 use super::config::{Config, Source};
 use super::finding::{Cause, Finding};
 use super::frame_context::FrameContext;
@@ -215,7 +216,9 @@ impl Monitor {
     /// Detections to tracks, our pose, and which track is associated with which claim.
     fn track(&mut self, estimate: &Estimate, energy_scale: f64, store: &Store, dt: f64) {
         let frame = &mut self.frame;
+        let usual_energy_j = |user: &str| self.memory.co_located.usual_energy_j(user);
         let mut detections = Detection::of(estimate, energy_scale, &frame.view);
+        leave_out_halos(&mut detections, &frame.claims, &frame.view, usual_energy_j);
         frame.tracker.predict(frame.now);
         frame.register(&mut detections, dt);
         frame.tracker.take(frame.now, &detections, dt);
@@ -235,7 +238,6 @@ impl Monitor {
         for (claim, displacement) in frame.claims.iter_mut().zip(displacements) {
             claim.position += displacement;
         }
-        let usual_energy_j = |user: &str| self.memory.co_located.usual_energy_j(user);
         mark_unresolvable(
             &mut frame.claims,
             &frame.tracker,
