@@ -219,8 +219,8 @@ impl Monitor {
         let usual_energy_j = |user: &str| self.memory.co_located.usual_energy_j(user);
         let mut detections = Detection::of(estimate, energy_scale, &frame.view);
         leave_out_halos(&mut detections, &frame.claims, &frame.view, usual_energy_j);
-        frame.tracker.predict(frame.now);
-        frame.register(&mut detections, dt);
+        let elapsed = frame.tracker.predict(frame.now);
+        frame.register(&mut detections, elapsed);
         frame.tracker.take(frame.now, &detections, dt);
         frame.light.update(&frame.tracker, &frame.view);
         let hit = frame.tracker.tracks.iter().filter(|t| t.hit);
@@ -228,12 +228,12 @@ impl Monitor {
         let beams = hit.map(|t| t.filter.position()).filter(|p| !frame.lights.has_at(*p));
         let beams: Vec<Vector2<f64>> = beams.collect();
         let period_s = frame.timing.period_s().unwrap_or(ASSUMED_PERIOD_S);
-        frame.update_bias(dt, period_s);
+        frame.update_bias(elapsed, period_s);
         let mut witnesses = witnesses(&frame.claims, &frame.tracker);
         for witness in &mut witnesses {
             witness.claimed += frame.bias_at(witness.claimed);
         }
-        frame.pose.update(&beams, &witnesses, dt, period_s);
+        frame.pose.update(&beams, &witnesses, elapsed, period_s);
         let displacements: Vec<_> = (frame.claims.iter().map(|c| frame.displacement_at(c.position))).collect();
         for (claim, displacement) in frame.claims.iter_mut().zip(displacements) {
             claim.position += displacement;

@@ -2,6 +2,9 @@
 
 use std::collections::BTreeMap;
 
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
 use super::stage::{CROWD, Expect, Reviewed, Story, expose_in_turns, review, scene_file};
 
 /// Which track answered for a user over the story, each once.
@@ -53,6 +56,28 @@ fn exposures_in_turns_raise_nothing_and_energies_are_those_of_the_long_ones() {
         // Each is a mean over 300 frames that scintillate by 29 %.
         let ratio = energies(1) / energies(0);
         assert!((0.9..1.1).contains(&ratio), "{ratio}");
+    }
+}
+
+/// Seven of eight frames hold no pixel: what tracks have in common moves from one usable frame to the next.
+#[test]
+fn frames_that_cannot_be_used_lead_no_tracks_astray_below_a_platform_that_sways() {
+    for seed in 0..6 {
+        let mut story = Story::with(
+            seed,
+            "[platform]\nsway = { amplitude_deg = [6, 5], period_s = [5.0, 4.0] }\ntelemetry.delay_s = 0.03\n",
+        );
+        story.change(|scene| {
+            scene.rate_hz = 100.0;
+            scene.link.integration_time_s = 0.01;
+        });
+        story.seconds = 4.0;
+        story.tamper = Box::new(move |t, made| {
+            if !ChaCha8Rng::seed_from_u64(t.to_bits() ^ seed).random_bool(0.125) {
+                made.frame.pixels.fill(f64::NAN);
+            }
+        });
+        review(&story).expect(&[]);
     }
 }
 

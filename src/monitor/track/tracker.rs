@@ -47,8 +47,8 @@ impl Tracker {
         self.take(time, detections, dt_s);
     }
 
-    /// Predicts every track to `time`.
-    pub fn predict(&mut self, time: Timestamp) {
+    /// Predicts every track to `time`; returns how far, s.
+    pub fn predict(&mut self, time: Timestamp) -> f64 {
         let elapsed = self.time.map_or(0.0, |t| seconds(t, time)).max(0.0);
         self.time = Some(time);
         if elapsed > FORGET_AFTER_S {
@@ -57,9 +57,11 @@ impl Tracker {
         for track in &mut self.tracks {
             track.filter.predict(elapsed);
         }
+        elapsed
     }
 
-    /// Links one frame's detections to the tracks, which are predicted to its time; `dt_s` is the time since the last frame, s.
+    /// Links one frame's detections to the tracks, which are predicted to its time; `dt_s` is the time since the last frame, usable or
+    /// not, s.
     pub fn take(&mut self, time: Timestamp, detections: &[Detection], dt_s: f64) {
         let owner = self.link(detections);
         let mut hit = vec![None; self.tracks.len()];
