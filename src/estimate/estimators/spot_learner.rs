@@ -103,14 +103,16 @@ impl SpotLearner {
 
     /// Learns from a frame that was searched.
     pub fn learn(&mut self, search: &mut FrameSearch, found: &Found, budgets: &mut Budgets) -> Lesson {
-        if found.hypothesis.sources.is_empty() || search.frame.smear.is_some() {
+        if found.hypothesis.sources.is_empty() {
             return Lesson::Nothing;
         }
         let groups = groups_as_spots(&found.hypothesis);
         let is_shown = found.spot_error > search.least_spot_error();
         if self.learned.is_none() {
             self.rest = self.rest.saturating_sub(1);
-            let is_misfit = is_shown && search.shown_by_recent_frames().is_some() || groups.is_some();
+            // What uneven light along a smear may be hides a misfit of the shape.
+            let is_hidden = search.compressed.unevenness > 0.0;
+            let is_misfit = is_shown && search.shown_by_recent_frames().is_some() || groups.is_some() || is_hidden;
             if !is_misfit || self.rest > 0 {
                 return Lesson::Nothing;
             }
@@ -198,7 +200,13 @@ impl SpotLearner {
         let mut are_unseen_added = false;
         for _ in 0..MOST_PASSES {
             let mut spot = known.at(&at);
-            spot.add(&search.reweighting.space.bases, &search.frame, &candidate.sources);
+            let smear = search.compressed.smear.as_ref();
+            spot.add(
+                &search.reweighting.space.bases,
+                &search.frame,
+                smear,
+                &candidate.sources,
+            );
             let (shape, error) = spot.shape(&self.camera)?;
             let camera = Camera {
                 spot_shape: Some(Arc::new(shape)),

@@ -32,7 +32,7 @@ const SEVEN_NODES: [(f64, f64); 7] = [
 /// Covariance over the smaller variance from which five nodes leave more than 10⁻⁴ of a spot's peak (0.4 % at 0.34, where seven leave a tenth
 /// of that).
 const NEARLY_ROUND: f64 = 0.18;
-const WHOLE: [(f64, f64); 1] = [(0.0, 1.0)];
+pub(crate) const WHOLE: [(f64, f64); 1] = [(0.0, 1.0)];
 /// Shares of a component that is one term.
 const ONE: [f64; 1] = [1.0];
 

@@ -10,9 +10,10 @@ use faer::{Mat, Scale, Side};
 use crate::estimate::model::bases::Bases;
 use crate::estimate::model::halo;
 use crate::estimate::model::hypothesis::PointSource;
+use crate::estimate::model::separable_model::WHOLE;
 use crate::estimate::preprocess::screening::PreprocessedFrame;
-use crate::optics::Camera;
 use crate::optics::spot::{Field, SpotShape, Template};
+use crate::optics::{Camera, DisplacedSpots};
 
 /// Radius out to which the spot is learned, σ.
 const REACH: f64 = 12.0;
@@ -77,10 +78,16 @@ impl LearnedSpot {
         }
     }
 
-    /// Adds what a frame says, whose sources are these.
-    pub fn add(&mut self, bases: &Bases, frame: &PreprocessedFrame, sources: &[PointSource]) {
+    /// Adds what a frame says, whose sources are these, smeared by motion.
+    pub fn add(
+        &mut self,
+        bases: &Bases,
+        frame: &PreprocessedFrame,
+        smear: Option<&DisplacedSpots>,
+        sources: &[PointSource],
+    ) {
         let count = self.coefficients.len();
-        let (mut normal, right) = self.normal_equations(bases, frame, sources);
+        let (mut normal, right) = self.normal_equations(bases, frame, smear, sources);
         let others = normal.nrows() - count;
         for k in count..normal.nrows() {
             normal[(k, k)] = normal[(k, k)] * (1.0 + 1e-9) + f64::MIN_POSITIVE;
@@ -106,9 +113,12 @@ impl LearnedSpot {
         &self,
         bases: &Bases,
         frame: &PreprocessedFrame,
+        smear: Option<&DisplacedSpots>,
         sources: &[PointSource],
     ) -> (Mat<f64>, Mat<f64>) {
         let count = self.coefficients.len();
+        let motion = smear.map_or(WHOLE.as_slice(), |smear| &smear.nodes);
+        let displacement = |u: [f64; 2]| smear.map_or([0.0; 2], |smear| smear.displacement(u));
         let background = count + OF_SOURCE * sources.len();
         let size = background + OF_BACKGROUND;
         let (mut normal, mut right) = (Mat::zeros(size, size), Mat::zeros(size, 1));
@@ -122,16 +132,15 @@ impl LearnedSpot {
                 let u = centre(&bx.edges, x);
                 for (i, source) in sources.iter().enumerate() {
                     let offset = [u - source.u[0], v - source.u[1]];
-                    if offset[0].hypot(offset[1]) < REACH {
-                        self.add_to_row(
-                            [bx.pitch(), by.pitch()],
-                            source.a,
-                            offset,
-                            &mut row,
-                            count + OF_SOURCE * i,
-                        );
-                        used.extend(count + OF_SOURCE * i..count + OF_SOURCE * (i + 1));
+                    if offset[0].hypot(offset[1]) >= REACH {
+                        continue;
                     }
+                    let (own, moved) = (count + OF_SOURCE * i, displacement(source.u));
+                    for (part, share) in motion {
+                        let offset = [0, 1].map(|k| offset[k] - part * moved[k]);
+                        self.add_to_row([bx.pitch(), by.pitch()], share * source.a, offset, &mut row, own);
+                    }
+                    used.extend(own..own + OF_SOURCE);
                 }
                 used.extend((0..count).filter(|j| row[*j] != 0.0));
                 row[background..].copy_from_slice(&[1.0, u, v]);
@@ -285,7 +294,7 @@ mod tests {
         }
         let mut spot = LearnedSpot::new(&bases);
         for _ in 0..3 {
-            spot.add(&bases, &frame, &sources);
+            spot.add(&bases, &frame, None, &sources);
         }
         let (shape, error) = spot.shape(&camera).unwrap();
         let sigma = camera.spot_sigma_m;
