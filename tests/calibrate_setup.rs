@@ -201,6 +201,11 @@ fn what_is_missing_or_in_the_way_is_named() {
         angle.contains("--field-of-view-deg") && angle.contains("400"),
         "{angle}"
     );
+    for counts in ["0", "-5", "nan"] {
+        let limit = format!("--saturation-counts={counts}");
+        let said = refusal(setup(&["--altitude-m", "100", &limit], &out), 2);
+        assert!(said.contains("saturation-counts"), "{counts}: {said}");
+    }
     assert!(!Path::new(&out).exists());
 
     let lens = [

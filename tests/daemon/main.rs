@@ -17,6 +17,7 @@ mod reload;
 mod siege;
 mod telemetry;
 
+use std::io::Write;
 use std::path::Path;
 use std::process::Command;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -119,6 +120,10 @@ fn a_bad_config_ends_the_program_before_a_port_is_bound() {
             "[[webhook]]\nurl = \"http://127.0.0.1:1\"\nsecret_file = \"absent\"\n",
             "absent",
         ),
+        (
+            "[fleet]\nurl = \"nats://127.0.0.1:1\"\nsite = \"s\"\nstation = \"a\"\nnkey_file = \"absent.nk\"\n",
+            "absent.nk",
+        ),
     ] {
         let file = dir.path().join("bad.toml");
         std::fs::write(&file, config).unwrap();
@@ -135,6 +140,23 @@ fn a_bad_config_ends_the_program_before_a_port_is_bound() {
             assert_eq!(output.status.code(), Some(64), "{said}");
         }
     }
+}
+
+#[test]
+fn a_log_that_nobody_reads_stops_nothing() {
+    /// Linux's capacity of a pipe.
+    const CAPACITY: usize = 65_536;
+    let dir = tempfile::tempdir().unwrap();
+    let (unread, mut full) = std::io::pipe().unwrap();
+    full.write_all(&[b'x'; CAPACITY]).unwrap();
+    let daemon = Daemon::start_logging_to(full.into(), dir.path(), "run", "");
+    let seen = daemon.wait_for("/v1/positions", "positions", |v| v["frame"].is_u64());
+    daemon.wait_for("/v1/positions", "newer positions", |v| {
+        v["frame"].as_u64() > seen["frame"].as_u64()
+    });
+    daemon.signal("-TERM");
+    assert_eq!(daemon.end().0, Some(0));
+    drop(unread);
 }
 
 #[test]

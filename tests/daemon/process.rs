@@ -27,6 +27,11 @@ impl Daemon {
 
     /// As another command than `run`.
     pub fn start_as(dir: &Path, command: &str, config: &str) -> Self {
+        Self::start_logging_to(Stdio::piped(), dir, command, config)
+    }
+
+    /// With its log elsewhere than in what [`Self::end`] gives, unless that is a pipe.
+    pub fn start_logging_to(log: Stdio, dir: &Path, command: &str, config: &str) -> Self {
         let port = free_port();
         let file = dir.join("oapwatch.toml");
         std::fs::write(&file, config).unwrap();
@@ -36,11 +41,11 @@ impl Daemon {
             .args([command, "--config"])
             .arg(&file)
             .args(["--listen", &format!("127.0.0.1:{port}")])
-            .stderr(Stdio::piped())
+            .stderr(log)
             .spawn()
             .unwrap();
-        let stderr = BufReader::new(child.stderr.take().unwrap());
-        let log = std::thread::spawn(move || stderr.lines().map_while(Result::ok).collect());
+        let lines = child.stderr.take().map(|stderr| BufReader::new(stderr).lines());
+        let log = std::thread::spawn(move || lines.into_iter().flatten().map_while(Result::ok).collect());
         let url = format!("http://127.0.0.1:{port}");
         Self { child, url, log }
     }
