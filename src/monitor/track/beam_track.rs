@@ -30,6 +30,9 @@ const JUST_MISSED_S: f64 = 0.35;
 /// Share of the time that a merged track counts as missed: it lives 1.5 s/0.2 = 7.5 s, longer than two users take to walk past
 /// each other, and not for ever.
 const MERGED_MISS_SHARE: f64 = 0.2;
+/// Signal-to-noise ratio below which a frame shows no emitter. Larger takes faint beams that merge for missed ones, smaller has beams merge into an
+/// emitter that has gone dark.
+const LEAST_SNR: f64 = 4.0;
 /// How far back a track knows where it was, s, for claims that come late or seldom, and in what steps. Longer serves later claims and takes
 /// memory (30 kB for a minute); finer steps follow turns more exactly. Not tuned.
 const TRAIL_S: f64 = 60.0;
@@ -179,11 +182,13 @@ impl Track {
         let here = self.filter.position();
         let spread = largest_eigenvalue(&self.filter.position_cov()).sqrt().min(1.0);
         let is_near = |d: &Detection| (d.position - here).norm() < d.resolution_m + GATE_FLOOR_M + 3.0 * spread;
+        // Without it an emitter is known from earlier frames alone, and hides nobody.
+        let has_light = |d: &Detection| d.snr > LEAST_SNR;
         let mut spots = followed
             .iter()
             .enumerate()
             .filter_map(|(j, whose)| Some((j, (*whose)?)));
-        spots.find(|(j, _)| was_there && is_near(&detections[*j]))
+        spots.find(|(j, _)| was_there && is_near(&detections[*j]) && has_light(&detections[*j]))
     }
 
     fn count(&mut self, hit: bool) {

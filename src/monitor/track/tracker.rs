@@ -215,6 +215,20 @@ mod tests {
     }
 
     #[test]
+    fn a_beam_that_is_missed_merges_into_light_and_not_into_what_is_dark() {
+        for (snr, is_merged) in [(100.0, true), (2.0, false)] {
+            let mut scene = Scene::new();
+            let apart = 0.5 * detection(0.0, 0.0).resolution_m;
+            (0..5).for_each(|_| scene.show(&[0.0, apart]));
+            let mut left = detection(0.0, 0.0);
+            left.snr = snr;
+            scene.tracker.step(at(6), &[left], 0.1);
+            let missed = &scene.tracker.tracks[1];
+            assert!(!missed.hit && missed.merged_into.is_some() == is_merged, "{snr}");
+        }
+    }
+
+    #[test]
     fn a_confirmed_track_outlives_a_second_and_a_half() {
         let mut scene = Scene::new();
         (0..5).for_each(|_| scene.show(&[0.0]));
