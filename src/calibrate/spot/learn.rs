@@ -29,7 +29,7 @@ const MOST_SPLINES: usize = 97;
 /// Largest half of the support, half sensors: spots near an edge show their tails as far as the other edge.
 const WIDEST: f64 = 1.8;
 /// Light at the edge that matters: of the brightest spot, in standard deviations of one pixel. The tails of five spots at this height add
-/// up to a quarter of an emitter's threshold, by estimate; more leaves them to the spot error, less takes longer. Not measured.
+/// up to a quarter of an emitter's threshold, by estimate; more leaves them to the spot error, less takes longer.
 const EDGE_LIGHT: f64 = 0.1;
 /// Relative fall of χ² per degree of freedom below which there are no more rounds.
 const SETTLED: f64 = 1e-3;
@@ -270,9 +270,7 @@ impl<'a> Learner<'a> {
         let camera = self.camera;
         let reach = 4.0 * camera.spot_sigma_m;
         let noise_share = |e: f64, norm: f64| 4.0 * self.noise_j / (e * norm);
-        let norm = norm(camera, &self.model);
-        let misfits = self.misfits();
-        let mut found = Vec::new();
+        let (norm, misfits, mut found) = (norm(camera, &self.model), self.misfits(), Vec::new());
         for (patch, misfits) in self.patches.iter_mut().zip(misfits) {
             let is_odd: Vec<bool> = patch
                 .sources
@@ -318,11 +316,21 @@ impl<'a> Learner<'a> {
         }
     }
 
-    /// Whether light at the edge of the support matters, and there is room for more.
-    fn is_cut_short(&self) -> bool {
+    /// Whether light at the edge of a model's support matters.
+    fn is_cut_short(&self, model: &TemplateModel) -> bool {
         let energies = self.patches.iter().flat_map(|p| &p.sources).map(|s| s.energy_j);
         let brightest = energies.fold(0.0, f64::max);
-        constraints::light_at_edge(self.camera, &self.model) * brightest > EDGE_LIGHT * self.noise_j
+        constraints::light_at_edge(self.camera, model) * brightest > EDGE_LIGHT * self.noise_j
+    }
+
+    /// The model out to where its light ends to matter: a pupil's is known farther out than it was learned.
+    pub fn as_far_as_seen(&self) -> TemplateModel {
+        let mut model = self.model.clone();
+        let half_m = self.camera.x.half_width().max(self.camera.y.half_width());
+        while model.pupil.is_some() && model.radius_m() < 2.0 * half_m && self.is_cut_short(&model) {
+            model = model.widened((GROWTH * model.n as f64) as usize | 1);
+        }
+        model
     }
 
     /// Rounds until χ² settles; the support grows while there is light at its edge.
@@ -354,7 +362,7 @@ impl<'a> Learner<'a> {
             before = chi2;
             self.step(round == 0 && self.model.degree == 0);
             let may_grow = self.model.degree == 0 || self.model.pupil.is_some();
-            if (1..=3).contains(&round) && may_grow && self.is_cut_short() {
+            if (1..=3).contains(&round) && may_grow && self.is_cut_short(&self.model) {
                 let wanted = (GROWTH * self.radius_m()).min(widest);
                 let n = (2.0 * wanted / self.model.knot_m) as usize;
                 let n = (n | 1).min(MOST_SPLINES);

@@ -219,10 +219,12 @@ pub fn learn(
     let mut after = Learner::with_model(camera, &held, noise_j, &model, misfit);
     let odd_held = after.mask_odd().len();
     after.fit(6);
+    let known = after.as_far_as_seen();
+    let after = after.refitted(known.clone());
     let count = Separable::needed(&after).unwrap_or(1);
     let dark = || Error::NotAlike { share: 100.0 };
-    let separable = Separable::of(camera, &model, count).ok_or_else(dark)?;
-    let after = after.refitted(separable.template(&model));
+    let separable = Separable::of(camera, &known, count).ok_or_else(dark)?;
+    let after = after.refitted(separable.template(&known));
     let before = after.refitted(TemplateModel::of_camera(camera, &model));
     let fit = |learner: &Learner| Fit {
         chi2: learner.patches.iter().map(|p| p.chi2).sum(),
@@ -247,17 +249,18 @@ pub fn learn(
     let mut last = Learner::with_model(camera, &images, noise_j, &model, misfit);
     run(&mut last, LAST_ROUNDS, "all frames");
     let information = statistics::information(&last);
-    let separable = Separable::of(camera, &last.model, count).ok_or_else(dark)?;
-    let shape = separable.shape(&last.model).ok_or_else(dark)?;
+    let model = last.as_far_as_seen();
+    let separable = Separable::of(camera, &model, count).ok_or_else(dark)?;
+    let shape = separable.shape(&model).ok_or_else(dark)?;
     if is_shape_better {
         checks::compact(&shape)?;
     }
     let peak_snr = statistics::peak_snr(&last);
     let spots = last.sources();
-    let left_out = (constraints::light_left_out(camera, &last.model) / LEFT).min(Camera::LARGEST_SPOT_ERROR);
+    let left_out = (constraints::light_left_out(camera, &model) / LEFT).min(Camera::LARGEST_SPOT_ERROR);
     let shape = shape.with_beyond(Some(Beyond {
         error: left_out,
-        from_m: constraints::known_radius_m(&last.model),
+        from_m: constraints::known_radius_m(&model),
     }));
     let spot_error = variance
         .spot_error
