@@ -9,7 +9,7 @@ use crate::optics::Camera;
 const NARROW: f64 = 8.5;
 /// Width, σ, up to which the halo of a measured spot is light on most of the sensor. Larger leaves curved daylight through a calibrated lens to
 /// invented sources, smaller takes an Airy disc's rings for daylight, and sources to make up for it.
-const HALO: f64 = 20.0;
+const HALO: f64 = 40.0;
 
 /// What a frame is compressed into and predicted in.
 pub(crate) struct Bases {
