@@ -17,7 +17,7 @@ const REACH: f64 = 6.5;
 const SHARE: f64 = 0.15;
 
 /// Takes out of `detections` what may be the halo of users who claim to be beyond the view, of each user's usual energy (`usual_energy_j`), or where
-/// that is not known the detections'.
+/// that is not known the detections'. Names that no beam has answered count for nothing: whoever writes claims could cover the edges with them.
 pub(super) fn leave_out_halos(
     detections: &mut Vec<Detection>,
     claims: &[ActiveClaim],
@@ -26,7 +26,9 @@ pub(super) fn leave_out_halos(
 ) {
     let usual_of_all = median_high(detections.iter().map(|d| d.energy_j)).unwrap_or(0.0);
     let reach_m = REACH * spot_m(view);
-    let beyond = claims.iter().filter(|c| !is_near_view(view, c.position, 0.0));
+    let beyond = claims
+        .iter()
+        .filter(|c| c.before.was_seen() && !is_near_view(view, c.position, 0.0));
     let beyond: Vec<(Vector2<f64>, f64)> = beyond
         .map(|c| (c.position, usual_energy_j(&c.claim.user).unwrap_or(usual_of_all)))
         .collect();
@@ -50,7 +52,7 @@ mod tests {
         let view = View::level(&optics::Config::default().camera().unwrap());
         let edge_m = view.ground_scale() * view.camera.x.half_width();
         let spot_m = spot_m(&view);
-        let left = |claimed_m: f64, share: f64, inside_spots: f64, flags: Flags| {
+        let left = |claimed_m: f64, share: f64, inside_spots: f64, flags: Flags, was_seen: bool| {
             let of = |x: f64, share: f64, flags: Flags| Detection {
                 energy_j: share * 1e-12,
                 flags,
@@ -61,15 +63,17 @@ mod tests {
                 of(20.0, 1.0, Flags::empty()),
                 of(edge_m - inside_spots * spot_m, share, flags),
             ];
-            let claims = [active_claim("u", edge_m + claimed_m, 0.0)];
-            leave_out_halos(&mut detections, &claims, &view, |_| None);
+            let mut claim = active_claim("u", edge_m + claimed_m, 0.0);
+            claim.before.last_seen = was_seen.then_some(claim.made);
+            leave_out_halos(&mut detections, &[claim], &view, |_| None);
             detections.len()
         };
         let beyond_m = 3.0 * spot_m;
-        assert_eq!(left(beyond_m, 0.05, 1.0, Flags::NEAR_EDGE), 2);
-        assert_eq!(left(beyond_m, 0.5, 1.0, Flags::NEAR_EDGE), 3);
-        assert_eq!(left(beyond_m, 0.05, 1.0, Flags::empty()), 3);
-        assert_eq!(left(beyond_m, 0.05, 4.0, Flags::NEAR_EDGE), 3);
-        assert_eq!(left(-spot_m, 0.05, 1.0, Flags::NEAR_EDGE), 3);
+        assert_eq!(left(beyond_m, 0.05, 1.0, Flags::NEAR_EDGE, true), 2);
+        assert_eq!(left(beyond_m, 0.05, 1.0, Flags::NEAR_EDGE, false), 3);
+        assert_eq!(left(beyond_m, 0.5, 1.0, Flags::NEAR_EDGE, true), 3);
+        assert_eq!(left(beyond_m, 0.05, 1.0, Flags::empty(), true), 3);
+        assert_eq!(left(beyond_m, 0.05, 4.0, Flags::NEAR_EDGE, true), 3);
+        assert_eq!(left(-spot_m, 0.05, 1.0, Flags::NEAR_EDGE, true), 3);
     }
 }
