@@ -29,7 +29,7 @@ const MOST_SPLINES: usize = 97;
 /// Largest half of the support, half sensors: spots near an edge show their tails as far as the other edge.
 const WIDEST: f64 = 1.8;
 /// Light at the edge that matters: of the brightest spot, in standard deviations of one pixel. The tails of five spots at this height add
-/// up to a quarter of an emitter's threshold, by estimate; more leaves them to the spot error, less takes longer.
+/// up to a quarter of an emitter's threshold, by estimate; more leaves them to the spot error, less takes longer. Not measured.
 const EDGE_LIGHT: f64 = 0.1;
 /// Relative fall of χ² per degree of freedom below which there are no more rounds.
 const SETTLED: f64 = 1e-3;
@@ -109,11 +109,10 @@ impl<'a> Learner<'a> {
         self.model.radius_m()
     }
 
-    /// First sources.
+    /// First sources: peaks that no spot's halo explains, whatever its shape.
     fn detect(&mut self) {
-        let (camera, noise) = (self.camera, self.noise_j);
-        let sigma = camera.spot_sigma_m;
-        let radius = self.radius_m();
+        let (camera, noise, radius) = (self.camera, self.noise_j, self.radius_m());
+        let halo = |d: f64| detection::unknown_halo(d / camera.spot_sigma_m);
         self.patches = self
             .images
             .par_iter()
@@ -126,7 +125,7 @@ impl<'a> Learner<'a> {
                     .map(|(v, w)| if *w > 0.0 { v - image.level } else { 0.0 })
                     .collect();
                 let peaks = self.filter.peaks(camera, &above, noise);
-                let own = detection::own_spots(&peaks, &[], |d| detection::unknown_halo(d / sigma));
+                let own = detection::own_spots(&peaks, &[], halo);
                 grouping::patches(camera, k, image, own.iter().map(Source::from).collect(), radius)
             })
             .collect();
@@ -270,7 +269,9 @@ impl<'a> Learner<'a> {
         let camera = self.camera;
         let reach = 4.0 * camera.spot_sigma_m;
         let noise_share = |e: f64, norm: f64| 4.0 * self.noise_j / (e * norm);
-        let (norm, misfits, mut found) = (norm(camera, &self.model), self.misfits(), Vec::new());
+        let norm = norm(camera, &self.model);
+        let misfits = self.misfits();
+        let mut found = Vec::new();
         for (patch, misfits) in self.patches.iter_mut().zip(misfits) {
             let is_odd: Vec<bool> = patch
                 .sources

@@ -225,7 +225,7 @@ pub fn learn(
     let dark = || Error::NotAlike { share: 100.0 };
     let separable = Separable::of(camera, &known, count).ok_or_else(dark)?;
     let after = after.refitted(separable.template(&known));
-    let before = after.refitted(TemplateModel::of_camera(camera, &model));
+    let before = after.refitted(TemplateModel::of_camera(camera, &known));
     let fit = |learner: &Learner| Fit {
         chi2: learner.patches.iter().map(|p| p.chi2).sum(),
         degrees_of_freedom: learner.patches.iter().map(|p| p.degrees_of_freedom()).sum(),
