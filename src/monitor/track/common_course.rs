@@ -31,6 +31,10 @@ const LOST_M_S: f64 = 0.2;
 /// Time in which they are back once poses tell again, s: the first ones tell most. Not tuned.
 const BACK_S: f64 = 1.5;
 
+/// Time over which the newest errors' mean square is taken, s. Longer still states how tracks swung before the delay of the poses was
+/// learned, shorter scatters.
+const NEWEST_S: f64 = 2.0;
+
 /// Variance of the mean of white errors over that of the same mean of what is left of them against tracks that follow it.
 const FOLLOWED: f64 = 1.4;
 
@@ -137,7 +141,7 @@ impl CommonCourse {
         self.velocity += error * pull.velocity;
         if pull.position > 0.0 {
             self.averaged_s = (self.averaged_s + dt).min(AVERAGED_S);
-            let of_mean = (dt / self.averaged_s.min(MEMORY_S)).min(1.0);
+            let of_mean = (dt / self.averaged_s.min(NEWEST_S)).min(1.0);
             self.newest += (error - self.newest) * pull.share_of_newest(dt);
             self.newest_square += (self.newest * self.newest.transpose() - self.newest_square) * of_mean;
             let below = |cov: &Matrix6<f64>| (by_pose * cov * by_pose.transpose()).trace();
