@@ -10,6 +10,10 @@ use super::distortion::Distortion;
 use super::error::Error;
 use crate::toml_file::Key;
 
+/// Share of its level by which a saturated pixel may lie below it: counts times joules per count are rounded, to single precision in some
+/// recordings. A sixteenth of a count of 16 bits.
+const ROUNDING: f64 = 1e-6;
+
 /// `[optics]` of a config or scene. What is left out takes the value of the paper's scene.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -195,7 +199,7 @@ impl Config {
             noise_std_j: positive("noise_std_j", self.noise_std_j)?,
             quantum_j: None,
             joules_per_count: self.joules_per_count,
-            saturation_j: self.saturation_j,
+            saturation_j: self.saturation_j.map(|level| level * (1.0 - ROUNDING)),
             spot_growth: 0.0,
             spot_shape: None,
             spot_error: self.spot_error.map_or(SpotError::AtLeast(0.0), SpotError::Fixed),
@@ -206,6 +210,25 @@ impl Config {
             (Some(calibration), _) => Ok(calibration.applied_to(&camera)?),
             (None, Some(path)) => Err(Error::CalibrationNotRead(path.clone())),
             (None, None) => Ok(camera),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_saturated_pixel_is_one_however_its_joules_are_rounded() {
+        for (joules_per_count, level) in [(3e-8, 0.00012285), (1.7e-4 / 4095.0, 1.7e-4)] {
+            let config = Config {
+                saturation_j: Some(level),
+                ..Config::default()
+            };
+            let limit = config.camera().expect("valid").saturation_limit_j();
+            let clipped = 4095.0 * joules_per_count;
+            assert!(clipped >= limit && f64::from(clipped as f32) >= limit, "{level}");
+            assert!(4094.0 * joules_per_count < limit);
         }
     }
 }
