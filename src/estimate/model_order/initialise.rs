@@ -18,6 +18,9 @@ const PENCIL_FIT_STEPS: usize = 100;
 /// Peaks below this share of the highest one wait for the next round: what an imperfect fit leaves around a bright source would pass for
 /// faint ones.
 const STRONG_PEAK: f64 = 0.1;
+/// Most peaks that are fitted together where no hypothesis is searched, the strongest: a step's time grows with the cube of their number, its
+/// memory with the square.
+const MOST_PEAKS: usize = 300;
 /// A rival that leaves less than this share of the deviance is no sign of noise that grows with the light: sources explain it.
 const RIVAL_SHARE: f64 = 0.5;
 
@@ -184,9 +187,10 @@ pub(crate) fn filter_peaks(search: &mut Search) -> Hypothesis {
         search.criterion.source_penalty.sqrt(),
         1.0,
     );
-    let mut hypothesis = Hypothesis::empty(Nuisances::default());
-    hypothesis
-        .sources
-        .extend(peaks.iter().map(|p| PointSource::new(p.u, p.a)));
-    hypothesis
+    search.context.budget.is_limited |= peaks.len() > MOST_PEAKS;
+    let strongest = peaks.iter().take(MOST_PEAKS);
+    Hypothesis {
+        sources: strongest.map(|p| PointSource::new(p.u, p.a)).collect(),
+        ..Hypothesis::empty(Nuisances::default())
+    }
 }

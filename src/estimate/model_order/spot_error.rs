@@ -136,7 +136,7 @@ pub(crate) fn explained_by_width(search: &mut Search, hypothesis: &Hypothesis) -
     })
 }
 
-/// The highest peaks of the frame, whatever a hypothesis made of it.
+/// The highest peaks of the frame, as many as a hypothesis may have, whatever one made of it.
 fn highest_peaks(search: &mut Search, hypothesis: &Hypothesis) -> Vec<PointSource> {
     let mut dark = Candidate::from(Hypothesis::empty(Nuisances {
         background: hypothesis.nuisances.background,
@@ -146,7 +146,8 @@ fn highest_peaks(search: &mut Search, hypothesis: &Hypothesis) -> Vec<PointSourc
     let peaks = search.residual_peaks(&mut dark);
     let least = peaks.first().map_or(0.0, |p| HIGH_PEAK * p.significance);
     let high = peaks.iter().take_while(|p| p.significance >= least);
-    high.map(|p| PointSource::new(p.u, p.a)).collect()
+    let most = search.compressed().max_sources();
+    high.take(most).map(|p| PointSource::new(p.u, p.a)).collect()
 }
 
 /// The bright spots of a frame that `hypothesis` explains by a width and faint sources, and the spot error that they show, where a lens
