@@ -49,7 +49,7 @@ fn event(event: AlertEventKind, mut alert: Alert) -> AlertEvent {
         AlertEventKind::Acknowledged => AlertState::Acknowledged,
         AlertEventKind::Cleared => AlertState::Cleared,
     };
-    AlertEvent { event, alert }
+    AlertEvent::new(event, alert)
 }
 
 fn raised(id: &str, raised_s: i64) -> AlertEvent {

@@ -36,10 +36,7 @@ fn raised(k: u64) -> AlertEvent {
         acknowledgement: None,
         station: None,
     };
-    AlertEvent {
-        event: AlertEventKind::Raised,
-        alert,
-    }
+    AlertEvent::new(AlertEventKind::Raised, alert)
 }
 
 fn open(dir: &Path) -> Journal {

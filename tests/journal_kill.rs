@@ -59,7 +59,7 @@ fn event(kind: AlertEventKind, id: &str) -> AlertEvent {
         acknowledgement: None,
         station: None,
     };
-    AlertEvent { event: kind, alert }
+    AlertEvent::new(kind, alert)
 }
 
 fn journal_in(dir: &Path) -> journal::Config {

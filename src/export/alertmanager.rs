@@ -125,7 +125,7 @@ impl Alertmanager {
             return vec![test];
         }
         let own = |severity, end| self.entry(alert, severity, message.now, end);
-        match event.event {
+        match event.told_as() {
             AlertEventKind::Cleared => vec![own(alert.severity, Some(alert.cleared_at.unwrap_or(message.now)))],
             // The severity has changed: the alert of the one before is over.
             AlertEventKind::Updated => [Severity::Info, Severity::Warning, Severity::Critical]

@@ -42,7 +42,7 @@ impl Syslog {
         let alert = &event.alert;
         let what = match message.is_test {
             true => "test".to_owned(),
-            false => word(event.event),
+            false => word(event.told_as()),
         };
         let header = format!(
             "<{}>1 {:.6} {} oapwatch {} {what}",

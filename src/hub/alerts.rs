@@ -170,7 +170,10 @@ impl HubAlerts {
             }
         }
         open.alert = alert;
-        Some(event(update.event, &open.alert))
+        Some(AlertEvent {
+            released: update.released,
+            ..event(update.event, &open.alert)
+        })
     }
 
     fn clear_member(&mut self, member: &Member, alert: Alert) -> Option<AlertEvent> {
@@ -306,10 +309,7 @@ fn note_reporters(alert: &mut Alert, members: &[Member]) {
 }
 
 fn event(event: AlertEventKind, alert: &Alert) -> AlertEvent {
-    AlertEvent {
-        event,
-        alert: alert.clone(),
-    }
+    AlertEvent::new(event, alert.clone())
 }
 
 #[cfg(test)]

@@ -18,10 +18,7 @@ fn told(kind: AlertEventKind, id: &str, alert: AlertKind, user: Option<&str>, x_
         "cleared_at": null, "user": user, "x_m": x_m, "y_m": 0.0, "cov_m2": null, "claimed": null, "evidence": {},
         "source": { "kind": "simulator", "frame": 0 },
     });
-    AlertEvent {
-        event: kind,
-        alert: serde_json::from_value(alert).unwrap(),
-    }
+    AlertEvent::new(kind, serde_json::from_value(alert).unwrap())
 }
 
 fn stranger(kind: AlertEventKind, id: &str, x_m: f64) -> AlertEvent {

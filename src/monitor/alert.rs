@@ -217,10 +217,7 @@ impl Alert {
 
     /// A step in its life, with the alert as it is now.
     pub(super) fn event(&self, event: AlertEventKind) -> AlertEvent {
-        AlertEvent {
-            event,
-            alert: self.clone(),
-        }
+        AlertEvent::new(event, self.clone())
     }
 
     /// Takes an operator's note of it. Whether that changes anything: an alert that is acknowledged takes only another note.
@@ -277,6 +274,27 @@ pub enum AlertEventKind {
 pub struct AlertEvent {
     pub event: AlertEventKind,
     pub alert: Alert,
+    /// The maintenance in which it was raised is over: receivers have heard nothing of it yet.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub released: bool,
+}
+
+impl AlertEvent {
+    pub fn new(event: AlertEventKind, alert: Alert) -> Self {
+        Self {
+            event,
+            alert,
+            released: false,
+        }
+    }
+
+    /// What it is to receivers.
+    pub fn told_as(&self) -> AlertEventKind {
+        match self.released {
+            true => AlertEventKind::Raised,
+            false => self.event,
+        }
+    }
 }
 
 #[cfg(test)]

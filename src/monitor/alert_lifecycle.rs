@@ -203,7 +203,10 @@ impl AlertLifecycle {
             alert.severity = severity;
             if has_escalated || is_released {
                 alert.source.frame = frame;
-                self.events.push(alert.event(AlertEventKind::Updated));
+                self.events.push(AlertEvent {
+                    released: is_released,
+                    ..alert.event(AlertEventKind::Updated)
+                });
             }
             return;
         }

@@ -175,3 +175,19 @@ fn an_acknowledgement_and_its_withdrawal_are_events_of_an_open_alert() {
     assert!(alerts.acknowledge("none", acknowledgement()).is_none());
     assert_eq!(alerts.unacknowledge(&id, withdrawal()).unwrap().event, Unacknowledged);
 }
+
+#[test]
+fn what_stands_when_maintenance_ends_is_raised_to_receivers_once() {
+    let (mut alerts, cause) = (lifecycle(), unseen("a"));
+    let mut told = |maintenance: Option<&str>, s: f64| {
+        let mut content = Content::new(Severity::Warning, json!({}));
+        content.maintenance = maintenance.map(str::to_owned);
+        alerts.apply(vec![Finding::present(cause.clone(), content)], at(s), 7);
+        let events = alerts.take_events();
+        events.iter().map(|e| (e.event, e.told_as())).collect::<Vec<_>>()
+    };
+    assert_eq!(told(Some("mast"), 0.0), [(Raised, Raised)]);
+    assert_eq!(told(Some("mast"), 1.0), []);
+    assert_eq!(told(None, 2.0), [(Updated, Raised)]);
+    assert_eq!(told(None, 3.0), []);
+}

@@ -77,7 +77,7 @@ impl CoolDown {
     /// Decides on a new event's delivery.
     pub(super) fn judge(&mut self, delivery: Waiting, event: &AlertEvent, now: Duration) -> Ruling {
         let alert = &event.alert;
-        match event.event {
+        match event.told_as() {
             AlertEventKind::Raised => self.raised(delivery, alert, now),
             AlertEventKind::Updated => self.updated(delivery, alert, now),
             AlertEventKind::Cleared => self.cleared(delivery, alert, now),
@@ -259,7 +259,7 @@ mod tests {
                 station: None,
             };
             let numbers = |rows: Vec<Waiting>| rows.iter().map(|r| r.seq.to_string()).collect::<Vec<_>>().join(" ");
-            match self.cool_down.judge(delivery, &AlertEvent { event, alert }, s(now)) {
+            match self.cool_down.judge(delivery, &AlertEvent::new(event, alert), s(now)) {
                 Ruling::Send(rows) => format!("send {}", numbers(rows)),
                 Ruling::Hold => "hold".into(),
                 Ruling::Withhold(rows) => format!("withhold {}", numbers(rows)),

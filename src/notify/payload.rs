@@ -24,7 +24,7 @@ pub(super) fn body(recorded: &Recorded, is_test: bool) -> Vec<u8> {
     let event = &recorded.event;
     match is_test {
         true => json(TEST, recorded.at, &event.alert),
-        false => json(event.event, recorded.at, &event.alert),
+        false => json(event.told_as(), recorded.at, &event.alert),
     }
 }
 
@@ -59,10 +59,7 @@ pub fn test_event(now: Timestamp) -> Recorded {
     Recorded {
         seq: 0,
         at: now,
-        event: AlertEvent {
-            event: AlertEventKind::Cleared,
-            alert,
-        },
+        event: AlertEvent::new(AlertEventKind::Cleared, alert),
     }
 }
 

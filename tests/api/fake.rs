@@ -120,10 +120,7 @@ impl Fake {
 
     /// Raises without waiting for the journal.
     pub fn raise_at_once(&self, id: &str) {
-        let event = AlertEvent {
-            event: AlertEventKind::Raised,
-            alert: alert(id, 0),
-        };
+        let event = AlertEvent::new(AlertEventKind::Raised, alert(id, 0));
         let events = self.feed.number(vec![event], at(0));
         self.journal.record_numbered(&events, at(0)).unwrap();
         self.feed.publish_events(events);
@@ -171,7 +168,7 @@ pub async fn until_closed(mut stream: TcpStream) -> String {
 }
 
 pub async fn publish(feed: &Feed, journal: &Journal, event: AlertEventKind, alert: Alert) {
-    let events = feed.number(vec![AlertEvent { event, alert }], at(0));
+    let events = feed.number(vec![AlertEvent::new(event, alert)], at(0));
     journal.record_numbered(&events, at(0)).unwrap();
     journal.settled().await;
     feed.publish_events(events);

@@ -49,7 +49,7 @@ pub fn event(event: AlertEventKind, id: &str, kind: AlertKind) -> AlertEvent {
         acknowledgement: None,
         station: None,
     };
-    AlertEvent { event, alert }
+    AlertEvent::new(event, alert)
 }
 
 pub fn life(id: &str) -> [AlertEvent; 3] {
