@@ -132,7 +132,7 @@ pub async fn enable(
 /// Sends a signed event that is marked as a test, once
 ///
 /// Its `type` is `webhook.test`, and its alert is made up. It is sent whatever the webhook's kinds and state are, counts for no
-/// retry, and the answer is waited for 5 s.
+/// retry, and the answer is waited for as long as for any other, 10 s at most.
 #[utoipa::path(post, path = "/v1/webhooks/{name}/test", tag = "webhooks",
     params(("name" = String, Path, description = "The webhook's name")),
     responses(

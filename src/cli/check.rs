@@ -83,7 +83,12 @@ fn send(receivers: &[Endpoint], json: bool, out: &mut impl Write) -> Outcome {
     let runtime = runtime.map_err(Failure::other)?;
     let mut failed = 0;
     for receiver in receivers {
-        let outcome = runtime.block_on(notify::send_test(receiver, "check", notify::Clock::wall()));
+        let outcome = runtime.block_on(notify::send_test(
+            receiver,
+            "check",
+            notify::Clock::wall(),
+            std::time::Duration::MAX,
+        ));
         failed += usize::from(!outcome.delivered);
         let Endpoint {
             name, kind, shown_url, ..

@@ -13,8 +13,8 @@ use crate::notify::{AskError, Clock, Endpoint, payload};
 
 /// Test events to one endpoint: often enough while somebody sets a receiver up, and no means to flood it.
 const TEST_EVERY: Duration = Duration::from_secs(5);
-/// Longest wait for the answer to a test event, while the operator's own request waits for it.
-const TEST_TIMEOUT: Duration = Duration::from_secs(5);
+/// Longest wait for the answer to a test event while a request to the API waits for it, which itself ends after 15 s unless configured.
+const REQUEST_WAITS: Duration = Duration::from_secs(10);
 
 /// What an operator asks of the worker.
 pub(in crate::notify) enum Command {
@@ -98,7 +98,9 @@ impl Worker {
                 }
                 lane.tested_at = Some(now);
                 let (endpoint, journal, clock) = (lane.endpoint.clone(), self.journal.clone(), self.clock);
-                tokio::spawn(async move { done.send(Ok(send_test(&endpoint, journal.id(), clock).await)) });
+                tokio::spawn(
+                    async move { done.send(Ok(send_test(&endpoint, journal.id(), clock, REQUEST_WAITS).await)) },
+                );
             }
             Command::Replace { endpoints, done } => {
                 let before: Vec<String> = self.lanes.iter().map(|lane| lane.endpoint.name.clone()).collect();
@@ -112,8 +114,9 @@ impl Worker {
     }
 }
 
-/// Sends a test event like any other, but once and beside the queue. `journal` is the name in its id.
-pub async fn send_test(endpoint: &Endpoint, journal: &str, clock: Clock) -> TestOutcome {
+/// Sends a test event like any other, but once and beside the queue, and waits for the answer as long as for any, `longest` at most.
+/// `journal` is the name in its id.
+pub async fn send_test(endpoint: &Endpoint, journal: &str, clock: Clock, longest: Duration) -> TestOutcome {
     let now = clock.now();
     let id = format!("msg_{journal}_test_{}", now.as_millisecond());
     let began = clock.uptime();
@@ -123,7 +126,7 @@ pub async fn send_test(endpoint: &Endpoint, journal: &str, clock: Clock) -> Test
         is_test: true,
         now,
     };
-    let (status, failure) = match super::deliver(endpoint, message, TEST_TIMEOUT).await {
+    let (status, failure) = match super::deliver(endpoint, message, endpoint.timeout.min(longest)).await {
         Verdict::Delivered(status) => (status, None),
         Verdict::Gone | Verdict::Expired => (Some(StatusCode::GONE), Some(Failure::Status(StatusCode::GONE))),
         Verdict::Failed { failure, .. } => (failure.status(), Some(failure)),
