@@ -22,8 +22,9 @@ const MAX_NOTE: usize = 1000;
 pub struct Config {
     pub x_m: f64,
     pub y_m: f64,
-    /// How far the light may be from there.
-    pub radius_m: f64,
+    /// How far the light may be from there; it follows from what is learned when left out.
+    #[serde(default)]
+    pub radius_m: Option<f64>,
     #[serde(default)]
     pub note: Option<String>,
     /// When the approval ends; never when left out.
@@ -154,14 +155,14 @@ pub fn from_config(configs: &[Config]) -> Result<Vec<KnownLight>, String> {
             id: format!("config-{:08x}", hash as u32),
             x_m: config.x_m,
             y_m: config.y_m,
-            radius_m: config.radius_m,
+            radius_m: config.radius_m.unwrap_or(DEFAULT_RADIUS_M),
             note: config.note.clone(),
             until: config.until,
             by: None,
             at: None,
             alert: None,
             source: LightSource::Config,
-            is_radius_stated: true,
+            is_radius_stated: config.radius_m.is_some(),
             learned: None,
         };
         light.check().map_err(|e| format!("known_light {}: {e}", k + 1))?;

@@ -8,7 +8,7 @@ pub fn known(places: &[[f64; 2]]) -> Vec<KnownLight> {
     let config = |[x_m, y_m]: &[f64; 2]| KnownLightConfig {
         x_m: *x_m,
         y_m: *y_m,
-        radius_m: 2.0,
+        radius_m: Some(2.0),
         note: None,
         until: None,
     };

@@ -16,7 +16,7 @@ fn known(places: &[[f64; 2]], radius_m: f64) -> impl Fn(f64, &mut Monitor, &[oap
         .map(|[x_m, y_m]| KnownLightConfig {
             x_m: *x_m,
             y_m: *y_m,
-            radius_m,
+            radius_m: Some(radius_m),
             note: Some("street lamp".into()),
             until: None,
         })
