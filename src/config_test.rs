@@ -2,6 +2,28 @@
 
 use super::*;
 
+/// The service's config says what the default one says, but where its files are.
+#[test]
+fn the_installed_config_differs_by_its_files_only() {
+    let [default, installed] = [
+        include_str!("../config/default.toml"),
+        include_str!("../deploy/oapwatch.toml"),
+    ]
+    .map(|text| text.lines().skip(1));
+    assert_eq!(default.clone().count(), installed.clone().count());
+    let is_of_a_file = |line: &str| {
+        ["/var/lib/oapwatch", "$CREDENTIALS_DIRECTORY"]
+            .iter()
+            .any(|f| line.contains(f))
+    };
+    for (default, installed) in default.zip(installed) {
+        assert!(
+            default == installed || is_of_a_file(installed),
+            "{default}\n{installed}"
+        );
+    }
+}
+
 #[test]
 fn paths_lead_from_the_config_s_folder_or_to_a_credential() {
     let base = Path::new("/etc/oapwatch");
