@@ -39,6 +39,7 @@ pub struct PictureQuery {
         (status = 200, description = "The picture", body = Vec<u8>, content_type = "image/png"),
         (status = 304, description = "Nothing new since the ETag given in If-None-Match"),
         (status = 400, description = "A parameter cannot be read", body = Problem, content_type = "application/problem+json"),
+        (status = 404, description = "A hub has no frames", body = Problem, content_type = "application/problem+json"),
         (status = 503, description = "There is no usable frame", body = Problem, content_type = "application/problem+json"),
     ))]
 pub async fn frame_png(
@@ -47,6 +48,9 @@ pub async fn frame_png(
     headers: HeaderMap,
 ) -> Result<Response, Problem> {
     let latest = positions::latest(&state)?;
+    if latest.snapshot.pose.is_none() {
+        return Err(Problem::not_found("a hub has no frames: ask a station".to_owned()));
+    }
     let none = || {
         Problem::later(
             StatusCode::SERVICE_UNAVAILABLE,

@@ -4,6 +4,7 @@ use axum::Json;
 use axum::Router;
 use axum::routing::get;
 use utoipa::openapi::security::{HttpAuthScheme, HttpBuilder, SecurityScheme};
+use utoipa::openapi::{ContentBuilder, Ref, Response, ResponseBuilder};
 use utoipa::{Modify, OpenApi};
 use utoipa_axum::router::OpenApiRouter;
 use utoipa_axum::routes;
@@ -39,7 +40,7 @@ impl Modify for Bearer {
 
 /// The routes, and their description made from the same code.
 pub fn router() -> (Router<State>, utoipa::openapi::OpenApi) {
-    OpenApiRouter::with_openapi(Described::openapi())
+    let (routes, mut description) = OpenApiRouter::with_openapi(Described::openapi())
         .routes(routes!(positions::positions))
         .routes(routes!(geojson::positions))
         .routes(routes!(geojson::footprint))
@@ -78,7 +79,54 @@ pub fn router() -> (Router<State>, utoipa::openapi::OpenApi) {
         .routes(routes!(probes::healthz))
         .routes(routes!(probes::readyz))
         .routes(routes!(probes::metrics))
-        .split_for_parts()
+        .split_for_parts();
+    describe_refusals(&mut description);
+    (routes, description)
+}
+
+/// Adds to every operation what the guards before it answer.
+fn describe_refusals(description: &mut utoipa::openapi::OpenApi) {
+    for (path, item) in &mut description.paths.paths {
+        let is_probe = matches!(path.as_str(), "/healthz" | "/readyz");
+        let operations = [
+            (&mut item.get, false),
+            (&mut item.put, true),
+            (&mut item.post, true),
+            (&mut item.delete, true),
+        ];
+        for (operation, changes) in operations {
+            let refusals = [
+                (
+                    "401",
+                    "A token is asked for, and none that is known was sent",
+                    !is_probe,
+                ),
+                ("403", "The token may only look", changes),
+                ("421", "The name in Host is not the monitor's", true),
+                (
+                    "429",
+                    "Too many requests of one client; Retry-After says how long to wait",
+                    !is_probe,
+                ),
+            ];
+            for (status, meaning, _) in refusals.into_iter().filter(|r| r.2) {
+                if let Some(operation) = operation {
+                    let responses = &mut operation.responses.responses;
+                    responses
+                        .entry(status.to_owned())
+                        .or_insert_with(|| problem(meaning).into());
+                }
+            }
+        }
+    }
+}
+
+fn problem(meaning: &str) -> Response {
+    let body = ContentBuilder::new().schema(Some(Ref::from_schema_name("Problem")));
+    ResponseBuilder::new()
+        .description(meaning)
+        .content("application/problem+json", body.build())
+        .build()
 }
 
 /// Serves the description; where no token is asked for, it asks for none.

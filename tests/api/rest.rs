@@ -293,6 +293,9 @@ async fn the_description_is_openapi_3_1_and_lists_every_path() {
     ] {
         assert!(api["paths"][path].is_object(), "{path}");
     }
+    let refused = |path: &str, method: &str, status: &str| api["paths"][path][method]["responses"][status].is_object();
+    assert!(refused("/v1/positions", "get", "401") && refused("/v1/zones", "put", "403"));
+    assert!(!refused("/healthz", "get", "401") && !refused("/v1/positions", "get", "403"));
     let acknowledge = &api["paths"]["/v1/alerts/{id}/acknowledge"];
     assert!(acknowledge["post"]["requestBody"].is_object() && acknowledge["delete"].is_object());
     assert_ne!(
