@@ -10,7 +10,7 @@ import { claimIcon, icon } from "./marks.js";
 import { Places } from "./places.js";
 import { poseWords, showStations, viewWords } from "./stations.js";
 import { Timeline } from "./timeline.js";
-import { el, fullStamp, lasting, micros, shown, zone } from "./words.js";
+import { el, fullStamp, lasting, micros, shown, stamp, zone } from "./words.js";
 
 const $ = (id) => document.getElementById(id);
 const FRAME_EVERY_MS = 500;
@@ -218,7 +218,9 @@ function notices() {
   if (source.kind === "fleet" && !latest.status.stations?.length) texts.push("No access point has said anything yet.");
   if (source.kind === "replay") texts.push("Replay: these frames come from a recording.");
   if (latest.status.fit?.hint) texts.push(`${latest.status.fit.hint}. Until then positions may be less precise, and faint beams beside bright ones unseen.`.replace(/^./, (c) => c.toUpperCase()));
-  if (journal.place === "memory") texts.push("Journal in memory: a restart of the monitor forgets all alerts. [journal] path in its config keeps them.");
+  const work = places.maintenance(Date.parse(latest.time));
+  if (work) texts.push(`Maintenance until ${stamp(Date.parse(work.until), Date.parse(latest.time))} by ${shown(work.by)}: alerts are recorded and not sent.`);
+  if (journal.place === "memory") texts.push("Journal in memory: a restart of the monitor forgets alerts, and what was drawn or approved. [journal] path in its config keeps them.");
   const list = $("notices");
   list.hidden = !texts.length;
   if (list.textContent !== texts.join("")) list.replaceChildren(...texts.map((text) => el("li", {}, text)));

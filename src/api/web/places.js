@@ -81,6 +81,11 @@ export class Places {
     this.warn();
   }
 
+  // The maintenance that is in force.
+  maintenance(now) {
+    return this.windows.find((w) => Date.parse(w.from) <= now && now < Date.parse(w.until));
+  }
+
   // Ground on which a stranger raises nothing.
   warn() {
     if (!this.half) return;
