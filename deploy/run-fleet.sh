@@ -12,10 +12,12 @@ port=8790
 for station in ap1:builtin ap2:eavesdropper ap3:windy; do
 	name=${station%:*}
 	mkdir -p "$work/$name"
+	# Users of its own: of one name at two places each would be an attack.
+	sed "s/\"u-/\"$name-u-/g" "$scenes/${station#*:}.toml" >"$work/$name/scene.toml"
 	cat >"$work/$name/oapwatch.toml" <<-TOML
 		[source]
 		kind = "simulator"
-		scene = "$scenes/${station#*:}.toml"
+		scene = "scene.toml"
 		[journal]
 		path = "journal.db"
 		[fleet]
