@@ -141,7 +141,7 @@ impl User {
             .consistency
             .excess(tolerated + unsure, &frame.systematic_cov(claim.position));
         self.is_mismatched |= frame.is_settled() && (self.outside >= OUTSIDE_FRAMES || excess.neg_log_p > threshold);
-        let track = track.filter(|_| !claim.ended && self.is_mismatched)?;
+        let track = track.filter(|_| self.is_mismatched)?;
         let distance = (track.filter.position() - claim.position).norm();
         let severity = if self.is_displaced || distance > CRITICAL_RATIO * tolerated {
             Severity::Critical

@@ -58,13 +58,18 @@ impl Eligibility<'_> {
         if claim.before.is_established() {
             return true;
         }
+        let is_alerted = self.alerts.is_open(&Cause::Track(track.id));
         if !self.crowding.is_crowded() {
+            // No word of a newcomer makes of a stranger who has been told of a user who is elsewhere.
+            let is_new = claim.before.track != Some(track.id);
+            let would_be_told_otherwise = is_alerted && is_new && !self.may_have_come(claim, track, owner);
             return claim.before.was_seen()
-                || !(self.has_walked_onto(claim, track) || (is_anothers && self.is_handed_on(claim, owner)));
+                || !(would_be_told_otherwise
+                    || self.has_walked_onto(claim, track)
+                    || (is_anothers && self.is_handed_on(claim, owner)));
         }
         // Where the beam was when the claim was made: a newcomer may be on the move.
         let beam = track.at(claim.made).unwrap_or(track.filter.position());
-        let is_alerted = self.alerts.is_open(&Cause::Track(track.id));
         !is_alerted && !is_anothers && (beam - claim.position).norm() <= self.crowding.reach_m()
     }
 
@@ -196,8 +201,21 @@ mod tests {
         // One who is heard later, or was claimed elsewhere then, came to the beam.
         let later = scene.hear("later", 40.0, 0.0);
         assert!(allows(&scene, &later, false));
-        let moved = newcomer(&mut scene, 46.0);
+        let moved = newcomer(&mut scene, 45.4);
         assert!(allows(&scene, &moved, false));
+    }
+
+    #[test]
+    fn an_alerted_beam_is_that_of_a_newcomer_near_it_only() {
+        let mut scene = scene();
+        scene.now += SignedDuration::from_secs(1);
+        let content = Content::new(Severity::Warning, serde_json::json!({}));
+        scene.apply(vec![Finding::present(Cause::Track(2), content)]);
+        scene.now += SignedDuration::from_secs(1);
+        for (off, is_allowed) in [(4.0, true), (12.0, false), (25.0, false)] {
+            let claim = scene.hear(&format!("{off} m off"), STRANGER[0] + off, 0.0);
+            assert_eq!(allows(&scene, &claim, false), is_allowed, "{off}");
+        }
     }
 
     #[test]
