@@ -152,7 +152,7 @@ impl Pipeline {
     pub fn step(&mut self, frame: &Frame) -> Step {
         let began = Instant::now();
         let digest = frame.digest();
-        let placement = self.platform.at(frame.time);
+        let placement = self.platform.at(frame.time, &self.camera);
         let smear = frame
             .exposure_s
             .and_then(|s| self.platform.smear(&placement, &self.camera, frame.time, s));

@@ -6,7 +6,7 @@ use nalgebra::{Matrix2, Matrix2x3, Matrix2x6, Matrix3, Matrix6, Vector2, Vector3
 
 use super::pose_error::PoseError;
 use super::terrain::{Ground, Terrain};
-use crate::optics::Camera;
+use crate::optics::{Axis, Camera};
 use crate::pose::{Mount, Pose, swap_ned_enu};
 
 /// Least angle to the ground, as the sine, of a ray that meets it: on a plane, flatter ones end more than fifty heights away.
@@ -106,6 +106,13 @@ impl Sight {
         let by_tangents = Matrix2::from_columns(&[along.column(1).into_owned(), along.column(0).into_owned()]);
         point.by_sensor = by_tangents * Matrix2::new(d, -b, -c, a) / det;
         Some(point)
+    }
+
+    /// Whether the middle of the sensor or one of its corners shows ground.
+    pub fn sees_ground(&self, camera: &Camera) -> bool {
+        let [x, y] = [&camera.x, &camera.y].map(Axis::half_width);
+        let places = [[0.0, 0.0], [x, y], [x, -y], [-x, y], [-x, -y]];
+        places.into_iter().any(|sensor| self.ground(camera, sensor).is_some())
     }
 
     /// Where the ray from the lens through a place meets the ground: where a beam from there appears to come from.

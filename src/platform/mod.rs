@@ -274,8 +274,8 @@ impl Platform {
         }
     }
 
-    /// Where the camera is at a frame's `time`, by the poses received.
-    pub fn at(&mut self, time: Timestamp) -> Placement {
+    /// Where `camera` is at a frame's `time`, by the poses received. One that shows it no ground cannot be true and is none.
+    pub fn at(&mut self, time: Timestamp, camera: &Camera) -> Placement {
         let stamp = self.stamp(time);
         let found = match &self.source {
             Source::Level => return Placement::Level,
@@ -286,20 +286,24 @@ impl Platform {
             }),
             Source::Replay(_, poses) | Source::Live(_, poses) => poses.at(stamp),
         };
-        let Some(mut pose) = found else {
+        let seen = found.and_then(|mut pose| {
+            let by_delay = pose.rates * self.delay_std_s();
+            pose.pose.cov += by_delay * by_delay.transpose();
+            let sight = Sight::new(&pose.pose, &self.mount).over(self.terrain.clone());
+            sight.sees_ground(camera).then_some((sight, pose))
+        });
+        let Some((sight, pose)) = seen else {
             let waited_s = seconds(*self.waiting_since.get_or_insert(time), time).max(0.0);
             return Placement::Unknown {
                 waited_s,
                 is_lost: waited_s > self.lost_s,
             };
         };
-        let by_delay = pose.rates * self.delay_std_s();
-        pose.pose.cov += by_delay * by_delay.transpose();
-        let is_lost = pose.age_s > self.lost_s;
+        self.waiting_since = None;
         Placement::At {
-            sight: Sight::new(&pose.pose, &self.mount).over(self.terrain.clone()),
+            sight,
+            is_lost: pose.age_s > self.lost_s,
             pose: Box::new(pose),
-            is_lost,
         }
     }
 }
@@ -320,6 +324,7 @@ mod tests {
             let value: f64 = StandardNormal.sample(&mut rng);
             value * noise_rad
         };
+        let camera = crate::optics::Config::default().camera().unwrap();
         let at = |s: f64| Timestamp::UNIX_EPOCH + SignedDuration::from_nanos(((100.0 + s) * 1e9).round() as i64);
         let tilt = |s: f64| [0.05 * (0.785 * s).sin(), 0.05 * (0.63 * s + 1.0).sin()];
         let mut platform = Platform {
@@ -339,7 +344,7 @@ mod tests {
             // A frame that is seen when the next poses are there.
             let frame_s = s - 0.04;
             if k % 5 == 2 && frame_s > 0.0 {
-                let Placement::At { pose, .. } = platform.at(at(frame_s)) else {
+                let Placement::At { pose, .. } = platform.at(at(frame_s), &camera) else {
                     panic!("poses are there");
                 };
                 let truth = tilt(frame_s);
@@ -362,6 +367,32 @@ mod tests {
                 );
                 assert!(std_s < 0.005, "{std_s}");
             }
+        }
+    }
+
+    #[test]
+    fn a_pose_that_shows_no_ground_is_none() {
+        let camera = crate::optics::Config::default().camera().unwrap();
+        let at = |s: i64| Timestamp::from_second(s).unwrap();
+        let pose = |roll: f64, height_m: f64| Pose {
+            attitude: UnitQuaternion::from_euler_angles(roll, 0.0, 0.0),
+            ..Pose::level(at(0), [0.0, 0.0, height_m])
+        };
+        // Level, with half of the view above the horizon, upside down, and below the ground.
+        for (roll, height_m, is_one) in [
+            (0.0, 300.0, true),
+            (1.57, 300.0, true),
+            (3.1, 300.0, false),
+            (0.0, -5.0, false),
+        ] {
+            let mut platform = Platform {
+                source: Source::Fixed(pose(roll, height_m)),
+                ..Platform::level()
+            };
+            platform.at(at(0), &camera);
+            let placement = platform.at(at(60), &camera);
+            let is_told = matches!(placement, Placement::Unknown { is_lost: true, .. });
+            assert_eq!(is_told, !is_one, "{roll} {height_m}");
         }
     }
 }
