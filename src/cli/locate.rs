@@ -34,8 +34,7 @@ pub struct Args {
 }
 
 /// Why a frame has no positions although its emitters may be seen.
-const NO_POSE: &str =
-    "no pose of the platform is known at this time: expected [platform] poses, or a recording that holds them";
+const NO_POSE: &str = "no pose of the platform is known at this time from which the camera sees ground: expected [platform] poses, or a recording that holds them";
 
 /// One line of the output.
 #[derive(Serialize)]
@@ -52,6 +51,9 @@ struct Line {
     /// Share of a spot's light by which the spots were taken to differ from the model.
     #[serde(skip_serializing_if = "Option::is_none")]
     spot_error: Option<f64>,
+    /// The search ended early: emitters may be missing, all of them too.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    is_cut_short: bool,
 }
 
 /// An emitter in the world.
@@ -82,7 +84,7 @@ impl Locator {
     /// Where the camera was at a frame's time, by the poses that came with the frame or are on file.
     fn placement(&mut self, poses: Vec<Pose>, time: Timestamp) -> Placement {
         self.platform.receive(poses, time);
-        self.platform.at(time)
+        self.platform.at(time, &self.view.camera)
     }
 
     fn smear(&self, placement: &Placement, frame: &Frame) -> Option<Smear> {
@@ -152,7 +154,7 @@ pub fn run(args: Args) -> Outcome {
     let path = recorded.path().to_owned();
     let mut out = std::io::BufWriter::new(std::io::stdout().lock());
     let bar = progress::count("frames");
-    let (mut usable, mut misshapen, mut first_error) = (0_u64, 0_u64, None);
+    let (mut usable, mut misshapen, mut cut_short, mut first_error) = (0_u64, 0_u64, 0_u64, None);
     for shot in recorded {
         let Shot {
             index,
@@ -199,7 +201,9 @@ pub fn run(args: Args) -> Outcome {
             latency_us,
             reduced_chi2: estimate.as_ref().ok().map(|e| e.reduced_chi2),
             spot_error: estimate.as_ref().ok().map(|e| e.spot_error).filter(|e| *e > 0.0),
+            is_cut_short: estimate.as_ref().is_ok_and(|e| e.is_cut_short),
         };
+        cut_short += u64::from(line.is_cut_short);
         misshapen += u64::from(line.spot_error.is_some_and(|share| share > camera.spot_error.least()));
         serde_json::to_writer(&mut out, &line).map_err(|e| Failure::other(std::io::Error::from(e)))?;
         writeln!(out).map_err(Failure::other)?;
@@ -207,6 +211,11 @@ pub fn run(args: Args) -> Outcome {
     }
     bar.finish_and_clear();
     out.flush().map_err(Failure::other)?;
+    if cut_short > 0 {
+        eprintln!(
+            "{cut_short} of {usable} frames: the search ended early, emitters may be missing ([estimator] budget_ms, or more light than can be searched)"
+        );
+    }
     if 2 * misshapen > usable {
         eprintln!(
             "{misshapen} of {usable} frames: the spot is not what the config says (positions may be less precise, faint emitters \
