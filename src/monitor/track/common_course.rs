@@ -33,7 +33,7 @@ const BACK_S: f64 = 1.5;
 
 /// Time over which the newest errors' mean square is taken, s. Longer still states how tracks swung before the delay of the poses was
 /// learned, shorter scatters.
-const NEWEST_S: f64 = 2.0;
+const NEWEST_S: f64 = 3.0;
 
 /// Variance of the mean of white errors over that of the same mean of what is left of them against tracks that follow it.
 const FOLLOWED: f64 = 1.4;
