@@ -1,6 +1,7 @@
 //! Large sensors from outside: windows of a frame give the answers of the whole frame, find all emitters, and say where they reach a limit.
 
 use std::sync::Arc;
+use std::time::Instant;
 
 use ndarray::{Array2, s};
 use oapwatch::estimate::{Config, Emitter, Estimate, Estimator, Flags, Rules, build};
@@ -254,6 +255,26 @@ fn a_limit_that_is_reached_is_flagged() {
         .unwrap();
     assert!(found.is_limited && found.emitters.len() < 100);
     assert!(found.emitters.iter().all(|e| e.flags.contains(Flags::LIMIT_REACHED)));
+}
+
+/// Thousands of peaks in one hypothesis took gigabytes and minutes.
+#[test]
+fn light_in_rows_is_searched_with_as_many_sources_as_a_hypothesis_may_have() {
+    let camera = Camera {
+        spot_sigma_m: 1e-3 / SIGMA,
+        ..camera([128, 128])
+    };
+    let rows = Array2::from_shape_fn((128, 128), |(y, _)| if y % 3 == 0 { 1000.0 } else { 0.0 });
+    let lit = Frame {
+        pixels: frame(&camera, &[], 1).pixels + rows * camera.noise_std_j,
+        ..frame(&camera, &[], 1)
+    };
+    for (name, most) in [("peak-fit", 300), ("subpixel-peak", 300), ("ml", 80)] {
+        let began = Instant::now();
+        let found = estimator(name, Rules::default(), &camera).estimate(&lit).unwrap();
+        assert!(found.is_limited && found.emitters.len() <= most, "{name}");
+        assert!(began.elapsed().as_secs() < 30, "{name}: {:?}", began.elapsed());
+    }
 }
 
 #[test]
