@@ -26,9 +26,11 @@ run-fleet: build
 build: setup
 	cargo build --release --locked
 
-# Tests share the program's build. Where CI is set nothing is skipped: what a test needs is installed first.
+# Tests share the program's build. Where CI is set nothing is skipped: what a test needs is installed first, and this crate (not its
+# dependencies) has overflow checks and debug assertions.
+CHECKED := --config 'profile.release.package.oapwatch.debug-assertions=true' --config 'profile.release.package.oapwatch.overflow-checks=true'
 test: setup $(if $(CI),setup-test,test-skips)
-	cargo test --release --locked
+	cargo test --release --locked $(if $(CI),$(CHECKED))
 
 .PHONY: test-skips
 test-skips:
@@ -39,12 +41,6 @@ test-skips:
 	@command -v mosquitto_sub >/dev/null || echo "Skipping MQTT clients of the fleet: mosquitto-clients is missing (make setup-test installs it)"
 	@test -x target/systems/bin/taky || echo "Skipping TAK and SAPIENT: taky or sapient-pydantic is missing (make setup-test installs them)"
 	@test -x target/schemathesis/bin/schemathesis || echo "Skipping requests made from the API's description: schemathesis is missing (make setup-test installs it)"
-
-.PHONY: test-checked
-# The tests with overflow checks and debug assertions in this crate; its dependencies are those of the release build.
-CHECKED := --config 'profile.release.package.oapwatch.debug-assertions=true' --config 'profile.release.package.oapwatch.overflow-checks=true'
-test-checked: setup $(if $(CI),setup-test,test-skips)
-	cargo test --release --locked $(CHECKED)
 
 setup:
 	@command -v cargo >/dev/null || { echo "Rust is missing: install it from https://rustup.rs"; exit 1; }
@@ -67,7 +63,7 @@ test-licences: setup
 	@cargo metadata --locked --format-version 1 --manifest-path fuzz/Cargo.toml >/dev/null
 
 .PHONY: deb
-# The Debian package, target/oapwatch.deb, linted and measured. PROFILE=release builds what the tests have built already.
+# The Debian package, target/oapwatch.deb, linted and measured. PROFILE=release builds what `make run` has built already.
 PROFILE ?= dist
 deb: setup
 	$(call need,sh -c 'command -v lintian && command -v python3 && command -v systemd-analyze',lintian python3-minimal systemd)
