@@ -6,6 +6,7 @@ use super::constraints::{self, norm};
 use super::detection::{self, MatchedFilter, Peak};
 use super::flashes;
 use super::grouping::{self, Image};
+use super::parts;
 use super::patch::{Patch, Source};
 use super::pupil::Pupil;
 use super::solve;
@@ -302,7 +303,11 @@ impl<'a> Learner<'a> {
         let like = self
             .model
             .widened((knots | 1).clamp(self.model.n, MOST_SPLINES.max(self.model.n)));
-        self.adopt(like.with_pupil(Pupil::of_camera(self.camera, varies)));
+        self.adopt(like.with_pupil(Pupil::of_camera(self.camera)));
+        if varies {
+            self.fit(15);
+            self.model = self.model.with_pupil(parts::joined(self));
+        }
     }
 
     /// One step of the template and of everything else at once.

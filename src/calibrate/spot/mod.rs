@@ -12,6 +12,7 @@ mod fixed_pattern;
 mod flashes;
 mod grouping;
 mod learn;
+mod parts;
 mod patch;
 mod pixel_maps;
 mod prepare;

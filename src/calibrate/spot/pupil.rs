@@ -9,7 +9,7 @@ use crate::optics::spot::{FieldPolynomial, Template};
 /// Noll's polynomials 4 to 11: defocus, astigmatism, coma, trefoil, spherical (Noll, 1976). Tilt is the spot's place.
 pub const ZERNIKES: usize = 8;
 /// Coefficients of 1, u, v, u², uv, v², u and v over half the sensor.
-const FIELD: usize = 6;
+pub const FIELD: usize = 6;
 /// Samples across the pupil: the image repeats after as many λF.
 const SAMPLES: usize = 64;
 /// Parts of a sample along an axis by which the aperture's edge is told.
@@ -46,15 +46,25 @@ impl Pupil {
     pub const PARAMETERS: usize = 1 + ZERNIKES * FIELD;
     /// Ways in which the image at one place changes: its width and each polynomial there.
     pub const CHANGES: usize = 1 + ZERNIKES;
+    /// The change that is astigmatism along the diagonals, Noll's fifth polynomial.
+    pub const OBLIQUE_ASTIGMATISM: usize = 2;
 
-    /// Nearly the Airy disc whose core is the camera's Gaussian.
-    pub fn of_camera(camera: &Camera, varies: bool) -> Self {
+    /// Nearly the Airy disc whose core is the camera's Gaussian, the same everywhere.
+    pub fn of_camera(camera: &Camera) -> Self {
         let mut parameters = [0.0; Self::PARAMETERS];
         parameters[0] = (ZERO_PER_SIGMA * camera.spot_sigma_m).ln();
         for even in [0, 1, 2] {
             parameters[1 + FIELD * even] = START_WAVES;
         }
-        Self { parameters, varies }
+        Self {
+            parameters,
+            varies: false,
+        }
+    }
+
+    /// Whether change `k` is an even polynomial.
+    pub fn is_even(k: usize) -> bool {
+        matches!(k, 1..=3 | 8)
     }
 
     /// The derivatives of what changes the image at a field place by the parameters: one factor for each of the parameters, those of

@@ -72,17 +72,9 @@ impl TemplateModel {
             Some(shape) => shape.is_uniform(),
             None => camera.spot_growth == 0.0,
         };
-        if is_uniform {
-            return Self {
-                inner: 0,
-                degree: 0,
-                coefficients: at([0.0; 2]),
-                pupil: None,
-                ..*like
-            };
-        }
         let half = like.field.half_sensor_m;
-        like.projected(|[u, v]| vec![at([u * half[0], v * half[1]])]).remove(0)
+        like.over_field(|[u, v]| vec![at([u * half[0], v * half[1]])], !is_uniform)
+            .remove(0)
     }
 
     /// The templates on the same knots whose first components would be `at` at each place of the field, projected on the Legendre
@@ -119,7 +111,7 @@ impl TemplateModel {
         let at = |place: [f64; 2]| vec![aperture.coefficients(&pupil.local(place), self.n, self.knot_m)];
         Self {
             pupil: Some(pupil),
-            ..self.projected(at).remove(0)
+            ..self.over_field(at, pupil.varies).remove(0)
         }
     }
 
@@ -139,7 +131,25 @@ impl TemplateModel {
             };
             (0..Pupil::CHANGES).map(derivative).collect()
         };
-        self.projected(at).into_iter().map(|model| model.coefficients).collect()
+        self.over_field(at, pupil.varies)
+            .into_iter()
+            .map(|model| model.coefficients)
+            .collect()
+    }
+
+    /// The templates on the same knots that are `at` at each place of the field, or everywhere as in its middle.
+    fn over_field(&self, at: impl Fn([f64; 2]) -> Vec<Vec<f64>> + Sync, varies: bool) -> Vec<Self> {
+        if varies {
+            return self.projected(at);
+        }
+        let uniform = |coefficients| Self {
+            inner: 0,
+            degree: 0,
+            coefficients,
+            pupil: None,
+            ..*self
+        };
+        at([0.0; 2]).into_iter().map(uniform).collect()
     }
 
     pub fn radius_m(&self) -> f64 {
@@ -350,7 +360,10 @@ mod tests {
         };
         let camera = config.camera().expect("a camera");
         let like = TemplateModel::gaussian(&camera, 0.3e-3, 9e-3);
-        let mut pupil = Pupil::of_camera(&camera, true);
+        let mut pupil = Pupil {
+            varies: true,
+            ..Pupil::of_camera(&camera)
+        };
         // Coma along x that grows along u.
         pupil.parameters[Pupil::range(5)][1] = 0.12;
         let (model, changes) = (like.with_pupil(pupil), like.pupil_changes(&pupil));
