@@ -128,7 +128,7 @@ impl Pipeline {
 
     /// Takes the poses for a frame at `time`, after those `with_frame`. Returns all, for a recording.
     pub fn receive_poses(&mut self, with_frame: Vec<Pose>, time: Timestamp) -> Vec<Pose> {
-        self.platform.receive(with_frame, time)
+        self.platform.receive(with_frame, time, &self.camera)
     }
 
     pub fn estimator(&self) -> &'static str {

@@ -83,7 +83,7 @@ struct Locator {
 impl Locator {
     /// Where the camera was at a frame's time, by the poses that came with the frame or are on file.
     fn placement(&mut self, poses: Vec<Pose>, time: Timestamp) -> Placement {
-        self.platform.receive(poses, time);
+        self.platform.receive(poses, time, &self.view.camera);
         self.platform.at(time, &self.view.camera)
     }
 

@@ -192,8 +192,9 @@ impl Platform {
     }
 
     /// Takes the poses that are there for a frame at `time`, after those that a recording has `with_frame`. Returns them, so that a
-    /// recording of them has [`Platform::at`] say the same again. A file of poses is preferred to those of a recording.
-    pub fn receive(&mut self, with_frame: Vec<Pose>, time: Timestamp) -> Vec<Pose> {
+    /// recording of them has [`Platform::at`] say the same again. A file of poses is preferred to those of a recording. One that shows
+    /// `camera` no ground cannot be true and is refused.
+    pub fn receive(&mut self, with_frame: Vec<Pose>, time: Timestamp, camera: &Camera) -> Vec<Pose> {
         let stamp = self.stamp(time);
         let (received, buffer) = match &mut self.source {
             Source::Level | Source::Fixed(_) => return Vec::new(),
@@ -205,7 +206,11 @@ impl Platform {
             }
         };
         for pose in &received {
-            telemetry::count(buffer.insert(pose.clone()));
+            let sight = Sight::new(pose, &self.mount).over(self.terrain.clone());
+            match sight.sees_ground(camera) {
+                true => telemetry::count(buffer.insert(pose.clone())),
+                false => telemetry::refused("no_ground"),
+            }
         }
         received
     }
@@ -274,7 +279,7 @@ impl Platform {
         }
     }
 
-    /// Where `camera` is at a frame's `time`, by the poses received. One that shows it no ground cannot be true and is none.
+    /// Where `camera` is at a frame's `time`, by the poses received. One that shows it no ground, such as a fixed one of a wrong mount, is none.
     pub fn at(&mut self, time: Timestamp, camera: &Camera) -> Placement {
         let stamp = self.stamp(time);
         let found = match &self.source {
@@ -340,7 +345,7 @@ mod tests {
                 attitude,
                 ..Pose::level(at(s), [0.0, 0.0, 300.0])
             };
-            platform.receive(vec![pose], at(s));
+            platform.receive(vec![pose], at(s), &camera);
             // A frame that is seen when the next poses are there.
             let frame_s = s - 0.04;
             if k % 5 == 2 && frame_s > 0.0 {
@@ -371,12 +376,12 @@ mod tests {
     }
 
     #[test]
-    fn a_pose_that_shows_no_ground_is_none() {
+    fn a_pose_that_shows_no_ground_is_refused() {
         let camera = crate::optics::Config::default().camera().unwrap();
         let at = |s: i64| Timestamp::from_second(s).unwrap();
-        let pose = |roll: f64, height_m: f64| Pose {
+        let pose = |s: i64, roll: f64, height_m: f64| Pose {
             attitude: UnitQuaternion::from_euler_angles(roll, 0.0, 0.0),
-            ..Pose::level(at(0), [0.0, 0.0, height_m])
+            ..Pose::level(at(s), [0.0, 0.0, height_m])
         };
         // Level, with half of the view above the horizon, upside down, and below the ground.
         for (roll, height_m, is_one) in [
@@ -386,13 +391,27 @@ mod tests {
             (0.0, -5.0, false),
         ] {
             let mut platform = Platform {
-                source: Source::Fixed(pose(roll, height_m)),
+                source: Source::Live(PoseInbox::default(), PoseBuffer::default()),
                 ..Platform::level()
             };
-            platform.at(at(0), &camera);
-            let placement = platform.at(at(60), &camera);
-            let is_told = matches!(placement, Placement::Unknown { is_lost: true, .. });
-            assert_eq!(is_told, !is_one, "{roll} {height_m}");
+            platform.receive(vec![pose(0, 0.0, 300.0)], at(0), &camera);
+            platform.receive(vec![pose(10, roll, height_m)], at(10), &camera);
+            // The last that is one holds, the longer the less exactly.
+            let Placement::At {
+                pose: found, is_lost, ..
+            } = platform.at(at(10), &camera)
+            else {
+                panic!("a pose is known");
+            };
+            assert_eq!(!is_lost, is_one, "{roll} {height_m}");
+            assert!(is_one || found.pose.cov[(0, 0)] > 0.01, "{roll} {height_m}");
         }
+        let mut platform = Platform {
+            source: Source::Fixed(pose(0, 3.1, 300.0)),
+            ..Platform::level()
+        };
+        platform.at(at(0), &camera);
+        let placement = platform.at(at(60), &camera);
+        assert!(matches!(placement, Placement::Unknown { is_lost: true, .. }));
     }
 }

@@ -104,7 +104,8 @@ fn pose(sample: &Sample, moment: Moment, world: &geo::Config) -> Result<Pose, Un
     })
 }
 
-fn refused(reason: &'static str) {
+/// Counts a pose or a message that is not used.
+pub(super) fn refused(reason: &'static str) {
     counter!(metric::POSE_REFUSED, "reason" => reason).increment(1);
 }
 
