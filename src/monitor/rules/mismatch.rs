@@ -77,13 +77,16 @@ impl Memory {
                 continue;
             }
             let confusion_m = frame.confusion_m(track);
+            // Where the beam was when the claim was made, less the claim.
+            let then = track
+                .at(claim.made)
+                .map(|then| then - claim.claimed - frame.displacement_at(claim.claimed));
             if user.consistency.newest().is_none_or(|t| t < claim.claim.time) {
                 let is_clear = track.confirmed && track.merged_into.is_none() && confusion_m == 0.0;
-                match track.at(claim.made) {
+                match then {
                     Some(then) if is_clear && is_settled => {
-                        let claimed = claim.claimed + frame.displacement_at(claim.claimed);
                         let beam = track.filter.position_cov();
-                        user.consistency.push(claim.claim.time, then - claimed, beam, claim.cov);
+                        user.consistency.push(claim.claim.time, then, beam, claim.cov);
                     }
                     _ if track.confirmed => user.consistency.skip(claim.claim.time),
                     _ => {}
@@ -91,14 +94,17 @@ impl Memory {
             }
             let cov = track.filter.position_cov() + claim.cov + frame.systematic_cov(claim.position);
             let here = track.filter.position();
-            let offset = here - claim.position;
             // Where nobody else claims to be, it is nobody else's beam.
             let is_a_guess = confusion_m > 0.0 && frame.is_anothers_place(i, here);
             let reach = frame.tolerated_distance_m(claim.position)
-                + claim.slack_m
                 + if is_a_guess { confusion_m } else { 0.0 }
                 + clock_uncertainty_s * track.filter.velocity().norm();
-            let is_outside = track.hit && track.confirmed && neg_log_p_outside(offset, &cov, reach) > gate;
+            let is_beyond = |offset, reach| neg_log_p_outside(offset, &cov, reach) > gate;
+            // A beam that was where it was claimed to be has shown itself how far its user has gone since.
+            let is_outside = track.hit
+                && track.confirmed
+                && is_beyond(here - claim.position, reach + claim.slack_m)
+                && then.is_none_or(|then| is_beyond(then, reach));
             user.outside = if is_outside { user.outside + 1 } else { 0 };
         }
     }
@@ -200,9 +206,11 @@ mod tests {
             findings
         }
 
-        /// From now on the claim so far puts the user x m from the beam.
+        /// From now on the claim so far, which is older than the beam, puts the user x m from it.
         fn move_claim(&mut self, x: f64) {
-            self.scene.claims[0].position.x = x;
+            let claim = &mut self.scene.claims[0];
+            claim.position.x = x;
+            claim.made = jiff::Timestamp::UNIX_EPOCH - jiff::SignedDuration::from_secs(1);
         }
 
         /// A frame with a new claim, x m from the beam.
@@ -228,6 +236,21 @@ mod tests {
         assert_eq!(alert.evidence["frames_outside"], 3);
         assert!((alert.evidence["distance_m"].as_f64().unwrap() - 9.0).abs() < 1e-9);
         assert!(watch.memory.is_mismatched("u-0"));
+    }
+
+    #[test]
+    fn a_beam_that_was_where_it_was_claimed_to_be_may_go_anywhere() {
+        let mut watch = Watch::new();
+        watch.scene.claims[0].position.x = 30.0;
+        assert!((0..10).all(|_| watch.show().is_empty()));
+    }
+
+    #[test]
+    fn a_mismatch_goes_on_after_its_user_s_end_while_the_beam_does() {
+        let mut watch = Watch::new();
+        assert_eq!(present(&watch.claim(9.0)).len(), 1);
+        watch.scene.claims[0].ended = true;
+        assert_eq!(present(&watch.show()).len(), 1);
     }
 
     #[test]
