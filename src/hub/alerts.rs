@@ -111,12 +111,13 @@ impl HubAlerts {
     }
 
     /// Takes one event of a station's alert; gives what it means for the list, if anything. `is_seen_elsewhere` says whether another
-    /// station sees a user now.
+    /// station sees a user now, `track_now` where a station's track is now, m.
     pub fn take(
         &mut self,
         name: &StationName,
         event: AlertEvent,
         is_seen_elsewhere: impl Fn(&str) -> bool,
+        track_now: impl Fn(&StationName, u64) -> Option<[f64; 2]>,
     ) -> Option<AlertEvent> {
         let member = (name.clone(), event.alert.id.clone());
         if event.event == AlertEventKind::Cleared {
@@ -127,17 +128,24 @@ impl HubAlerts {
         }
         match self.of_member.get(&member).cloned() {
             Some(id) => self.update(&id, &member, event),
-            None => self.add(member, event.alert, is_seen_elsewhere),
+            None => self.add(member, event.alert, is_seen_elsewhere, track_now),
         }
     }
 
-    fn add(&mut self, member: Member, alert: Alert, is_seen_elsewhere: impl Fn(&str) -> bool) -> Option<AlertEvent> {
+    fn add(
+        &mut self,
+        member: Member,
+        alert: Alert,
+        is_seen_elsewhere: impl Fn(&str) -> bool,
+        track_now: impl Fn(&StationName, u64) -> Option<[f64; 2]>,
+    ) -> Option<AlertEvent> {
         let is_unseen = alert.kind == AlertKind::UserUnseen;
         if is_unseen && alert.user.as_deref().is_some_and(is_seen_elsewhere) {
             self.withheld.insert(member);
             return None;
         }
-        if let Some(open) = self.open.values_mut().find(|open| is_shared(open, &member.0, &alert)) {
+        let is_same = |open: &&mut Open| is_shared(open, &member.0, &alert, &track_now);
+        if let Some(open) = self.open.values_mut().find(is_same) {
             self.of_member.insert(member.clone(), open.alert.id.clone());
             open.members.push(member);
             note_reporters(&mut open.alert, &open.members);
@@ -159,9 +167,17 @@ impl HubAlerts {
     fn update(&mut self, id: &str, member: &Member, update: AlertEvent) -> Option<AlertEvent> {
         let open = self.open.get_mut(id)?;
         if open.members.first() != Some(member) {
-            return None;
+            let is_worse = update.alert.severity > open.alert.severity;
+            return is_worse.then(|| {
+                open.alert.severity = update.alert.severity;
+                event(AlertEventKind::Updated, &open.alert)
+            });
         }
         let mut alert = adopted(member, update.alert, &open.members);
+        // Whoever raised it may have cleared it since: it stays the alert that receivers know.
+        alert.id = id.to_owned();
+        alert.raised_at = open.alert.raised_at;
+        alert.severity = alert.severity.max(open.alert.severity);
         if update.event == AlertEventKind::Updated {
             // What was acknowledged here stays so.
             alert.acknowledgement = alert.acknowledgement.or(open.alert.acknowledgement.take());
@@ -190,6 +206,7 @@ impl HubAlerts {
         let open = self.open.get_mut(&id)?;
         open.members.retain(|other| other != member);
         if !open.members.is_empty() {
+            open.alert.station = open.members.first().map(|(name, _)| name.clone());
             note_reporters(&mut open.alert, &open.members);
             return Some(event(AlertEventKind::Reported, &open.alert));
         }
@@ -279,14 +296,29 @@ impl HubAlerts {
     }
 }
 
-/// Whether an alert of one station is open already for another station's.
-fn is_shared(open: &Open, name: &StationName, alert: &Alert) -> bool {
+/// Whether an alert of one station is open already for another station's, whose beam may have gone on since its alert was told.
+fn is_shared(
+    open: &Open,
+    name: &StationName,
+    alert: &Alert,
+    track_now: impl Fn(&StationName, u64) -> Option<[f64; 2]>,
+) -> bool {
     let is_of_place = matches!(
         alert.kind,
         AlertKind::UnclaimedEmitter | AlertKind::UserUnseen | AlertKind::PositionMismatch
     );
     let is_of_another = !open.members.is_empty() && open.members.iter().all(|(other, _)| other != name);
-    is_of_place && is_of_another && open.alert.has_cause_of(alert)
+    let here = || {
+        let track = open.alert.evidence["track"].as_u64()?;
+        let (other, _) = open.members.first()?;
+        let [x_m, y_m] = track_now(other, track)?;
+        let mut moved = open.alert.clone();
+        (moved.x_m, moved.y_m) = (Some(x_m), Some(y_m));
+        Some(moved)
+    };
+    is_of_place
+        && is_of_another
+        && (open.alert.has_cause_of(alert) || here().is_some_and(|moved| moved.has_cause_of(alert)))
 }
 
 /// A station's alert under the hub's id.

@@ -199,7 +199,8 @@ impl Chain {
         let refused = self.stations.take_sign(&message.name, now).err();
         let (stations, name) = (&self.stations, &message.name);
         let is_seen_elsewhere = |user: &str| stations.is_seen_elsewhere(user, name, now);
-        let event = self.alerts.take(name, message.event, is_seen_elsewhere);
+        let track_now = |name: &StationName, track| stations.track(name, track, now);
+        let event = self.alerts.take(name, message.event, is_seen_elsewhere, track_now);
         let origin = Origin {
             source: source.into(),
             seq: message.seq,

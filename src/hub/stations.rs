@@ -191,6 +191,13 @@ impl Stations {
             .any(|e| e.user.as_deref() == Some(user))
     }
 
+    /// Where a station's track is, m.
+    pub fn track(&self, name: &StationName, track: u64, now: Timestamp) -> Option<[f64; 2]> {
+        let message = self.fresh(now).find(|message| message.name == *name)?;
+        let beam = message.emitters.iter().find(|e| e.track == track)?;
+        Some([beam.x_m, beam.y_m])
+    }
+
     /// Users that are claimed or seen at two places, with one sighting of each: places that differ by more than `tolerated_m`, by what
     /// both covariances allow, and by the way that a user can have gone between the two times.
     pub fn conflicts(&self, now: Timestamp, tolerated_m: f64) -> BTreeMap<String, [Sighting; 2]> {
