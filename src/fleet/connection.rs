@@ -33,8 +33,8 @@ pub const CAPACITY: usize = 1 << 16;
 /// Longest wait between two attempts to connect.
 const SLOWEST_RETRY: Duration = Duration::from_secs(5);
 
-/// Messages of the server's refusals that are logged: a burst, then one a minute.
-const REFUSALS: Quota = Quota::per_minute(NonZeroU32::MIN).allow_burst(NonZeroU32::new(3).expect("some"));
+/// Log lines of each kind that comes with every message or attempt.
+const TOLD: Quota = Quota::per_minute(NonZeroU32::MIN);
 
 /// Why there is no connection.
 #[derive(Debug, thiserror::Error)]
@@ -104,8 +104,11 @@ impl Access {
     /// subjects below `_INBOX.<name>`, so that the server can keep those of others from us. Of each subscription `capacity` messages wait
     /// at most.
     pub async fn connect(&self, name: String, capacity: usize) -> Result<Client, Error> {
-        let refusals: Arc<DefaultDirectRateLimiter> = Arc::new(RateLimiter::direct(REFUSALS));
-        let url = self.url.clone();
+        let log = Arc::new(Log {
+            url: self.url.clone(),
+            refusals: RateLimiter::direct(TOLD),
+            failures: RateLimiter::direct(TOLD),
+        });
         let options = self.options.clone();
         let options = options
             .custom_inbox_prefix(format!("_INBOX.{name}"))
@@ -120,7 +123,7 @@ impl Access {
                     .min(SLOWEST_RETRY)
             })
             .event_callback(move |event| {
-                say(&event, &url, &refusals);
+                log.say(&event);
                 std::future::ready(())
             });
         Ok(options.connect(&self.url).await?)
@@ -135,21 +138,35 @@ fn read(key: &'static str, path: &Path) -> Result<String, Error> {
     })
 }
 
-fn say(event: &Event, url: &str, refusals: &DefaultDirectRateLimiter) {
-    match event {
-        Event::Connected => tracing::info!(url, "connected to the NATS server"),
-        Event::Disconnected => tracing::warn!(url, "the NATS server is gone; alerts wait in the journal"),
-        Event::SlowConsumer(_) => {
-            counter!(metric::FLEET_MESSAGES, "topic" => "heard", "outcome" => "dropped").increment(1);
-        }
-        // Such as a subject that the server's config leaves to another station: one for each message.
-        Event::ServerError(error) => {
-            counter!(metric::FLEET_MESSAGES, "topic" => "any", "outcome" => "refused").increment(1);
-            if refusals.check().is_ok() {
-                tracing::warn!(url, %error, "the NATS server refuses (told once a minute): does it know the key of this site and station?");
+/// What happens to a connection, for the log.
+struct Log {
+    url: String,
+    refusals: DefaultDirectRateLimiter,
+    failures: DefaultDirectRateLimiter,
+}
+
+impl Log {
+    fn say(&self, event: &Event) {
+        let url = self.url.as_str();
+        match event {
+            Event::Connected => tracing::info!(url, "connected to the NATS server"),
+            Event::Disconnected => tracing::warn!(url, "the NATS server is gone; alerts wait in the journal"),
+            Event::SlowConsumer(_) => {
+                counter!(metric::FLEET_MESSAGES, "topic" => "heard", "outcome" => "dropped").increment(1);
             }
+            // Such as a subject that the server's config leaves to another station: one for each message.
+            Event::ServerError(error) => {
+                counter!(metric::FLEET_MESSAGES, "topic" => "any", "outcome" => "refused").increment(1);
+                if self.refusals.check().is_ok() {
+                    tracing::warn!(url, %error, "the NATS server refuses (told once a minute): does it know the key of this site and station?");
+                }
+            }
+            // Each attempt that fails.
+            Event::ClientError(error) if self.failures.check().is_ok() => {
+                tracing::warn!(url, %error, "no connection to the NATS server (told once a minute): is it there, and is its certificate signed by fleet.ca_file?");
+            }
+            other => tracing::debug!(url, %other, "NATS"),
         }
-        other => tracing::debug!(url, %other, "NATS"),
     }
 }
 
