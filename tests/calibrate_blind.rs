@@ -152,6 +152,26 @@ fn a_comatic_lens_is_learned_from_its_wavefront() {
     assert!((560..=602).contains(&found), "{found}, not calibrated {before}");
 }
 
+/// Astigmatism that grows with the square of the field and turns as one goes around: a start that is the same everywhere ends beside it.
+#[test]
+fn astigmatism_that_turns_with_the_field_is_learned() {
+    let dir = tempfile::tempdir().unwrap();
+    let effects = "[effects.spot]\nkind = \"zernike\"\nfirst_zero_m = 2.2e-3\n\
+        [[effects.spot.term]]\nnoll = 6\nwaves = [0.0, 0.0, 0.0, 0.1, 0.0, -0.1]\n\
+        [[effects.spot.term]]\nnoll = 5\nwaves = [0.0, 0.0, 0.0, 0.0, 0.2]";
+    scene_frames(dir.path(), "spot_sigma_m = 7.5e-4", SIX, effects, 60);
+    let out = learned(dir.path());
+    assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
+    let report: serde_json::Value = serde_json::from_slice(&out.stdout).unwrap();
+    let wavefront = &report["spot"]["wavefront"];
+    // The mean of (u² + v²)² over the sensor is 28/45.
+    let astigmatism = 0.1 * (28.0f64 / 45.0).sqrt();
+    for (key, expected) in [("first_zero_m", 2.2e-3), ("astigmatism", astigmatism)] {
+        let ratio = wavefront[key].as_f64().unwrap() / expected;
+        assert!((ratio - 1.0).abs() < 0.03, "{key}: {report}");
+    }
+}
+
 #[test]
 fn a_gaussian_that_is_known_is_not_calibrated_again() {
     let dir = tempfile::tempdir().unwrap();

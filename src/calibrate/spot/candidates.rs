@@ -3,12 +3,15 @@
 use super::error::Error;
 use super::grouping::Image;
 use super::learn::Learner;
+use super::parts;
 use super::statistics;
 use crate::optics::Camera;
 
 /// Learns for a number of rounds and says which stage that is.
 type Run<'a> = &'a mut dyn FnMut(&mut Learner, usize, &'static str);
 
+/// Steps of the places before anything is learned.
+const PLACES: usize = 15;
 const SHAPE_ROUNDS: usize = 12;
 const WAVEFRONT_ROUNDS: usize = 30;
 const FIELD_ROUNDS: usize = 4;
@@ -85,7 +88,11 @@ pub fn best<'a>(first: Learner<'a>, held: &[&Image], is_field_covered: bool, run
 
 fn wavefront<'a>(camera: &'a Camera, images: &'a [&'a Image], noise_j: f64, varies: bool, run: Run) -> Learner<'a> {
     let mut learner = Learner::new(camera, images, noise_j);
-    learner.begin_wavefront(varies);
+    learner.begin_wavefront();
+    if varies {
+        learner.fit(PLACES);
+        learner.model = learner.model.with_pupil(parts::joined(&learner));
+    }
     run(&mut learner, WAVEFRONT_ROUNDS, "the lens's wavefront");
     learner
 }

@@ -6,7 +6,6 @@ use super::constraints::{self, norm};
 use super::detection::{self, MatchedFilter, Peak};
 use super::flashes;
 use super::grouping::{self, Image};
-use super::parts;
 use super::patch::{Patch, Source};
 use super::pupil::Pupil;
 use super::solve;
@@ -296,18 +295,14 @@ impl<'a> Learner<'a> {
         found
     }
 
-    /// Goes on with the spot of a lens's pupil, whose wavefront is then what is learned; `varies` where it may change over the field.
-    pub fn begin_wavefront(&mut self, varies: bool) {
+    /// Goes on with the spot of a lens's pupil, whose wavefront is then what is learned.
+    pub fn begin_wavefront(&mut self) {
         let radius = FIRST_PUPIL_RADIUS * self.camera.spot_sigma_m;
         let knots = (2.0 * radius / self.model.knot_m) as usize;
         let like = self
             .model
             .widened((knots | 1).clamp(self.model.n, MOST_SPLINES.max(self.model.n)));
         self.adopt(like.with_pupil(Pupil::of_camera(self.camera)));
-        if varies {
-            self.fit(15);
-            self.model = self.model.with_pupil(parts::joined(self));
-        }
     }
 
     /// One step of the template and of everything else at once.

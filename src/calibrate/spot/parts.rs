@@ -7,7 +7,7 @@ use rayon::prelude::*;
 
 use super::grouping::{self, Image};
 use super::learn::Learner;
-use super::patch::Patch;
+use super::patch::{Patch, Source};
 use super::pupil::{FIELD, Pupil};
 use super::template_model::TemplateModel;
 use super::wavefront;
@@ -33,40 +33,56 @@ struct Part {
     local: [f64; Pupil::CHANGES],
 }
 
-/// The wavefront that changes over the field from which to learn, for a learner of one that does not and whose places are fitted.
+/// The wavefront that changes over the field from which to learn, for a learner of one that does not and whose places are fitted: of the
+/// joined one and one that is the same everywhere, what explains lone spots better after some steps.
 pub fn joined(learner: &Learner) -> Pupil {
-    let of_part = |k: usize| Part::of(learner, [k % PARTS, k / PARTS]);
-    let parts: Vec<Part> = (0..PARTS * PARTS).filter_map(of_part).collect();
-    join(&parts).unwrap_or(Pupil {
+    let parts: Vec<Vec<Patch>> = (0..PARTS * PARTS)
+        .map(|k| lone_spots(learner, [k % PARTS, k / PARTS]))
+        .filter(|spots| spots.len() >= LEAST_SPOTS)
+        .collect();
+    let uniform = Pupil {
         varies: true,
         ..Pupil::of_camera(learner.camera)
-    })
+    };
+    let fits: Vec<Part> = parts.iter().filter_map(|spots| Part::of(learner, spots)).collect();
+    let Some(joined) = join(&fits) else {
+        return uniform;
+    };
+    let spots = parts.concat();
+    let fits = [joined, uniform].map(|start| fitted(learner.camera, &learner.model, spots.clone(), start));
+    let [joined, uniform] = fits;
+    if joined.0 < uniform.0 { joined.1 } else { uniform.1 }
+}
+
+/// Patches of spots of part (x, y) beside which there is no other.
+fn lone_spots(learner: &Learner, part: [usize; 2]) -> Vec<Patch> {
+    let is_inside = |at: [f64; 2]| {
+        let place = learner.model.field.at(at).0;
+        place.map(|t| (0.5 * (t + 1.0) * PARTS as f64) as usize) == part
+    };
+    let reach = REACH * learner.camera.spot_sigma_m;
+    let is_alone = |patch: &Patch, s: usize| {
+        let at = patch.sources[s].at;
+        let near = |other: &Source| (other.at[0] - at[0]).hypot(other.at[1] - at[1]) < reach;
+        patch.sources.iter().filter(|other| near(other)).count() == 1
+    };
+    let spots: Vec<(usize, usize)> = (learner.patches.iter().enumerate())
+        .flat_map(|(p, patch)| (0..patch.sources.len()).map(move |s| (p, s)))
+        .filter(|(p, s)| is_inside(learner.patches[*p].sources[*s].at) && is_alone(&learner.patches[*p], *s))
+        .collect();
+    let step = spots.len().div_ceil(MOST_SPOTS).max(1);
+    let chosen: Vec<(usize, usize)> = spots.into_iter().step_by(step).collect();
+    chosen
+        .par_iter()
+        .flat_map_iter(|(p, s)| alone(learner, *p, *s))
+        .collect()
 }
 
 impl Part {
-    /// Of the spots of part (x, y); none where there are few.
-    fn of(learner: &Learner, part: [usize; 2]) -> Option<Self> {
-        let field_place = |at: [f64; 2]| learner.model.field.at(at).0;
-        let is_inside = |at: [f64; 2]| {
-            let cell = field_place(at).map(|t| (0.5 * (t + 1.0) * PARTS as f64) as usize);
-            cell == part
-        };
-        let spots: Vec<(usize, usize)> = (learner.patches.iter().enumerate())
-            .flat_map(|(p, patch)| (0..patch.sources.len()).map(move |s| (p, s)))
-            .filter(|(p, s)| is_inside(learner.patches[*p].sources[*s].at))
-            .collect();
-        if spots.len() < LEAST_SPOTS {
-            return None;
-        }
-        let step = spots.len().div_ceil(MOST_SPOTS);
-        let chosen: Vec<(usize, usize)> = spots.into_iter().step_by(step).collect();
-        let patches: Vec<Patch> = chosen
-            .par_iter()
-            .flat_map_iter(|(p, s)| alone(learner, *p, *s))
-            .collect();
+    fn of(learner: &Learner, spots: &[Patch]) -> Option<Self> {
         let place = std::array::from_fn(|k| {
-            let sum: f64 = patches.iter().map(|p| field_place(p.sources[0].at)[k]).sum();
-            sum / patches.len() as f64
+            let at = |patch: &Patch| learner.model.field.at(patch.sources[0].at).0[k];
+            spots.iter().map(at).sum::<f64>() / spots.len() as f64
         });
         // Astigmatism at its best focus looks the same after a quarter turn: from one diagonal no way leads down to the other.
         let starts = [1.0, -1.0].map(|sign| {
@@ -76,7 +92,7 @@ impl Part {
                 .for_each(|p| *p *= sign);
             start
         });
-        let fits = starts.map(|start| fitted(learner.camera, &learner.model, patches.clone(), start));
+        let fits = starts.map(|start| fitted(learner.camera, &learner.model, spots.to_vec(), start));
         let best = fits.into_iter().min_by(|a, b| a.0.total_cmp(&b.0))?;
         Some(Self {
             place,
@@ -103,7 +119,7 @@ fn alone(learner: &Learner, p: usize, s: usize) -> Vec<Patch> {
     grouping::patches(camera, chosen.frame, &alone, vec![own], REACH * camera.spot_sigma_m)
 }
 
-/// χ² and wavefront of a fit to patches, of one that is the same everywhere.
+/// χ² and wavefront after some steps from a start.
 fn fitted(camera: &Camera, like: &TemplateModel, mut patches: Vec<Patch>, start: Pupil) -> (f64, Pupil) {
     let (mut model, mut pupil) = (like.with_pupil(start), start);
     let fit = |patches: &mut [Patch], model: &TemplateModel| {
