@@ -25,6 +25,7 @@ pub mod supervisor;
 pub mod time;
 pub mod toml_file;
 pub mod ulog;
+pub mod word;
 
 pub mod assign;
 pub mod estimate;

@@ -14,6 +14,7 @@ const LAYERS: &[&str] = &[
     "metric",
     "supervisor",
     "time",
+    "word",
     "frame",
     "claim",
     "pose",

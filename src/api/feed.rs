@@ -14,9 +14,10 @@ use tokio::sync::watch;
 use super::history::History;
 use super::picture;
 use super::snapshot::Snapshot;
-use crate::claim::Claim;
+use crate::claim::{Claim, escape_undisplayable};
 use crate::journal::Recorded;
 use crate::monitor::{Alert, AlertEvent, Report};
+use crate::word::word;
 
 /// Positions kept for readers that are a moment late.
 const POSITIONS_KEPT: usize = 16;
@@ -163,11 +164,12 @@ impl Feed {
         events.into_iter().map(numbered).collect()
     }
 
-    /// Makes numbered events known. They must come in the order of their numbers.
+    /// Makes numbered events known, to the log too. They must come in the order of their numbers.
     pub fn publish_events(&self, events: Vec<Recorded>) {
         let Some(seq) = events.last().map(|e| e.seq) else {
             return;
         };
+        events.iter().for_each(|recorded| log(&recorded.event));
         let mut ring = self.ring();
         for event in events {
             if ring.events.len() == EVENTS_KEPT
@@ -310,4 +312,19 @@ pub struct Joined {
     pub resumed: bool,
     pub latest: Option<Arc<Published>>,
     pub cursor: Cursor,
+}
+
+/// Writes an alert's event to the log.
+fn log(event: &AlertEvent) {
+    let alert = &event.alert;
+    tracing::info!(
+        event = word(event.event),
+        kind = word(alert.kind),
+        severity = word(alert.severity),
+        id = alert.id,
+        user = alert.user.as_deref().map(escape_undisplayable).as_deref(),
+        x_m = alert.x_m,
+        y_m = alert.y_m,
+        "alert"
+    );
 }

@@ -6,9 +6,7 @@ use std::time::Duration;
 use jiff::Timestamp;
 use tokio::sync::{Notify, oneshot};
 
-use super::status::word;
 use crate::api::{Acknowledged, Feed, Snapshot};
-use crate::claim::escape_undisplayable;
 use crate::journal::Journal;
 use crate::monitor::{Alert, AlertEvent, AlertEventKind};
 
@@ -105,7 +103,6 @@ impl Outlet {
                 if tokio::time::timeout(JOURNAL_TIMEOUT, journal.settled()).await.is_err() {
                     tracing::error!("the journal's disk hangs; alerts are published before they are on it");
                 }
-                numbered.iter().for_each(|numbered| log(&numbered.event));
                 feed.publish_events(numbered);
             }
             for (reply, outcome) in pending.acknowledged {
@@ -121,19 +118,4 @@ impl Outlet {
             }
         }
     }
-}
-
-/// Writes an alert's event to the log, which like any reader hears of it after the journal.
-fn log(event: &AlertEvent) {
-    let alert = &event.alert;
-    tracing::info!(
-        event = word(event.event),
-        kind = word(alert.kind),
-        severity = word(alert.severity),
-        id = alert.id,
-        user = alert.user.as_deref().map(escape_undisplayable).as_deref(),
-        x_m = alert.x_m,
-        y_m = alert.y_m,
-        "alert"
-    );
 }

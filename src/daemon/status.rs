@@ -12,6 +12,7 @@ use crate::api::{FitStatus, FrameCounts, Latency, Snapshot, SourceState};
 use crate::estimate::Estimate;
 use crate::metric;
 use crate::monitor::{Alert, AlertEvent, AlertEventKind, AlertKind, AlertState, PositionStatus, Report};
+use crate::word::word;
 
 /// Frames over which rate and latency are computed.
 const WINDOW: usize = 128;
@@ -171,12 +172,4 @@ fn push<T>(window: &mut VecDeque<T>, value: T) {
         window.pop_front();
     }
     window.push_back(value);
-}
-
-/// The JSON string of a unit variant, used as a label.
-pub(super) fn word(value: impl serde::Serialize) -> String {
-    match serde_json::to_value(value) {
-        Ok(serde_json::Value::String(word)) => word,
-        other => unreachable!("labels are made of unit variants, found {other:?}"),
-    }
 }

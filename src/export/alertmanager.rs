@@ -15,10 +15,11 @@ use super::address::Address;
 use super::config::Config;
 use super::tls;
 use super::updates::{Context, RESEND, Updates};
-use super::words::{sentence, title, word};
+use super::words::{sentence, title};
 use crate::monitor::{Alert, AlertEventKind, AlertKind, Severity};
 use crate::notify::{Channel, Failure, Message, Verdict, is_loopback, judge};
 use crate::small_file;
+use crate::word::word;
 
 /// An open alert that is not sent again for this long is over, as far as Alertmanager knows: four times what one lost request costs, as in
 /// Prometheus.

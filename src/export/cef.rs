@@ -1,9 +1,10 @@
 //! An alert event in ArcSight's Common Event Format (Micro Focus, "Implementing ArcSight Common Event Format", revision 26).
 
-use super::words::{sigma_m, title, word};
+use super::words::{sigma_m, title};
 use crate::claim::escape_undisplayable;
 use crate::monitor::Severity;
 use crate::notify::Message;
+use crate::word::word;
 
 /// `CEF:0|oapwatch|oapwatch|VERSION|KIND|TITLE|SEVERITY|EXTENSION`; `what` is the step in the alert's life.
 pub(super) fn event(message: &Message<'_>, station: &str, what: &str) -> String {

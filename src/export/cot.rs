@@ -13,10 +13,11 @@ use super::config::Config;
 use super::link::Link;
 use super::place::{Place, World};
 use super::updates::{Context, RESEND, Updates};
-use super::words::{sentence, title, track, word};
+use super::words::{sentence, title, track};
 use crate::claim::escape_undisplayable;
 use crate::monitor::{Alert, AlertEventKind, AlertKind, PositionStatus, TrackedPosition};
 use crate::notify::{Channel, Failure, Message, Verdict};
+use crate::word::word;
 
 /// An emitter goes stale after so many of its own updates have failed to come, and not before five seconds.
 const STALE_UPDATES: f64 = 3.0;

@@ -6,10 +6,11 @@ use super::address::Address;
 use super::cef;
 use super::config::{Config, Format};
 use super::link::Link;
-use super::words::{sentence, sigma_m, word};
+use super::words::{sentence, sigma_m};
 use crate::claim::escape_undisplayable;
 use crate::monitor::{Alert, AlertState, Severity};
 use crate::notify::{Channel, Message, Verdict};
+use crate::word::word;
 
 /// authpriv: security messages (RFC 5424, table 1).
 const FACILITY: u8 = 10;

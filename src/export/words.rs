@@ -2,14 +2,7 @@
 
 use crate::claim::escape_undisplayable;
 use crate::monitor::{Alert, TrackedPosition};
-
-/// A unit variant's name, as it stands in JSON.
-pub(super) fn word(variant: impl serde::Serialize) -> String {
-    match serde_json::to_value(variant) {
-        Ok(serde_json::Value::String(word)) => word,
-        other => unreachable!("a unit variant serialises to a string, not {other:?}"),
-    }
-}
+use crate::word::word;
 
 /// The kind as words: `unclaimed emitter`.
 pub(super) fn title(alert: &Alert) -> String {

@@ -11,6 +11,7 @@ use crate::monitor::{
     Acknowledgement, Alert, AlertEvent, AlertEventKind, AlertKind, AlertSource, AlertState, Severity, StationName,
     Withdrawal,
 };
+use crate::word::word;
 
 /// Key of the evidence that lists the stations' own alerts.
 const REPORTED: &str = "reported_by";
@@ -225,10 +226,8 @@ impl HubAlerts {
             OwnCause::StationLost(name) => (AlertKind::StationLost, None, Some(name.clone())),
             OwnCause::UserInTwoPlaces(user) => (AlertKind::UserInTwoPlaces, Some(user.clone()), None),
         };
-        let word = serde_json::to_value(kind).ok();
-        let word = word.as_ref().and_then(Value::as_str).unwrap_or("alert").to_owned();
         let about = station.as_ref().map(|name| format!(".{name}")).unwrap_or_default();
-        let stem = format!("hub{about}.{word}-{}", now.strftime("%Y%m%dT%H%M%S%6fZ"));
+        let stem = format!("hub{about}.{}-{}", word(kind), now.strftime("%Y%m%dT%H%M%S%6fZ"));
         let free = |n: &u32| !self.open.contains_key(&format!("{stem}-{n}"));
         let number = (0..).find(free).expect("some number is free");
         let alert = Alert {

@@ -6,9 +6,10 @@ use jiff::Timestamp;
 use rusqlite::types::Value;
 use rusqlite::{OptionalExtension, Row, params};
 
-use super::store::{Store, word};
+use super::store::Store;
 use super::{AuditEntry, AuditRecord, DeadLetter, EndpointRecord, Error, Waiting};
 use crate::monitor::{Alert, AlertEvent, AlertKind, AlertState};
+use crate::word::word;
 
 /// Which alerts to list; the newest raised come first.
 #[derive(Clone, Debug, Default)]
@@ -83,11 +84,11 @@ impl Store {
         let mut values: Vec<Value> = Vec::new();
         if let Some(state) = filter.state {
             sql += " AND state = ?";
-            values.push(word(&state).into());
+            values.push(word(state).into());
         }
         if let Some(kind) = filter.kind {
             sql += " AND kind = ?";
-            values.push(word(&kind).into());
+            values.push(word(kind).into());
         }
         if let Some(since) = filter.since {
             sql += " AND raised_us >= ?";

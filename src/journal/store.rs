@@ -10,6 +10,7 @@ use super::origin::Origin;
 use super::outbox::Subscriptions;
 use super::{Attempt, AuditRecord, Error, Outcome, schema};
 use crate::monitor::{AlertEvent, AlertEventKind};
+use crate::word::word;
 
 /// One change of the journal. Applying it must never fail for what it holds, only for the disk: a write
 /// that is refused for its content would hold up all that wait behind it.
@@ -165,8 +166,8 @@ fn put_event(
     )?
     .execute(params![
         alert.id,
-        word(&alert.kind),
-        word(&alert.state),
+        word(alert.kind),
+        word(alert.state),
         alert.raised_at.as_microsecond(),
         seq,
         now.as_microsecond(),
@@ -201,7 +202,7 @@ fn put_audit(tx: &Connection, record: &AuditRecord) -> Result<(), rusqlite::Erro
         .execute(params![
             record.id,
             record.at.as_microsecond(),
-            word(&entry.action),
+            word(entry.action),
             entry.actor,
             entry.client,
             entry.target,
@@ -259,14 +260,6 @@ fn put_attempt(tx: &Connection, attempt: &Attempt) -> Result<(), rusqlite::Error
         Some(error) => statement.execute(params![attempt.endpoint, at, error])?,
     };
     Ok(())
-}
-
-/// A unit variant's name, as it stands in JSON.
-pub(super) fn word<T: serde::Serialize>(variant: &T) -> String {
-    match serde_json::to_value(variant) {
-        Ok(serde_json::Value::String(word)) => word,
-        other => unreachable!("a unit variant serialises to a string, not {other:?}"),
-    }
 }
 
 fn json<T: serde::Serialize>(value: &T) -> String {

@@ -3,9 +3,9 @@
 use std::collections::BTreeMap;
 
 use jiff::Timestamp;
-use serde_json::Value;
 
 use super::alert::AlertKind;
+use crate::word::word;
 
 /// Alerts of each kind raised at the newest instant.
 #[derive(Debug, Default)]
@@ -23,9 +23,7 @@ impl AlertIds {
         let next = self.raised.entry(kind).or_default();
         let number = *next;
         *next += 1;
-        let kind = serde_json::to_value(kind).ok();
-        let kind = kind.as_ref().and_then(Value::as_str).unwrap_or("alert");
-        format!("{kind}-{}-{number}", now.strftime("%Y%m%dT%H%M%S%6fZ"))
+        format!("{}-{}-{number}", word(kind), now.strftime("%Y%m%dT%H%M%S%6fZ"))
     }
 }
 

@@ -14,8 +14,9 @@ use super::message::{
 };
 use crate::api;
 use crate::export::place::{self, World};
-use crate::export::words::{sentence, track, word};
+use crate::export::words::{sentence, track};
 use crate::monitor::{self, AlertState, Severity, TrackedPosition};
+use crate::word::word;
 
 /// Status reports; the registration promises them.
 pub(super) const STATUS_EVERY: Duration = Duration::from_secs(5);
