@@ -42,6 +42,8 @@ const LEVELS: [&str; 6] = ["off", "error", "warn", "info", "debug", "trace"];
 
 /// The target of the NATS client's own events.
 const NATS_CLIENT: &str = "async_nats";
+/// The target under which each refused certificate is an error of its own, without the name of whom it was for.
+const CERTIFICATES: &str = "rustls_platform_verifier";
 
 /// Lines that wait for a reader of stderr who stalls; further ones are lost, and nothing waits for them.
 const WAITING: usize = 1 << 14;
@@ -78,12 +80,13 @@ impl Config {
             level: self.level.clone(),
             source,
         })?;
-        // Every attempt to reach a server that is gone would be a line: `fleet` says when it is gone, and when it is back.
-        let is_talkative = filter.default_level() == Some(LevelFilter::INFO) && !self.level.contains(NATS_CLIENT);
-        Ok(match is_talkative {
-            true => filter.with_target(NATS_CLIENT, LevelFilter::WARN),
-            false => filter,
-        })
+        // Every attempt to reach a server would be a line: those who connect say when it is gone, and why.
+        let quiet = [(NATS_CLIENT, LevelFilter::WARN), (CERTIFICATES, LevelFilter::OFF)];
+        let is_usual = filter.default_level() == Some(LevelFilter::INFO);
+        let quiet = quiet
+            .into_iter()
+            .filter(|(target, _)| is_usual && !self.level.contains(target));
+        Ok(filter.with_targets(quiet))
     }
 }
 
