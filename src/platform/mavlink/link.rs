@@ -28,7 +28,8 @@ const HEARTBEAT_EVERY: Duration = Duration::from_secs(1);
 /// Without a word from the autopilot for so long, a connection is opened anew.
 const SILENCE: Duration = Duration::from_secs(5);
 const FIRST_RETRY: Duration = Duration::from_millis(250);
-const LAST_RETRY: Duration = Duration::from_secs(8);
+/// Longest wait between two attempts: so much later an autopilot that is back is heard.
+const LAST_RETRY: Duration = Duration::from_secs(2);
 const CONNECT: Duration = Duration::from_secs(3);
 
 /// What a link needs to know.
@@ -105,6 +106,7 @@ impl Link {
     fn run(mut self, stop: &AtomicBool, mut on_event: impl FnMut(Event, Moment, &Reader)) {
         let mut buffer = vec![0; BUFFER];
         let mut retry = FIRST_RETRY;
+        let mut told: Option<String> = None;
         let mut heard = Instant::now();
         let mut due = Due::default();
         let mut slot = Slot::new();
@@ -114,10 +116,14 @@ impl Link {
                     Ok(transport) => {
                         self.transport = Some(transport);
                         self.reader.reconnected();
-                        heard = Instant::now();
+                        (heard, told) = (Instant::now(), None);
                     }
                     Err(error) => {
-                        tracing::warn!("no telemetry: {:?}: {error}; trying again", self.settings.endpoint);
+                        let error = error.to_string();
+                        if told.as_ref() != Some(&error) {
+                            tracing::warn!("no telemetry: {:?}: {error}; trying again", self.settings.endpoint);
+                        }
+                        told = Some(error);
                         pause(retry, stop);
                         retry = (retry * 2).min(LAST_RETRY);
                     }
