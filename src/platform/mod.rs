@@ -378,10 +378,10 @@ mod tests {
     #[test]
     fn a_pose_that_shows_no_ground_is_refused() {
         let camera = crate::optics::Config::default().camera().unwrap();
-        let at = |s: i64| Timestamp::from_second(s).unwrap();
-        let pose = |s: i64, roll: f64, height_m: f64| Pose {
+        let at = |ms: i64| Timestamp::from_millisecond(ms).unwrap();
+        let pose = |ms: i64, roll: f64, height_m: f64| Pose {
             attitude: UnitQuaternion::from_euler_angles(roll, 0.0, 0.0),
-            ..Pose::level(at(s), [0.0, 0.0, height_m])
+            ..Pose::level(at(ms), [0.0, 0.0, height_m])
         };
         // Level, with half of the view above the horizon, upside down, and below the ground.
         for (roll, height_m, is_one) in [
@@ -395,7 +395,8 @@ mod tests {
                 ..Platform::level()
             };
             platform.receive(vec![pose(0, 0.0, 300.0)], at(0), &camera);
-            platform.receive(vec![pose(10, roll, height_m)], at(10), &camera);
+            let later = [9_900, 10_000, 10_100].map(|ms| pose(ms, roll, height_m));
+            platform.receive(later.into(), at(10_000), &camera);
             // The last that is one holds, the longer the less exactly.
             let Placement::At {
                 pose: found, is_lost, ..
@@ -411,7 +412,7 @@ mod tests {
             ..Platform::level()
         };
         platform.at(at(0), &camera);
-        let placement = platform.at(at(60), &camera);
+        let placement = platform.at(at(60_000), &camera);
         assert!(matches!(placement, Placement::Unknown { is_lost: true, .. }));
     }
 }
