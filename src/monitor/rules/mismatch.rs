@@ -241,6 +241,7 @@ mod tests {
     #[test]
     fn a_beam_that_was_where_it_was_claimed_to_be_may_go_anywhere() {
         let mut watch = Watch::new();
+        watch.claim(0.0);
         watch.scene.claims[0].position.x = 30.0;
         assert!((0..10).all(|_| watch.show().is_empty()));
     }
