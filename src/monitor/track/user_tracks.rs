@@ -34,10 +34,10 @@ impl UserTracks {
                 user.found(track);
                 user.first_seen.get_or_insert(now);
                 user.last_seen = Some(now);
-            } else if !claim.expected || claim.is_unresolvable {
+            } else if claim.is_unresolvable || !(claim.expected || claim.may_have_left) {
                 user.unseen_since = None;
                 user.absence = 0.0;
-            } else {
+            } else if claim.expected {
                 user.unseen_since.get_or_insert(now);
                 user.absence += (1.0f64 / MISS_PROBABILITY).ln();
             }
@@ -87,6 +87,11 @@ mod tests {
         for k in 1..4 {
             users.update(&claims, &none, at(k));
         }
+        let user = users.get("a").unwrap();
+        assert_eq!(user.unseen_since, Some(at(1)));
+        assert!((user.absence - 1000f64.ln()).abs() < 1e-9);
+        (claims[0].expected, claims[0].may_have_left) = (false, true);
+        users.update(&claims, &none, at(4));
         let user = users.get("a").unwrap();
         assert_eq!(user.unseen_since, Some(at(1)));
         assert!((user.absence - 1000f64.ln()).abs() < 1e-9);
