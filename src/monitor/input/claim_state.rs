@@ -214,8 +214,8 @@ impl ActiveClaim {
 
     /// Covariance for the association with a beam: half of what the user may have gone and may be off counts as a standard
     /// deviation.
-    pub fn association_cov(&self, tolerated_m: f64) -> Matrix2<f64> {
-        let slack = 0.5 * self.slack_m.min(MAX_SLACK_M);
+    pub fn association_cov(&self, tolerated_m: f64, gone_m: f64) -> Matrix2<f64> {
+        let slack = 0.5 * gone_m.min(MAX_SLACK_M);
         let isotropic = |variance: f64| Matrix2::identity() * variance;
         let tolerated = isotropic(0.25 * tolerated_m * tolerated_m);
         self.cov + isotropic(self.pose_variance) + isotropic(slack * slack) + tolerated

@@ -129,7 +129,7 @@ fn an_ended_claim_bears_for_its_grace() {
 #[test]
 fn the_association_widens_with_age_up_to_a_bound() {
     let mut claim = fixture::active_claim("a", 0.0, 0.0);
-    let variance = |claim: &ActiveClaim| claim.association_cov(4.0)[(0, 0)];
+    let variance = |claim: &ActiveClaim| claim.association_cov(4.0, claim.slack_m)[(0, 0)];
     assert!((variance(&claim) - 4.09).abs() < 1e-12);
     claim.slack_m = 6.0;
     assert!((variance(&claim) - 13.09).abs() < 1e-12);

@@ -77,9 +77,13 @@ pub fn associate(claims: &[ActiveClaim], tracker: &Tracker, eligibility: &Eligib
             .collect();
         let matching = assign(open.len(), tracks.len(), GATE + INCUMBENCY, |i, j| {
             let (claim, track) = (&claims[open[i]], tracks[j]);
-            let offset = track.filter.position() - claim.position;
-            let cov = track.filter.position_cov() + claim.association_cov(eligibility.config.tolerated_distance_m);
-            let d2 = mahalanobis2(offset, cov);
+            // Where the beam was when the claim was made; of a newer one, how far its user may have gone since.
+            let (beam, gone_m) = match track.at(claim.made) {
+                Some(then) => (then, 0.0),
+                None => (track.filter.position(), claim.slack_m),
+            };
+            let cov = claim.association_cov(eligibility.config.tolerated_distance_m, gone_m);
+            let d2 = mahalanobis2(beam - claim.position, track.filter.position_cov() + cov);
             if d2 > GATE || !eligibility.allows(claim, track, owners.get(&track.id).copied()) || has_own(claim, track) {
                 f64::INFINITY
             } else if claim.before.track == Some(track.id) {
@@ -192,6 +196,21 @@ mod tests {
             let kept = [Some(1), Some(2)];
             assert_eq!(ids(&exchanging, &tracker) != kept, exchanged, "{apart}");
         }
+    }
+
+    #[test]
+    fn who_has_gone_on_since_their_claim_does_not_get_the_beam_that_stands_there_now() {
+        // The second drives past the first, who claims to be far away, and claims when they are beside each other.
+        let frames: Vec<[f64; 2]> = (0..20).map(|k| [0.0, 12.0 - f64::from(k)]).collect();
+        let frames: Vec<&[f64]> = frames.iter().map(|f| f.as_slice()).collect();
+        let tracker = tracker(&frames);
+        let mut driver = known(2.0, 2);
+        driver.made = Timestamp::from_millisecond(1000).unwrap();
+        (driver.age_s, driver.slack_m) = (0.9, 11.7);
+        let mut liar = known(-25.0, 1);
+        liar.claim.user = "liar".into();
+        (liar.made, liar.slack_m) = (driver.made, 2.7);
+        assert_eq!(ids(&[driver, liar], &tracker), [Some(2), Some(1)]);
     }
 
     #[test]
