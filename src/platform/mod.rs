@@ -400,7 +400,7 @@ mod tests {
             // The last that is one holds, the longer the less exactly.
             let Placement::At {
                 pose: found, is_lost, ..
-            } = platform.at(at(10), &camera)
+            } = platform.at(at(10_000), &camera)
             else {
                 panic!("a pose is known");
             };
