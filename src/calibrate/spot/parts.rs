@@ -18,12 +18,12 @@ use crate::optics::Camera;
 const PARTS: usize = 3;
 /// Fewest spots of a part, and most that are used: they need not be exact.
 const LEAST_SPOTS: usize = 10;
-const MOST_SPOTS: usize = 50;
+const MOST_SPOTS: usize = 24;
 /// Half the window around a spot, σ: its core and the ring or lobes around it.
 const REACH: f64 = 5.0;
-const STEPS: usize = 8;
+const STEPS: usize = 6;
 /// Steps of the places within one of the wavefront.
-const PLACES: usize = 6;
+const PLACES: usize = 4;
 /// Share of the parts' information by which the joined wavefront is held at zero where there are too few parts.
 const DAMPING: f64 = 1e-3;
 
