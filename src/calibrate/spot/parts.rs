@@ -202,7 +202,7 @@ mod tests {
             let place = [k % PARTS, k / PARTS].map(|t| (t as f64 - 1.0) * 2.0 / 3.0);
             let mut local = [0.0; Pupil::CHANGES];
             local[0] = 2e-3_f64.ln();
-            let sign = if k % 2 == 0 { 1.0 } else { -1.0 };
+            let sign = [1.0, -1.0][k % 2];
             (local[2], local[3]) = (sign * waves(place)[0], sign * waves(place)[1]);
             local[4] = 0.05 * place[1];
             Part { place, local }
