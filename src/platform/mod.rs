@@ -13,6 +13,7 @@ pub mod mavlink;
 mod place;
 pub mod px4_log;
 mod replay;
+mod source;
 mod telemetry;
 
 use std::collections::VecDeque;
@@ -34,6 +35,7 @@ use crate::pose::{Mount, Pose};
 use crate::time::seconds;
 use delay::DelayEstimate;
 use replay::Replay;
+use source::Source;
 
 /// Age of a pose, s, beyond which its error is not the delay's.
 const MAX_LEARNING_AGE_S: f64 = 0.1;
@@ -85,27 +87,6 @@ struct Unlearned {
     time: Timestamp,
     error: Vector6<f64>,
     delay_s: f64,
-}
-
-#[allow(clippy::large_enum_variant, reason = "a platform has one")]
-enum Source {
-    /// Level over (0, 0) at the camera's own altitude.
-    Level,
-    Fixed(Pose),
-    /// From a file.
-    Replay(Box<Replay>, PoseBuffer),
-    /// From an autopilot, or with the frames of a recording.
-    Live(PoseInbox, PoseBuffer),
-}
-
-impl Source {
-    /// Reads the poses so far; `None` where there is no buffer of them.
-    fn read<T>(&self, reader: impl FnOnce(&PoseBuffer) -> T) -> Option<T> {
-        match self {
-            Self::Level | Self::Fixed(_) => None,
-            Self::Replay(_, poses) | Self::Live(_, poses) => Some(reader(poses)),
-        }
-    }
 }
 
 /// Where the camera is in one frame.
@@ -196,23 +177,9 @@ impl Platform {
     /// `camera` no ground cannot be true and is refused.
     pub fn receive(&mut self, with_frame: Vec<Pose>, time: Timestamp, camera: &Camera) -> Vec<Pose> {
         let stamp = self.stamp(time);
-        let (received, buffer) = match &mut self.source {
-            Source::Level | Source::Fixed(_) => return Vec::new(),
-            Source::Replay(replay, buffer) => (replay.until(stamp), buffer),
-            Source::Live(inbox, buffer) => {
-                let mut received = with_frame;
-                received.extend(inbox.take());
-                (received, buffer)
-            }
-        };
-        for pose in &received {
-            let sight = Sight::new(pose, &self.mount).over(self.terrain.clone());
-            match sight.sees_ground(camera) {
-                true => telemetry::count(buffer.insert(pose.clone())),
-                false => telemetry::refused("no_ground"),
-            }
-        }
-        received
+        let (mount, terrain) = (&self.mount, &self.terrain);
+        let shows_ground = |pose: &Pose| Sight::new(pose, mount).over(terrain.clone()).sees_ground(camera);
+        self.source.receive(with_frame, stamp, shows_ground)
     }
 
     /// A frame's time on the clock of the poses.
@@ -282,15 +249,10 @@ impl Platform {
     /// Where `camera` is at a frame's `time`, by the poses received. One that shows it no ground, such as a fixed one of a wrong mount, is none.
     pub fn at(&mut self, time: Timestamp, camera: &Camera) -> Placement {
         let stamp = self.stamp(time);
-        let found = match &self.source {
-            Source::Level => return Placement::Level,
-            Source::Fixed(pose) => Some(PoseAt {
-                pose: pose.clone(),
-                age_s: 0.0,
-                rates: Vector6::zeros(),
-            }),
-            Source::Replay(_, poses) | Source::Live(_, poses) => poses.at(stamp),
-        };
+        if let Source::Level = self.source {
+            return Placement::Level;
+        }
+        let found = self.source.at(stamp);
         let seen = found.and_then(|mut pose| {
             let by_delay = pose.rates * self.delay_std_s();
             pose.pose.cov += by_delay * by_delay.transpose();
