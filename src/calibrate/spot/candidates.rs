@@ -91,7 +91,7 @@ fn wavefront<'a>(camera: &'a Camera, images: &'a [&'a Image], noise_j: f64, vari
     learner.begin_wavefront();
     if varies {
         learner.fit(PLACES);
-        learner.model = learner.model.with_pupil(parts::joined(&learner));
+        learner.model = learner.model.with_pupil(parts::start(&learner));
     }
     run(&mut learner, WAVEFRONT_ROUNDS, "the lens's wavefront");
     learner

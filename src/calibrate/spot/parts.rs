@@ -35,7 +35,7 @@ struct Part {
 
 /// The wavefront that changes over the field from which to learn, for a learner of one that does not and whose places are fitted: of the
 /// joined one and one that is the same everywhere, what explains lone spots better after some steps.
-pub fn joined(learner: &Learner) -> Pupil {
+pub fn start(learner: &Learner) -> Pupil {
     let parts: Vec<Vec<Patch>> = (0..PARTS * PARTS)
         .map(|k| lone_spots(learner, [k % PARTS, k / PARTS]))
         .filter(|spots| spots.len() >= LEAST_SPOTS)
