@@ -178,8 +178,8 @@ fn evidence_of_any_form_is_taken() {
     }
 }
 
-#[test]
-fn an_alert_that_another_station_goes_on_with_stays_the_one_that_was_raised() {
+/// A stranger whom both stations have told of.
+fn raised_by_both() -> HubAlerts {
     let mut alerts = HubAlerts::default();
     for station in ["a", "b"] {
         alerts.take(
@@ -189,6 +189,12 @@ fn an_alert_that_another_station_goes_on_with_stays_the_one_that_was_raised() {
             NOWHERE,
         );
     }
+    alerts
+}
+
+#[test]
+fn an_alert_that_another_station_goes_on_with_stays_the_one_that_was_raised() {
+    let mut alerts = raised_by_both();
     let left = alerts.take(&name("a"), stranger(AlertEventKind::Cleared, "1", 0.0), NOBODY, NOWHERE);
     assert_eq!(left.unwrap().alert.station, Some(name("b")));
     let mut worse = stranger(AlertEventKind::Updated, "1", 3.0);
@@ -211,15 +217,7 @@ fn an_alert_that_another_station_goes_on_with_stays_the_one_that_was_raised() {
 
 #[test]
 fn the_severest_of_the_stations_counts() {
-    let mut alerts = HubAlerts::default();
-    for station in ["a", "b"] {
-        alerts.take(
-            &name(station),
-            stranger(AlertEventKind::Raised, "1", 0.0),
-            NOBODY,
-            NOWHERE,
-        );
-    }
+    let mut alerts = raised_by_both();
     let mut second = stranger(AlertEventKind::Updated, "1", 0.0);
     assert!(alerts.take(&name("b"), second.clone(), NOBODY, NOWHERE).is_none());
     second.alert.severity = Severity::Critical;
