@@ -131,6 +131,11 @@ impl Pipeline {
         self.platform.receive(with_frame, time, &self.camera)
     }
 
+    /// Whether the poses received tell of `time`, or will not.
+    pub fn is_posed(&self, time: Timestamp) -> bool {
+        self.platform.is_posed(time)
+    }
+
     pub fn estimator(&self) -> &'static str {
         self.estimator.name()
     }

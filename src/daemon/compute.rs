@@ -14,11 +14,12 @@ use super::posts::Posts;
 use super::publish::Outlet;
 use super::reload::Settings;
 use super::status::State;
+use super::waiting::Waiting;
 use crate::api::{ClaimsStatus, Command, FrameCounts, JournalStatus, Snapshot, SourceState, SourceStatus, Status};
 use crate::claims::{Claim, ClaimState, Inbox};
 use crate::frame::Frame;
 use crate::frames::record::{Recorder, Taken};
-use crate::frames::{Arrivals, Capture, Next};
+use crate::frames::{Arrivals, Capture, Captured, Next};
 use crate::journal::Journal;
 use crate::metric;
 use crate::monitor::{AlertEventKind, Report};
@@ -31,6 +32,8 @@ use crate::supervisor::Supervisor;
 const PATIENCE: Duration = Duration::from_millis(50);
 /// The same while posted claims wait to be placed.
 const POSTING: Duration = Duration::from_millis(1);
+/// The same while frames wait for poses.
+const AWAITING: Duration = Duration::from_millis(5);
 /// Most claims and poses kept for a recorder that accepts nothing.
 const MOST_UNRECORDED: usize = 100_000;
 /// A source that gives neither a frame nor a failure for this long is reported as failed.
@@ -40,6 +43,7 @@ const SILENCE: Duration = Duration::from_secs(2);
 pub struct Compute {
     pub pipeline: Pipeline,
     pub capture: Capture,
+    pub waiting: Waiting,
     pub recorder: Option<Recorder>,
     /// Claims of the log that take effect with the next frame, so that a recording reproduces them.
     pub inbox: Inbox,
@@ -60,6 +64,8 @@ pub struct Compute {
     pub source: String,
     /// A replay runs on the clock of its recording, every other source on the wall clock.
     pub is_replay: bool,
+    /// An autopilot sends poses beside the frames.
+    pub has_telemetry: bool,
     pub stop: Arc<AtomicBool>,
     pub ready: Arc<AtomicBool>,
     pub state: State,
@@ -73,40 +79,68 @@ impl Compute {
             self.take_settings();
             self.follow_log();
             self.handle_commands();
-            let patience = if self.posts.is_empty() { PATIENCE } else { POSTING };
+            let patience = match (self.posts.is_empty(), self.waiting.is_empty()) {
+                (false, _) => POSTING,
+                (true, false) => AWAITING,
+                (true, true) => PATIENCE,
+            };
             let captured = self.capture.next(patience);
-            let arrived = Instant::now();
             match captured.next {
-                Next::Frame(frame, arrivals) => {
-                    last_event = arrived;
-                    // The latency of a live frame counts from its capture; a recording's frame has waited for this thread.
-                    let since = if self.is_replay { arrived } else { captured.at };
-                    self.take_arrivals(arrivals, frame.time);
-                    self.handle_commands();
-                    let recorded = self.recorder.as_mut().map(|r| r.frame(&frame, &self.unrecorded));
-                    self.recorded(recorded.flatten(), captured.file);
-                    self.frame(frame, since);
-                }
-                Next::Unusable {
-                    index,
-                    time,
-                    reason,
-                    arrivals,
-                } => {
-                    last_event = arrived;
-                    self.take_arrivals(arrivals, time);
-                    self.unusable(index, time, reason, captured.file);
+                Next::Frame(..) | Next::Unusable { .. } => {
+                    last_event = Instant::now();
+                    self.waiting.push(captured);
                 }
                 Next::Nothing if !self.is_replay && last_event.elapsed() > SILENCE => {
-                    last_event = arrived;
+                    last_event = Instant::now();
                     self.silence();
                 }
-                Next::Nothing => {}
-                Next::End => self.ended(),
+                Next::End if self.waiting.is_empty() => self.ended(),
+                Next::Nothing | Next::End => {}
+            }
+            while let Some(captured) = self.due() {
+                self.process(captured);
             }
         }
         self.supervisor.stopping();
         self.outlet.close();
+    }
+
+    /// The next event of the source, once the poses of its time are there or have been waited for.
+    fn due(&mut self) -> Option<Captured> {
+        if !self.has_telemetry {
+            return self.waiting.take(|_| true);
+        }
+        self.waiting.take(|time| {
+            let poses = self.pipeline.receive_poses(Vec::new(), time);
+            if self.recorder.is_some() {
+                self.unrecorded.poses.extend(poses);
+            }
+            self.pipeline.is_posed(time)
+        })
+    }
+
+    fn process(&mut self, captured: Captured) {
+        match captured.next {
+            Next::Frame(frame, arrivals) => {
+                // The latency of a live frame counts from its capture; a recording's frame has waited for this thread.
+                let since = if self.is_replay { Instant::now() } else { captured.at };
+                self.take_arrivals(arrivals, frame.time);
+                self.handle_commands();
+                let recorded = self.recorder.as_mut().map(|r| r.frame(&frame, &self.unrecorded));
+                self.recorded(recorded.flatten(), captured.file);
+                self.frame(frame, since);
+            }
+            Next::Unusable {
+                index,
+                time,
+                reason,
+                arrivals,
+            } => {
+                self.take_arrivals(arrivals, time);
+                self.unusable(index, time, reason, captured.file);
+            }
+            Next::Nothing | Next::End => {}
+        }
     }
 
     /// Takes what came with a frame, the claims of the log that it has time for, and the poses until now.

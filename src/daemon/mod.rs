@@ -10,6 +10,7 @@ mod process;
 mod publish;
 mod reload;
 mod status;
+mod waiting;
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -187,6 +188,7 @@ impl Daemon {
             "watching; API and page on {}",
             listener.url(self.server.scheme())?,
         );
+        let has_telemetry = self.telemetry.is_some();
         let telemetry = self.telemetry.zip(self.pipeline.pose_inbox());
         let telemetry = telemetry.map(|(link, inbox)| Telemetry::start(link, inbox, self.config.world.clone()));
         let _telemetry = telemetry.transpose()?;
@@ -197,6 +199,7 @@ impl Daemon {
         let compute = Compute {
             pipeline: self.pipeline,
             capture: Capture::start(self.source)?,
+            waiting: waiting::Waiting::default(),
             recorder: self.recorder,
             inbox: inbox.clone(),
             posts: posts::Posts::default(),
@@ -215,6 +218,7 @@ impl Daemon {
             claims_log: log.map(|l| l.display().to_string()),
             source: source.kind.name().to_owned(),
             is_replay,
+            has_telemetry,
             stop: halt.clone(),
             ready,
             state: State::new(started_at, first_clock, known),

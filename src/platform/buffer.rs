@@ -27,8 +27,8 @@ const JUMPS_IN_A_ROW: u32 = 10;
 const TURN_RAD_S2: f64 = 3.0;
 const ACCELERATION_M_S2: f64 = 2.0;
 /// Beyond the last pose, how long its rates are taken to go on, s: a telemetry's usual delay. Longer follows a sway past its
-/// turning point, shorter lags behind it.
-const UNIFORM_S: f64 = 0.1;
+/// turning point, shorter lags behind it. The error of an older pose is not its delay's, and frames wait for a newer one.
+pub(super) const UNIFORM_S: f64 = 0.1;
 /// Rates at which attitude (rad/s) and position (m/s) wander from there on: a sway of 8° in 8 s has 0.08 rad/s rms.
 const WANDER_RAD_S: f64 = 0.1;
 const WANDER_M_S: f64 = 3.0;

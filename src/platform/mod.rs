@@ -33,12 +33,13 @@ use crate::geo::{self, Sight, Terrain};
 use crate::optics::{Camera, Smear};
 use crate::pose::{Mount, Pose};
 use crate::time::seconds;
+use buffer::UNIFORM_S;
 use delay::DelayEstimate;
 use replay::Replay;
 use source::Source;
 
-/// Age of a pose, s, beyond which its error is not the delay's.
-const MAX_LEARNING_AGE_S: f64 = 0.1;
+/// Age of the newest pose, s, from which on it has ended rather than is late, and frames do not wait for another.
+const ENDED_S: f64 = 1.0;
 
 /// Why there are no poses.
 #[derive(Debug, thiserror::Error)]
@@ -182,6 +183,12 @@ impl Platform {
         self.source.receive(with_frame, stamp, shows_ground)
     }
 
+    /// Whether the poses received tell of a frame at `time` as exactly as rates that go on do, or will not: none come, or they have ended.
+    pub fn is_posed(&self, time: Timestamp) -> bool {
+        let newest = self.source.read(|poses| poses.newest().map(|pose| pose.time)).flatten();
+        newest.is_none_or(|newest| !(UNIFORM_S..ENDED_S).contains(&seconds(newest, self.stamp(time))))
+    }
+
     /// A frame's time on the clock of the poses.
     fn stamp(&self, time: Timestamp) -> Timestamp {
         let delay = SignedDuration::from_secs_f64(self.delay_s());
@@ -201,7 +208,7 @@ impl Platform {
     /// Learns the delay from the pose error that the beams of a frame share, where it is not configured. `pose` is that of the
     /// frame.
     pub fn learn(&mut self, error: &Vector6<f64>, pose: &PoseAt) {
-        if self.delay_s.is_some() || pose.age_s >= MAX_LEARNING_AGE_S {
+        if self.delay_s.is_some() || pose.age_s >= UNIFORM_S {
             return;
         }
         if self.unlearned.len() == MOST_WAITING {
@@ -276,105 +283,5 @@ impl Platform {
 }
 
 #[cfg(test)]
-mod tests {
-    use nalgebra::UnitQuaternion;
-    use rand::SeedableRng;
-    use rand_chacha::ChaCha8Rng;
-    use rand_distr::{Distribution, StandardNormal};
-
-    use super::*;
-
-    /// The delay as learned in a minute of sway, where poses are `late_s` late and their tilt has white noise, rad.
-    fn learned(late_s: f64, noise_rad: f64) -> (f64, f64) {
-        let mut rng = ChaCha8Rng::seed_from_u64(7);
-        let mut noise = || {
-            let value: f64 = StandardNormal.sample(&mut rng);
-            value * noise_rad
-        };
-        let camera = crate::optics::Config::default().camera().unwrap();
-        let at = |s: f64| Timestamp::UNIX_EPOCH + SignedDuration::from_nanos(((100.0 + s) * 1e9).round() as i64);
-        let tilt = |s: f64| [0.05 * (0.785 * s).sin(), 0.05 * (0.63 * s + 1.0).sin()];
-        let mut platform = Platform {
-            source: Source::Live(PoseInbox::default(), PoseBuffer::default()),
-            ..Platform::level()
-        };
-        // Stamps at 50 Hz that coincide with those of the frames at 10 Hz.
-        for k in 0..3000_u32 {
-            let s = 0.02 * f64::from(k);
-            let [north, east] = tilt(s - late_s);
-            let attitude = UnitQuaternion::from_scaled_axis([north + noise(), east + noise(), 0.0].into());
-            let pose = Pose {
-                attitude,
-                ..Pose::level(at(s), [0.0, 0.0, 300.0])
-            };
-            platform.receive(vec![pose], at(s), &camera);
-            // A frame that is seen when the next poses are there.
-            let frame_s = s - 0.04;
-            if k % 5 == 2 && frame_s > 0.0 {
-                let Placement::At { pose, .. } = platform.at(at(frame_s), &camera) else {
-                    panic!("poses are there");
-                };
-                let truth = tilt(frame_s);
-                let found = pose.pose.attitude.scaled_axis();
-                let error = Vector6::new(found.x - truth[0], found.y - truth[1], 0.0, 0.0, 0.0, 0.0);
-                platform.learn(&error, &pose);
-            }
-        }
-        (platform.delay_s(), platform.learned.std_s())
-    }
-
-    #[test]
-    fn a_delay_is_learned_from_poses_with_noise_too() {
-        for late_s in [0.0, 0.03] {
-            for noise_rad in [0.0, 0.001, 0.003] {
-                let (found, std_s) = learned(late_s, noise_rad);
-                assert!(
-                    (found - late_s).abs() < 4.0 * std_s,
-                    "{late_s} {noise_rad}: {found} ± {std_s}"
-                );
-                assert!(std_s < 0.005, "{std_s}");
-            }
-        }
-    }
-
-    #[test]
-    fn a_pose_that_shows_no_ground_is_refused() {
-        let camera = crate::optics::Config::default().camera().unwrap();
-        let at = |ms: i64| Timestamp::from_millisecond(ms).unwrap();
-        let pose = |ms: i64, roll: f64, height_m: f64| Pose {
-            attitude: UnitQuaternion::from_euler_angles(roll, 0.0, 0.0),
-            ..Pose::level(at(ms), [0.0, 0.0, height_m])
-        };
-        // Level, with half of the view above the horizon, upside down, and below the ground.
-        for (roll, height_m, is_one) in [
-            (0.0, 300.0, true),
-            (1.57, 300.0, true),
-            (3.1, 300.0, false),
-            (0.0, -5.0, false),
-        ] {
-            let mut platform = Platform {
-                source: Source::Live(PoseInbox::default(), PoseBuffer::default()),
-                ..Platform::level()
-            };
-            platform.receive(vec![pose(0, 0.0, 300.0)], at(0), &camera);
-            let later = [9_900, 10_000, 10_100].map(|ms| pose(ms, roll, height_m));
-            platform.receive(later.into(), at(10_000), &camera);
-            // The last that is one holds, the longer the less exactly.
-            let Placement::At {
-                pose: found, is_lost, ..
-            } = platform.at(at(10_000), &camera)
-            else {
-                panic!("a pose is known");
-            };
-            assert_eq!(!is_lost, is_one, "{roll} {height_m}");
-            assert!(is_one || found.pose.cov[(0, 0)] > 0.01, "{roll} {height_m}");
-        }
-        let mut platform = Platform {
-            source: Source::Fixed(pose(0, 3.1, 300.0)),
-            ..Platform::level()
-        };
-        platform.at(at(0), &camera);
-        let placement = platform.at(at(60_000), &camera);
-        assert!(matches!(placement, Placement::Unknown { is_lost: true, .. }));
-    }
-}
+#[path = "platform_test.rs"]
+mod tests;
