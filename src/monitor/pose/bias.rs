@@ -21,7 +21,7 @@ const LEAST: [f64; 2] = [1e-12, 1e-8];
 /// The lasting error of the pose, about north, east, down (rad), then east, north, up (m).
 #[derive(Clone, Debug, Default)]
 pub struct PoseBias {
-    /// Covariance that the newest fresh pose stated.
+    /// Covariance that the newest fresh pose stated; the first one where none was fresh yet.
     prior: Option<Matrix6<f64>>,
     information: Matrix6<f64>,
     /// The same with the squares of the weights: how much the weighted sums scatter.
@@ -57,6 +57,10 @@ impl PoseBias {
 
     pub fn cov(&self) -> &Matrix6<f64> {
         &self.cov
+    }
+
+    pub fn has_prior(&self) -> bool {
+        self.prior.is_some()
     }
 
     /// Takes one frame's residuals, `dt` seconds after the last one's; each user claims every `period_s`. `prior` is the
