@@ -4,6 +4,7 @@ use super::error::Error;
 use super::grouping::Image;
 use super::learn::Learner;
 use super::parts;
+use super::pupil::Pupil;
 use super::statistics;
 use crate::optics::Camera;
 
@@ -23,6 +24,9 @@ const FIELD_RADIUS: f64 = 7.0;
 pub const BETTER: f64 = 30.0;
 /// Share of the light that a wavefront may leave unexplained for no other shape to be tried.
 const EXPLAINED: f64 = 0.03;
+/// Share of the light that the wavefront of a whole aperture leaves from which on a cut one is tried, which takes as long again. Of lenses
+/// whose aperture is round it leaves none.
+const WHOLE: f64 = 0.01;
 /// Parameters of a spot, each of which lowers χ² by chance (Akaike, 1974).
 const PER_SPOT: usize = 3;
 
@@ -38,7 +42,7 @@ pub fn first<'a>(
     let Err(error) = check(&shape) else {
         return Ok(shape);
     };
-    let wavefront = wavefront(camera, images, noise_j, true, run);
+    let wavefront = wavefront(camera, images, noise_j, Lens::Varying, run);
     check(&wavefront).map_err(|_| error)?;
     Ok(wavefront)
 }
@@ -54,17 +58,22 @@ pub fn best<'a>(first: Learner<'a>, held: &[&Image], is_field_covered: bool, run
         (score, statistics::unexplained(&held, 0.0))
     };
     let (mut least, _) = on_held(&first);
-    let mut learned = |varies: bool| {
-        let wavefront = wavefront(first.camera, first.images, first.noise_j, varies, run);
+    let mut learned = |lens: Lens| {
+        let wavefront = wavefront(first.camera, first.images, first.noise_j, lens, run);
         let (score, unexplained) = on_held(&wavefront);
         (wavefront, score, unexplained)
     };
-    let mut of_lens = learned(true);
+    let mut of_lens = learned(Lens::Varying);
     // Where no spot stood a change over the field is extrapolated, which the held-out frames do not see.
     if !is_field_covered {
-        let same = learned(false);
+        let same = learned(Lens::Uniform);
         if same.1 - of_lens.1 < BETTER {
             of_lens = same;
+        }
+    } else if of_lens.2 > WHOLE {
+        let cut = learned(Lens::Cut);
+        if of_lens.1 - cut.1 > BETTER {
+            of_lens = cut;
         }
     }
     let (wavefront, score, unexplained) = of_lens;
@@ -86,10 +95,25 @@ pub fn best<'a>(first: Learner<'a>, held: &[&Image], is_field_covered: bool, run
     if score < least { wavefront } else { best }
 }
 
-fn wavefront<'a>(camera: &'a Camera, images: &'a [&'a Image], noise_j: f64, varies: bool, run: Run) -> Learner<'a> {
+/// What a lens's wavefront may be.
+#[derive(Clone, Copy)]
+enum Lens {
+    /// The same everywhere.
+    Uniform,
+    /// Another at other places of the field.
+    Varying,
+    /// The same, of an aperture that is cut.
+    Cut,
+}
+
+fn wavefront<'a>(camera: &'a Camera, images: &'a [&'a Image], noise_j: f64, lens: Lens, run: Run) -> Learner<'a> {
     let mut learner = Learner::new(camera, images, noise_j);
-    learner.begin_wavefront();
-    if varies {
+    let whole = Pupil::of_camera(camera);
+    learner.begin_wavefront(match lens {
+        Lens::Uniform | Lens::Varying => whole,
+        Lens::Cut => whole.cut(),
+    });
+    if let Lens::Varying | Lens::Cut = lens {
         learner.fit(PLACES);
         learner.model = learner.model.with_pupil(parts::start(&learner));
     }

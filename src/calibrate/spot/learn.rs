@@ -296,13 +296,13 @@ impl<'a> Learner<'a> {
     }
 
     /// Goes on with the spot of a lens's pupil, whose wavefront is then what is learned.
-    pub fn begin_wavefront(&mut self) {
+    pub fn begin_wavefront(&mut self, pupil: Pupil) {
         let radius = FIRST_PUPIL_RADIUS * self.camera.spot_sigma_m;
         let knots = (2.0 * radius / self.model.knot_m) as usize;
         let like = self
             .model
             .widened((knots | 1).clamp(self.model.n, MOST_SPLINES.max(self.model.n)));
-        self.adopt(like.with_pupil(Pupil::of_camera(self.camera)));
+        self.adopt(like.with_pupil(pupil));
     }
 
     /// One step of the template and of everything else at once.

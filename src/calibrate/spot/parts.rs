@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use super::grouping::{self, Image};
 use super::learn::Learner;
 use super::patch::{Patch, Source};
-use super::pupil::{FIELD, Pupil};
+use super::pupil::{FIELD, Pupil, ZERNIKES};
 use super::template_model::TemplateModel;
 use super::wavefront;
 use crate::calibrate::exposure::ScaledCholesky;
@@ -34,24 +34,27 @@ struct Part {
 }
 
 /// The wavefront that changes over the field from which to learn, for a learner of one that does not and whose places are fitted: of the
-/// joined one and one that is the same everywhere, what explains lone spots better after some steps.
+/// joined one and one that is the same everywhere, what explains lone spots better after some steps. Of a cut aperture each with a rim that
+/// moves one way or the other: with the sign of all even polynomials the image would stay the same.
 pub fn start(learner: &Learner) -> Pupil {
+    let first = learner.model.pupil.unwrap_or(Pupil::of_camera(learner.camera));
     let parts: Vec<Vec<Patch>> = (0..PARTS * PARTS)
         .map(|k| lone_spots(learner, [k % PARTS, k / PARTS]))
         .filter(|spots| spots.len() >= LEAST_SPOTS)
         .collect();
-    let uniform = Pupil {
-        varies: true,
-        ..Pupil::of_camera(learner.camera)
-    };
-    let fits: Vec<Part> = parts.iter().filter_map(|spots| Part::of(learner, spots)).collect();
-    let Some(joined) = join(&fits) else {
-        return uniform;
-    };
+    let uniform = Pupil { varies: true, ..first };
+    let fits: Vec<Part> = parts
+        .iter()
+        .filter_map(|spots| Part::of(learner, spots, first))
+        .collect();
     let spots = parts.concat();
-    let fits = [joined, uniform].map(|start| fitted(learner.camera, &learner.model, spots.clone(), start));
-    let [joined, uniform] = fits;
-    if joined.0 < uniform.0 { joined.1 } else { uniform.1 }
+    let starts = std::iter::once(uniform).chain(join(&fits, uniform));
+    let starts = starts.flat_map(|start| match start.is_cut {
+        true => vec![start.with_rim(1.0), start.with_rim(-1.0)],
+        false => vec![start],
+    });
+    let fits = starts.map(|start| fitted(learner.camera, &learner.model, spots.clone(), start));
+    fits.min_by(|a, b| a.0.total_cmp(&b.0)).map_or(uniform, |best| best.1)
 }
 
 /// Patches of spots of part (x, y) beside which there is no other.
@@ -79,14 +82,14 @@ fn lone_spots(learner: &Learner, part: [usize; 2]) -> Vec<Patch> {
 }
 
 impl Part {
-    fn of(learner: &Learner, spots: &[Patch]) -> Option<Self> {
+    fn of(learner: &Learner, spots: &[Patch], first: Pupil) -> Option<Self> {
         let place = std::array::from_fn(|k| {
             let at = |patch: &Patch| learner.model.field.at(patch.sources[0].at).0[k];
             spots.iter().map(at).sum::<f64>() / spots.len() as f64
         });
         // Astigmatism at its best focus looks the same after a quarter turn: from one diagonal no way leads down to the other.
         let starts = [1.0, -1.0].map(|sign| {
-            let mut start = Pupil::of_camera(learner.camera);
+            let mut start = first;
             start.parameters[Pupil::range(Pupil::OBLIQUE_ASTIGMATISM)]
                 .iter_mut()
                 .for_each(|p| *p *= sign);
@@ -140,9 +143,9 @@ fn fitted(camera: &Camera, like: &TemplateModel, mut patches: Vec<Patch>, start:
 
 /// The wavefront nearest to the parts' (least squares). The image stays the same where all even polynomials change their sign: of all
 /// signs of the parts those are taken that a polynomial of the field follows best.
-fn join(parts: &[Part]) -> Option<Pupil> {
+fn join(parts: &[Part], like: Pupil) -> Option<Pupil> {
     let n = parts.len();
-    let factors = Mat::from_fn(n, FIELD, |i, c| Pupil::factors(1, parts[i].place)[c]);
+    let factors = Mat::from_fn(n, FIELD, |i, c| Pupil::factors(parts[i].place)[c]);
     let normal = factors.transpose() * &factors;
     let solver = ScaledCholesky::new(&normal, DAMPING)?;
     let project = |values: &[f64]| -> Vec<f64> {
@@ -172,16 +175,16 @@ fn join(parts: &[Part]) -> Option<Pupil> {
             };
             values.iter().enumerate().map(square).sum::<f64>()
         };
-        (1..Pupil::CHANGES).filter(|k| Pupil::is_even(*k)).map(of).sum()
+        (1..=ZERNIKES).filter(|k| Pupil::is_even(*k)).map(of).sum()
     };
     // The last part's sign is free.
     let signs = (0..1usize << n.checked_sub(1)?).min_by(|a, b| left(a).total_cmp(&left(b)))?;
-    let mut pupil = Pupil {
-        parameters: [0.0; Pupil::PARAMETERS],
-        varies: true,
-    };
-    pupil.parameters[0] = parts.iter().map(|part| part.local[0]).sum::<f64>() / n as f64;
-    for k in 1..Pupil::CHANGES {
+    let mut pupil = like;
+    // What is the same everywhere is in the mean of the parts.
+    for k in (0..Pupil::CHANGES).filter(|k| !(1..=ZERNIKES).contains(k)) {
+        pupil.parameters[Pupil::range(k)][0] = parts.iter().map(|part| part.local[k]).sum::<f64>() / n as f64;
+    }
+    for k in 1..=ZERNIKES {
         pupil.parameters[Pupil::range(k)].copy_from_slice(&project(&signed(signs, k)));
     }
     Some(pupil)
@@ -208,7 +211,12 @@ mod tests {
             Part { place, local }
         };
         let parts: Vec<Part> = (0..PARTS * PARTS).map(part).collect();
-        let pupil = join(&parts).expect("a wavefront");
+        let like = Pupil {
+            parameters: [0.0; Pupil::PARAMETERS],
+            varies: true,
+            is_cut: false,
+        };
+        let pupil = join(&parts, like).expect("a wavefront");
         let place = [-0.8, 0.5];
         let local = pupil.local(place);
         let sign = (local[2] / waves(place)[0]).signum();
@@ -221,6 +229,11 @@ mod tests {
 
     #[test]
     fn without_parts_there_is_nothing_to_join() {
-        assert!(join(&[]).is_none());
+        let like = Pupil {
+            parameters: [0.0; Pupil::PARAMETERS],
+            varies: true,
+            is_cut: false,
+        };
+        assert!(join(&[], like).is_none());
     }
 }

@@ -1,4 +1,6 @@
-//! The spot of a round aperture whose wavefront departs from a sphere by a few Zernike polynomials that change over the field.
+//! The spot of an aperture whose wavefront departs from a sphere by a few Zernike polynomials that change over the field. The aperture is
+//! round, or cut: its middle covered, as by a secondary mirror, and its edge by a second round one, the rim of another lens, which moves
+//! over the pupil with the place in the field (vignetting; Born and Wolf, 1999, section 4.8).
 
 use faer::{Mat, c64};
 use ndarray::Array2;
@@ -10,6 +12,19 @@ use crate::optics::spot::{FieldPolynomial, Template};
 pub const ZERNIKES: usize = 8;
 /// Coefficients of 1, u, v, u², uv, v², u and v over half the sensor.
 pub const FIELD: usize = 6;
+/// How a cut aperture's image changes beside: by the radius of what covers its middle, the rim's centre along x and y, and the rim's
+/// radius less 1, all in radii of the aperture.
+const CUTS: usize = 4;
+const OBSCURATION: usize = 1 + ZERNIKES;
+const RIM_X: usize = OBSCURATION + 1;
+const RIM_Y: usize = OBSCURATION + 2;
+const RIM_RADIUS: usize = OBSCURATION + 3;
+/// A rim that nothing shows of.
+const NO_RIM: f64 = 1.0;
+/// Where the cuts start: a rim that has not moved, or is much wider than the aperture, does not change the image with them.
+const START_OBSCURATION: f64 = 0.2;
+const START_RIM: f64 = 0.05;
+const START_RIM_MOVES: f64 = 0.2;
 /// Samples across the pupil: the image repeats after as many λF.
 const SAMPLES: usize = 64;
 /// Parts of a sample along an axis by which the aperture's edge is told.
@@ -21,12 +36,15 @@ const ZERO_PER_SIGMA: f64 = 2.7;
 /// Even polynomials at the start, waves: at zero the image does not change to first order with them.
 const START_WAVES: f64 = 0.03;
 
-/// ln of the first dark ring's radius, m, and for each polynomial its root mean square in waves over the field.
+/// For each of the ways in which the image at a place changes, a quadratic of the field: ln of the first dark ring's radius, m; the
+/// root mean square of each polynomial, waves; the cuts.
 #[derive(Clone, Copy, Debug)]
 pub struct Pupil {
     pub parameters: [f64; Self::PARAMETERS],
     /// Whether it may change over the field.
     pub varies: bool,
+    /// Whether the aperture may be cut.
+    pub is_cut: bool,
 }
 
 /// What a lens does to a plane wave, in an optical engineer's terms.
@@ -40,12 +58,24 @@ pub struct Wavefront {
     pub coma: f64,
     pub trefoil: f64,
     pub spherical: f64,
+    /// Radius of what covers the aperture's middle, in its own.
+    pub obscuration: f64,
+    /// None where nothing shows of one.
+    pub rim: Option<Rim>,
+}
+
+/// The rim of another lens that cuts the aperture off towards the sensor's edge (vignetting), in radii of the aperture.
+#[derive(Clone, Copy, Debug, serde::Serialize)]
+pub struct Rim {
+    /// How far its centre moves over half the sensor.
+    pub moves: f64,
+    pub radius: f64,
 }
 
 impl Pupil {
-    pub const PARAMETERS: usize = 1 + ZERNIKES * FIELD;
-    /// Ways in which the image at one place changes: its width and each polynomial there.
-    pub const CHANGES: usize = 1 + ZERNIKES;
+    pub const PARAMETERS: usize = Self::CHANGES * FIELD;
+    /// Ways in which the image at one place changes: its width, each polynomial there, and the cuts.
+    pub const CHANGES: usize = 1 + ZERNIKES + CUTS;
     /// The change that is astigmatism along the diagonals, Noll's fifth polynomial.
     pub const OBLIQUE_ASTIGMATISM: usize = 2;
 
@@ -53,13 +83,31 @@ impl Pupil {
     pub fn of_camera(camera: &Camera) -> Self {
         let mut parameters = [0.0; Self::PARAMETERS];
         parameters[0] = (ZERO_PER_SIGMA * camera.spot_sigma_m).ln();
-        for even in [0, 1, 2] {
-            parameters[1 + FIELD * even] = START_WAVES;
+        for even in [1, 2, 3] {
+            parameters[FIELD * even] = START_WAVES;
         }
+        parameters[FIELD * RIM_RADIUS] = NO_RIM;
         Self {
             parameters,
             varies: false,
+            is_cut: false,
         }
+    }
+
+    /// The same with an aperture that may be cut, its middle covered as at the start.
+    pub fn cut(mut self) -> Self {
+        self.is_cut = true;
+        self.parameters[FIELD * OBSCURATION] = START_OBSCURATION;
+        self
+    }
+
+    /// The same with a rim that cuts off the side of the aperture towards which the field's place lies, or with the opposite `sign`
+    /// the other side.
+    pub fn with_rim(mut self, sign: f64) -> Self {
+        self.parameters[FIELD * RIM_X + 1] = sign * START_RIM_MOVES;
+        self.parameters[FIELD * RIM_Y + 2] = sign * START_RIM_MOVES;
+        self.parameters[FIELD * RIM_RADIUS] = START_RIM;
+        self
     }
 
     /// Whether change `k` is an even polynomial.
@@ -67,35 +115,57 @@ impl Pupil {
         matches!(k, 1..=3 | 8)
     }
 
-    /// The derivatives of what changes the image at a field place by the parameters: one factor for each of the parameters, those of
-    /// change `k` being [`Self::range`]`(k)`.
-    pub fn factors(k: usize, [u, v]: [f64; 2]) -> [f64; FIELD] {
-        match k {
-            0 => [1.0, 0.0, 0.0, 0.0, 0.0, 0.0],
-            _ => [1.0, u, v, u * u, u * v, v * v],
-        }
+    /// Derivatives of a change at a field place by its parameters.
+    pub fn factors([u, v]: [f64; 2]) -> [f64; FIELD] {
+        [1.0, u, v, u * u, u * v, v * v]
     }
 
-    /// The parameters on which change `k` depends.
+    /// The parameters of change `k`.
     pub fn range(k: usize) -> std::ops::Range<usize> {
-        match k {
-            0 => 0..1,
-            _ => 1 + FIELD * (k - 1)..1 + FIELD * k,
+        FIELD * k..FIELD * (k + 1)
+    }
+
+    /// Whether parameter `p` is learned.
+    pub fn is_free(&self, p: usize) -> bool {
+        let factor = p % FIELD;
+        match p / FIELD {
+            0 => factor == 0,
+            OBSCURATION => self.is_cut && factor == 0,
+            RIM_X => self.is_cut && self.varies && matches!(factor, 0 | 1),
+            RIM_Y => self.is_cut && self.varies && matches!(factor, 0 | 2),
+            RIM_RADIUS => self.is_cut && self.varies && factor == 0,
+            _ => self.varies || factor == 0,
         }
     }
 
-    /// The parameters that stay zero.
-    pub fn fixed(&self) -> impl Iterator<Item = usize> + use<> {
-        let varies = self.varies;
-        (1..Self::PARAMETERS).filter(move |c| !varies && (c - 1) % FIELD != 0)
+    /// Whether change `k` is learned, anywhere.
+    pub fn may_change(&self, k: usize) -> bool {
+        Self::range(k).any(|p| self.is_free(p))
     }
 
-    /// ln of the first dark ring's radius and each polynomial's waves at a field place.
+    /// Each change at a field place.
     pub fn local(&self, place: [f64; 2]) -> [f64; Self::CHANGES] {
         std::array::from_fn(|k| {
             let parameters = &self.parameters[Self::range(k)];
-            parameters.iter().zip(Self::factors(k, place)).map(|(p, f)| p * f).sum()
+            parameters.iter().zip(Self::factors(place)).map(|(p, f)| p * f).sum()
         })
+    }
+
+    /// The rim, where it cuts anything off at the sensor's corners.
+    fn rim(&self) -> Option<Rim> {
+        let rim = Rim {
+            moves: 0.5 * (self.parameters[FIELD * RIM_X + 1] + self.parameters[FIELD * RIM_Y + 2]),
+            radius: 1.0 + self.parameters[FIELD * RIM_RADIUS],
+        };
+        let corners = [[-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0], [1.0, 1.0]];
+        let off = corners.map(|place| {
+            let local = self.local(place);
+            local[RIM_X].hypot(local[RIM_Y])
+        });
+        (off.into_iter()
+            .fold(rim.radius - 1.0, |least, off| least.min(rim.radius - off - 1.0))
+            < 0.0)
+            .then_some(rim)
     }
 
     pub fn wavefront(&self) -> Wavefront {
@@ -110,6 +180,8 @@ impl Pupil {
             coma: rms(4..6),
             trefoil: rms(6..8),
             spherical: rms(8..9),
+            obscuration: self.parameters[FIELD * OBSCURATION].abs(),
+            rim: self.rim(),
         }
     }
 }
@@ -157,11 +229,11 @@ impl Aperture {
     /// (Soummer et al., 2007).
     pub fn coefficients(&self, local: &[f64; Pupil::CHANGES], n: usize, knot_m: f64) -> Vec<f64> {
         let per_knot = AIRY_ZERO * knot_m / local[0].exp();
-        let waves = &local[1..];
+        let waves = &local[1..=ZERNIKES];
         let wave = |j: usize, i: usize| {
             let phase: f64 = waves.iter().zip(&self.polynomials).map(|(w, z)| w * z[(j, i)]).sum();
             let (sin, cos) = (std::f64::consts::TAU * phase).sin_cos();
-            c64::new(cos, sin) * self.open[(j, i)]
+            c64::new(cos, sin) * self.open[(j, i)] * uncut(local, sample(i), sample(j))
         };
         let pupil = Mat::from_fn(SAMPLES, SAMPLES, wave);
         let kernel = Mat::from_fn(n, SAMPLES, |k, q| {
@@ -175,6 +247,14 @@ impl Aperture {
         coefficients.iter_mut().for_each(|c| *c /= total);
         coefficients
     }
+}
+
+/// Share of the sample at (x, y) that the cuts leave.
+fn uncut(local: &[f64; Pupil::CHANGES], x: f64, y: f64) -> f64 {
+    // An edge within a sample is taken for a straight one across the direction to its centre.
+    let inside = |distance: f64| (0.5 + 0.5 * SAMPLES as f64 * distance).clamp(0.0, 1.0);
+    let of_rim = inside(1.0 + local[RIM_RADIUS] - (x - local[RIM_X]).hypot(y - local[RIM_Y]));
+    of_rim * inside(x.hypot(y) - local[OBSCURATION].abs())
 }
 
 /// Noll's polynomial 4 + `k`, of unit variance over the pupil.
@@ -196,6 +276,25 @@ fn zernike(k: usize, x: f64, y: f64) -> f64 {
 mod tests {
     use super::*;
     use crate::optics::spot::Field;
+
+    #[test]
+    fn cuts_take_their_share_of_the_aperture() {
+        let aperture = Aperture::new();
+        let open = |local: &[f64; Pupil::CHANGES]| {
+            let of = |j: usize, i: usize| aperture.open[(j, i)] * uncut(local, sample(i), sample(j));
+            Mat::from_fn(SAMPLES, SAMPLES, of).sum() / aperture.open.sum()
+        };
+        let mut local = [0.0; Pupil::CHANGES];
+        local[RIM_RADIUS] = NO_RIM;
+        assert!((open(&local) - 1.0).abs() < 1e-9);
+        local[OBSCURATION] = 0.4;
+        assert!((open(&local) - 0.84).abs() < 2e-3, "{}", open(&local));
+        // Two unit discs half a radius apart: their overlap is 2·acos(¼) − ½·√(1 − 1/16) of π.
+        local = [0.0; Pupil::CHANGES];
+        local[RIM_X] = 0.5;
+        let expected = (2.0 * 0.25_f64.acos() - 0.5 * (1.0 - 0.0625_f64).sqrt()) / std::f64::consts::PI;
+        assert!((open(&local) - expected).abs() < 5e-3, "{} {expected}", open(&local));
+    }
 
     #[test]
     fn polynomials_are_orthonormal_over_the_aperture() {
@@ -227,7 +326,7 @@ mod tests {
         let expected = &template.components[0].coefficients;
         let n = expected.nrows();
         let mut local = [0.0; Pupil::CHANGES];
-        local[0] = zero_m.ln();
+        (local[0], local[RIM_RADIUS]) = (zero_m.ln(), NO_RIM);
         let found = Aperture::new().coefficients(&local, n, knot_m);
         let (total, peak) = (expected.sum(), expected[(n / 2, n / 2)]);
         for (f, e) in found.iter().zip(expected) {

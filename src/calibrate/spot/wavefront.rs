@@ -9,7 +9,7 @@ use super::template_model::TemplateModel;
 use crate::calibrate::exposure::ScaledCholesky;
 use crate::optics::Camera;
 
-/// Standard deviation of every parameter about zero, waves: what the spots do not tell stays small. The width is free.
+/// Standard deviation of every parameter about zero, waves or radii of the aperture: what the spots do not tell stays small. The width is free.
 const PRIOR: f64 = 0.3;
 /// Patches that are used for one step, at most: they determine fifty parameters, and more take longer.
 const MOST_PATCHES: usize = 400;
@@ -30,7 +30,7 @@ pub fn step(camera: &Camera, model: &TemplateModel, pupil: Pupil, patches: &[Pat
     // Added up in their order, so that the same frames always give the same calibration.
     let normals: Vec<(Mat<f64>, Vec<f64>)> = patches
         .par_iter()
-        .filter_map(|patch| normal(camera, model, patch, &changes))
+        .filter_map(|patch| normal(camera, model, &pupil, patch, &changes))
         .collect();
     let mut h = Mat::<f64>::zeros(Pupil::PARAMETERS, Pupil::PARAMETERS);
     let mut g = vec![0.0; Pupil::PARAMETERS];
@@ -42,7 +42,7 @@ pub fn step(camera: &Camera, model: &TemplateModel, pupil: Pupil, patches: &[Pat
         h[(k, k)] += PRIOR.powi(-2);
         g[k] -= pupil.parameters[k] * PRIOR.powi(-2);
     }
-    for k in pupil.fixed() {
+    for k in (0..Pupil::PARAMETERS).filter(|k| !pupil.is_free(*k)) {
         (0..Pupil::PARAMETERS).for_each(|l| (h[(k, l)], h[(l, k)]) = (0.0, 0.0));
         (h[(k, k)], g[k]) = (1.0, 0.0);
     }
@@ -74,22 +74,28 @@ pub fn step(camera: &Camera, model: &TemplateModel, pupil: Pupil, patches: &[Pat
 }
 
 /// Normal equations of one patch.
-fn normal(camera: &Camera, model: &TemplateModel, patch: &Patch, changes: &[Vec<f64>]) -> Option<(Mat<f64>, Vec<f64>)> {
+fn normal(
+    camera: &Camera,
+    model: &TemplateModel,
+    pupil: &Pupil,
+    patch: &Patch,
+    changes: &[Vec<f64>],
+) -> Option<(Mat<f64>, Vec<f64>)> {
     let linear = patch.linearise(camera, model)?;
     let mut columns = Mat::<f64>::zeros(patch.pixels(), Pupil::PARAMETERS);
     let mut buffers = Buffers::default();
     for (i, source) in patch.sources.iter().enumerate() {
         let (place, _) = model.field.at(source.at);
-        for (k, change) in changes.iter().enumerate() {
+        for (k, change) in changes.iter().enumerate().filter(|(k, _)| pupil.may_change(*k)) {
             let mut image = vec![0.0; patch.pixels()];
             linear.source_change(patch, model, i, change, &mut buffers, &mut image);
-            for (c, factor) in Pupil::range(k).zip(Pupil::factors(k, place)) {
+            for (c, factor) in Pupil::range(k).zip(Pupil::factors(place)) {
                 let column = columns.col_as_slice_mut(c);
                 column.iter_mut().zip(&image).for_each(|(c, v)| *c += factor * v);
             }
         }
     }
-    for c in 0..Pupil::PARAMETERS {
+    for c in (0..Pupil::PARAMETERS).filter(|c| pupil.is_free(*c)) {
         let column = columns.col_as_slice_mut(c);
         column.iter_mut().zip(&patch.weight).for_each(|(c, w)| *c *= w);
         linear.project(patch, column);

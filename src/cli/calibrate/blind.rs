@@ -123,6 +123,8 @@ fn read(args: &Args, camera: &Camera) -> Result<Vec<Array2<f64>>, Failure> {
     Ok(frames)
 }
 
+/// Obscuration below which none is told of: its square, the light that it takes, is then below what spots show.
+const LEAST_OBSCURATION: f64 = 0.05;
 /// Reduced χ² of held-out frames that raises no doubt: overlapping spots and bright ones add to it, nothing honest lowers it by as much.
 const AS_EXPECTED: std::ops::Range<f64> = 0.8..1.5;
 
@@ -159,8 +161,18 @@ fn report(camera: &Camera, l: &Learned) -> Vec<String> {
         1e3 * shape.radius_m()
     ));
     if let Some(w) = &l.wavefront {
+        let mut aperture = "a round aperture".to_owned();
+        if w.obscuration > LEAST_OBSCURATION {
+            aperture += &format!(", covered out to {:.2} of its radius,", w.obscuration);
+        }
+        if let Some(rim) = w.rim {
+            aperture += &format!(
+                ", cut off by a rim of {:.2} of its radius that moves over {:.2} of it across half the sensor (vignetting),",
+                rim.radius, rim.moves
+            );
+        }
         lines.push(format!(
-            "wavefront: a round aperture whose first dark ring is at {:.4} mm; over the sensor {:.3} waves rms of defocus, {:.3} of \
+            "wavefront: {aperture} whose first dark ring is at {:.4} mm; over the sensor {:.3} waves rms of defocus, {:.3} of \
              astigmatism, {:.3} of coma, {:.3} of trefoil, {:.3} of spherical aberration",
             1e3 * w.first_zero_m,
             w.defocus,
