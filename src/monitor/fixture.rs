@@ -110,7 +110,6 @@ impl Scene {
             crowding: self.crowding,
             alerts: &self.alerts,
             of_lights: &NO_LIGHTS,
-            overlap_m: self.overlap_m(),
             store: &self.store,
         }
     }

@@ -253,7 +253,6 @@ impl Monitor {
             crowding: frame.crowding,
             alerts: &frame.alerts,
             of_lights: &of_lights,
-            overlap_m: frame.overlap_m(),
             store,
         };
         frame.association = associate(&frame.claims, &frame.tracker, &eligibility);

@@ -68,7 +68,7 @@ pub fn associate(claims: &[ActiveClaim], tracker: &Tracker, eligibility: &Eligib
     let has_own = |a: &ActiveClaim, track: &Track| {
         let own = a.before.current().and_then(|id| tracker.get(id));
         let own = own.filter(|own| own.id != track.id && own.hit && own.confirmed && own.unresolved_from.is_none());
-        own.is_some_and(|own| a.before.is_established() && own.is_old() && !own.has_met(track, eligibility.overlap_m))
+        own.is_some_and(|own| a.before.is_established() && own.is_old() && !own.has_met(track))
     };
     let mut association = Association::none(claims.len());
     for tracks in [&hit, &merged] {
@@ -140,7 +140,6 @@ mod tests {
             crowding: Crowding::default(),
             alerts: &AlertLifecycle::new("replay".into(), None, 60.0),
             of_lights: &BTreeSet::new(),
-            overlap_m: 25.0,
             store: &Store::new(&claims::Config::default()),
         };
         associate(claims, tracker, &eligibility).track_of
@@ -175,7 +174,7 @@ mod tests {
 
     #[test]
     fn users_who_exchange_their_claims_keep_their_beams_unless_these_have_met() {
-        for (apart, exchanged) in [(60.0, false), (20.0, true)] {
+        for (apart, exchanged) in [(60.0, false), (12.0, false), (2.0, true)] {
             let mut tracker = Tracker::new(50.0);
             for k in 0..50 {
                 // From here on 60 m apart, whether they have met or not.

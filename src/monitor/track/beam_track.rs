@@ -37,8 +37,11 @@ const LEAST_SNR: f64 = 4.0;
 /// memory (30 kB for a minute); finer steps follow turns more exactly. Not tuned.
 const TRAIL_S: f64 = 60.0;
 const TRAIL_STEP_S: f64 = 0.05;
-/// Every how many steps of it are looked at for whether two beams have met: two cars are within three spot widths of each other for longer.
+/// Every how many steps of it are looked at for whether two beams have met: two cars are within a spot width of each other for longer.
 const MET_EVERY: usize = 5;
+/// Distances at which two beams merge within which they may have been taken for each other: a beam that comes apart from another is found
+/// again only farther away. Larger lets a liar take the beam of a user beside, smaller has users whose beams were exchanged accused.
+const TAKEN_FOR: f64 = 2.0;
 /// Probability that an emitter in view is detected in a frame. Low, so that misses cost an eavesdropper's score little. Assumed.
 const DETECTION_PROBABILITY: f64 = 0.9;
 
@@ -64,12 +67,21 @@ pub struct Track {
     hits: u32,
     frames: u32,
     missed_s: f64,
-    trail: VecDeque<(Timestamp, Vector2<f64>)>,
+    trail: VecDeque<Past>,
+}
+
+/// Where a beam was.
+#[derive(Clone, Copy, Debug)]
+struct Past {
+    time: Timestamp,
+    position: Vector2<f64>,
+    /// Distance from another beam within which the two may have been taken for each other, m.
+    taken_for_m: f64,
 }
 
 impl Track {
     pub fn start(id: u64, time: Timestamp, detection: &Detection) -> Self {
-        Self {
+        let mut track = Self {
             id,
             filter: ManoeuvringFilter::start(detection.position, detection.cov),
             since: time,
@@ -82,8 +94,26 @@ impl Track {
             hits: 1,
             frames: 1,
             missed_s: 0.0,
-            trail: VecDeque::from([(time, detection.position)]),
+            trail: VecDeque::new(),
             detection: detection.clone(),
+        };
+        track.remember(time);
+        track
+    }
+
+    /// Where it is now goes into its trail.
+    fn remember(&mut self, time: Timestamp) {
+        self.trail.push_back(Past {
+            time,
+            position: self.filter.position(),
+            taken_for_m: TAKEN_FOR * self.merges_within_m(self.detection.resolution_m),
+        });
+        while self
+            .trail
+            .front()
+            .is_some_and(|past| seconds(past.time, time) > TRAIL_S)
+        {
+            self.trail.pop_front();
         }
     }
 
@@ -99,10 +129,13 @@ impl Track {
 
     /// Where the beam was at `time`, if the track reaches back that far.
     pub fn at(&self, time: Timestamp) -> Option<Vector2<f64>> {
-        let after = self.trail.partition_point(|(t, _)| *t <= time);
+        let after = self.trail.partition_point(|past| past.time <= time);
         match (after.checked_sub(1).map(|i| self.trail[i]), self.trail.get(after)) {
-            (Some((ta, a)), Some(&(tb, b))) => Some(a + (b - a) * (seconds(ta, time) / seconds(ta, tb))),
-            (Some((t, p)), None) if seconds(t, time) < 2.0 * TRAIL_STEP_S => Some(p),
+            (Some(a), Some(b)) => {
+                let share = seconds(a.time, time) / seconds(a.time, b.time);
+                Some(a.position + (b.position - a.position) * share)
+            }
+            (Some(last), None) if seconds(last.time, time) < 2.0 * TRAIL_STEP_S => Some(last.position),
             _ => None,
         }
     }
@@ -112,13 +145,22 @@ impl Track {
         seconds(self.since, self.last_hit) >= ESTABLISHED_S
     }
 
-    /// Whether two beams have been within a distance of each other, m, as far back as both are known.
-    pub fn has_met(&self, other: &Self, within_m: f64) -> bool {
-        let is_near = |(time, here): &(Timestamp, Vector2<f64>)| {
-            let there = other.at(*time);
-            there.is_some_and(|there| (there - here).norm() < within_m)
+    /// Whether two beams may have been taken for each other, as far back as both are known.
+    pub fn has_met(&self, other: &Self) -> bool {
+        let has_been_near = |a: &Self, b: &Self| {
+            let is_near = |past: &Past| {
+                let there = b.at(past.time);
+                there.is_some_and(|there| (there - past.position).norm() < past.taken_for_m)
+            };
+            a.trail.iter().rev().step_by(MET_EVERY).any(is_near)
         };
-        self.trail.iter().rev().step_by(MET_EVERY).any(is_near)
+        has_been_near(self, other) || has_been_near(other, self)
+    }
+
+    /// Distance from a spot of a resolution within which the beam merges into it, m.
+    fn merges_within_m(&self, resolution_m: f64) -> f64 {
+        let spread = largest_eigenvalue(&self.filter.position_cov()).sqrt().min(1.0);
+        resolution_m + GATE_FLOOR_M + 3.0 * spread
     }
 
     /// Takes a detection. One that another beam `is_merged` into lies between the two: neither takes its place or its velocity
@@ -147,12 +189,9 @@ impl Track {
         if self.unresolved_from.is_none() {
             self.missed_s = 0.0;
         }
-        let due = self.trail.back().is_none_or(|(t, _)| seconds(*t, time) >= TRAIL_STEP_S);
-        if due {
-            self.trail.push_back((time, self.filter.position()));
-            while self.trail.front().is_some_and(|(t, _)| seconds(*t, time) > TRAIL_S) {
-                self.trail.pop_front();
-            }
+        let is_due = |last: &Past| seconds(last.time, time) >= TRAIL_STEP_S;
+        if self.trail.back().is_none_or(is_due) {
+            self.remember(time);
         }
     }
 
@@ -180,8 +219,7 @@ impl Track {
     pub fn merges_into(&self, detections: &[Detection], followed: &[Option<u64>]) -> Option<(usize, u64)> {
         let was_there = self.confirmed && self.is_seen();
         let here = self.filter.position();
-        let spread = largest_eigenvalue(&self.filter.position_cov()).sqrt().min(1.0);
-        let is_near = |d: &Detection| (d.position - here).norm() < d.resolution_m + GATE_FLOOR_M + 3.0 * spread;
+        let is_near = |d: &Detection| (d.position - here).norm() < self.merges_within_m(d.resolution_m);
         // Without it an emitter is known from earlier frames alone, and hides nobody.
         let has_light = |d: &Detection| d.snr > LEAST_SNR;
         let mut spots = followed

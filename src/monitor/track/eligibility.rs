@@ -34,8 +34,6 @@ pub struct Eligibility<'a> {
     pub alerts: &'a AlertLifecycle,
     /// Tracks of known lights.
     pub of_lights: &'a BTreeSet<u64>,
-    /// Distance within which two beams disturb each other, m.
-    pub overlap_m: f64,
     pub store: &'a Store,
 }
 
