@@ -285,7 +285,7 @@ impl Monitor {
             };
             let displaced = frame
                 .users
-                .displaced(since, &frame.claims, &frame.association, is_alerted);
+                .displaced([since, frame.now], &frame.claims, &frame.association, is_alerted);
             if let Some(i) = displaced {
                 let user = &frame.claims[i].claim.user;
                 frame.association.assign(i, track);

@@ -8,6 +8,11 @@ use crate::time::seconds;
 /// chance meeting of two who walk lasts. Longer keeps honest newcomers unknown during a flood of claims. Not measured.
 pub const ESTABLISHED_S: f64 = 3.0;
 
+/// Time over which absences are a habit, s. Longer doubts those of who was hidden once, shorter takes beams in bursts for ones that vanish.
+const HABIT_S: f64 = 10.0;
+/// Times the longest of them from which another is none of that habit.
+const LONGER: f64 = 2.0;
+
 #[derive(Clone, Copy, Debug, Default)]
 pub struct UserTrack {
     /// The track that was associated last.
@@ -18,6 +23,15 @@ pub struct UserTrack {
     pub unseen_since: Option<Timestamp>,
     /// ln likelihood ratio of "absent" to "missed by chance".
     pub absence: f64,
+    /// The end of an absence, the longest of late.
+    returned: Option<Return>,
+}
+
+/// The end of an absence.
+#[derive(Clone, Copy, Debug)]
+struct Return {
+    time: Timestamp,
+    away_s: f64,
 }
 
 impl UserTrack {
@@ -36,6 +50,28 @@ impl UserTrack {
         seen.is_some_and(|(first, last)| seconds(first, last) >= ESTABLISHED_S)
     }
 
+    /// Whether the beam is away for no longer than it has been of late, as one in bursts is: that it went tells nothing.
+    pub fn is_often_away(&self, now: Timestamp) -> bool {
+        let (Some(since), Some(last)) = (self.unseen_since, self.returned) else {
+            return false;
+        };
+        seconds(last.time, since) < HABIT_S && seconds(since, now) < LONGER * last.away_s
+    }
+
+    /// The beam is `track` again, or still.
+    pub fn seen(&mut self, track: u64, now: Timestamp) {
+        if let Some(since) = self.unseen_since {
+            let away_s = seconds(since, now);
+            let is_latest = |last: &Return| seconds(last.time, now) >= HABIT_S || away_s >= last.away_s;
+            if self.returned.as_ref().is_none_or(is_latest) {
+                self.returned = Some(Return { time: now, away_s });
+            }
+        }
+        self.found(track);
+        self.first_seen.get_or_insert(now);
+        self.last_seen = Some(now);
+    }
+
     /// The beam is `track`.
     pub fn found(&mut self, track: u64) {
         self.track = Some(track);
@@ -47,6 +83,22 @@ impl UserTrack {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn who_goes_and_comes_is_often_away_until_they_stay_away() {
+        let at = |tenths: i64| Timestamp::from_millisecond(100 * tenths).unwrap();
+        let mut user = UserTrack::default();
+        user.seen(1, at(0));
+        user.unseen_since = Some(at(10));
+        assert!(!user.is_often_away(at(14)));
+        user.seen(1, at(14));
+        user.unseen_since = Some(at(20));
+        // It has been away for 0.4 s.
+        assert!(user.is_often_away(at(24)) && user.is_often_away(at(27)) && !user.is_often_away(at(28)));
+        // That was long ago.
+        user.unseen_since = Some(at(114));
+        assert!(!user.is_often_away(at(118)));
+    }
 
     #[test]
     fn three_seconds_establish_a_user() {

@@ -31,9 +31,7 @@ impl UserTracks {
         for (i, claim) in claims.iter().enumerate() {
             let user = self.entry(&claim.claim.user);
             if let Some(track) = association.track_id(i) {
-                user.found(track);
-                user.first_seen.get_or_insert(now);
-                user.last_seen = Some(now);
+                user.seen(track, now);
             } else if claim.is_unresolvable || !(claim.expected || claim.may_have_left) {
                 user.unseen_since = None;
                 user.absence = 0.0;
@@ -46,10 +44,10 @@ impl UserTracks {
 
     /// The claim of the user whom a beam that has had no claim since `since` may belong to: one who vanished as it appeared, or
     /// the only one who has not been seen yet. Where several have not been seen, which of them it is would be a guess, and the
-    /// beam is nobody's. Users whose absence `is_alerted` are not looked for.
+    /// beam is nobody's. Users whose absence `is_alerted` are not looked for, nor those who are as often away.
     pub fn displaced(
         &self,
-        since: Timestamp,
+        [since, now]: [Timestamp; 2],
         claims: &[ActiveClaim],
         association: &Association,
         is_alerted: impl Fn(&str) -> bool,
@@ -59,7 +57,8 @@ impl UserTracks {
             .filter_map(|i| {
                 let user = self.get(&claims[i].claim.user)?;
                 let gap = seconds(user.unseen_since?, since).abs();
-                (user.absence >= VANISHED && gap <= COINCIDENCE_S).then_some((i, gap))
+                let has_vanished = user.absence >= VANISHED && !user.is_often_away(now);
+                (has_vanished && gap <= COINCIDENCE_S).then_some((i, gap))
             })
             .filter(|(i, _)| !is_alerted(&claims[*i].claim.user));
         let (known, new): (Vec<_>, Vec<_>) =
@@ -118,13 +117,13 @@ mod tests {
         let mut one = Association::none(2);
         one.assign(0, 1);
         for k in 1..4 {
-            assert_eq!(users.displaced(at(k), &claims, &one, |_| false), None);
+            assert_eq!(users.displaced([at(k); 2], &claims, &one, |_| false), None);
             users.update(&claims, &one, at(k));
         }
-        assert_eq!(users.displaced(at(10), &claims, &one, |_| false), Some(1));
-        assert_eq!(users.displaced(at(10), &claims, &one, |user| user == "b"), None);
+        assert_eq!(users.displaced([at(10); 2], &claims, &one, |_| false), Some(1));
+        assert_eq!(users.displaced([at(10); 2], &claims, &one, |user| user == "b"), None);
         // It came two seconds after the user went.
-        assert_eq!(users.displaced(at(21), &claims, &one, |_| false), None);
+        assert_eq!(users.displaced([at(21); 2], &claims, &one, |_| false), None);
     }
 
     #[test]
@@ -134,7 +133,7 @@ mod tests {
             let mut users = UserTracks::default();
             let none = Association::none(claims.len());
             (0..3).for_each(|k| users.update(claims, &none, at(k)));
-            assert_eq!(users.displaced(at(0), claims, &none, |_| false), displaced);
+            assert_eq!(users.displaced([at(0); 2], claims, &none, |_| false), displaced);
         }
     }
 }
