@@ -80,6 +80,12 @@ impl Sight {
         &self.cov
     }
 
+    /// From the camera's axes to north, east, down.
+    pub fn axes(&self) -> Matrix3<f64> {
+        let columns = [0, 1, 2].map(|k| swap_ned_enu(self.to_world.column(k).into()));
+        Matrix3::from_columns(&columns)
+    }
+
     /// The same with the pose corrected by a rotation vector (north, east, down) and a shift (east, north, up), which are then
     /// known to `cov`.
     pub fn corrected(&self, by: &Vector6<f64>, cov: Matrix6<f64>) -> Self {

@@ -292,7 +292,7 @@ impl FrameContext {
             let residuals = residuals(&self.claims, &self.tracker, &self.view, self.bias.error());
             let is_fresh = self.pose_age_s < FRESH_S;
             let prior = (is_fresh || !self.bias.has_prior()).then(|| sight.cov());
-            self.bias.update(&residuals, prior, dt, period_s);
+            self.bias.update(&residuals, &sight.axes(), prior, dt, period_s);
             let shared = self.bias.shared_offset(&residuals).filter(|_| is_fresh);
             self.wander.update(shared, &self.course.cov(), dt, period_s);
         }

@@ -1,7 +1,7 @@
 //! What the poses' source and the users' claims together say of the pose error that lasts: the source's own covariance is the
 //! prior, each claim that a beam answers is a measurement.
 
-use nalgebra::{Matrix2, Matrix2x6, Matrix6, Vector2, Vector6};
+use nalgebra::{Matrix2, Matrix2x6, Matrix3, Matrix6, SMatrix, SVector, Vector2};
 
 use crate::geo::PoseError;
 use crate::monitor::stats::gaussian::mahalanobis2;
@@ -15,18 +15,31 @@ const HALF_WEIGHT: f64 = 2.0;
 const OUTSIDE: f64 = 5.0;
 /// Users that say together how the pose is off, at least: with fewer one of them would.
 const MIN_SHARING: usize = 3;
+/// Turn in the world, shift in the world, turn with the camera.
+pub const STATE: usize = 9;
+/// Share of the stated attitude error's variance that is fixed in the world, as a heading's by the earth's field; the rest is fixed in the
+/// platform, as a mount's or a tilt's by an accelerometer's. While the platform does not turn the two are the same. Not measured.
+const IN_THE_WORLD: f64 = 0.5;
 /// Variances below which no pose is taken to be known, rad² and m²: keeps the prior regular.
 const LEAST: [f64; 2] = [1e-12, 1e-8];
 
-/// The lasting error of the pose, about north, east, down (rad), then east, north, up (m).
+pub type State = SVector<f64, STATE>;
+type ToPose = SMatrix<f64, 6, STATE>;
+type StateMatrix = SMatrix<f64, STATE, STATE>;
+
+/// The lasting error of the pose, about north, east, down (rad), then east, north, up (m): a part of the turn stays in the world, a part
+/// turns with the camera.
 #[derive(Clone, Debug, Default)]
 pub struct PoseBias {
     /// Covariance that the newest fresh pose stated; the first one where none was fresh yet.
     prior: Option<Matrix6<f64>>,
-    information: Matrix6<f64>,
+    information: StateMatrix,
     /// The same with the squares of the weights: how much the weighted sums scatter.
-    scatter: Matrix6<f64>,
-    vector: Vector6<f64>,
+    scatter: StateMatrix,
+    vector: State,
+    state: State,
+    /// From the state to the newest pose's error.
+    to_pose: ToPose,
     error: PoseError,
     cov: Matrix6<f64>,
 }
@@ -44,8 +57,8 @@ pub struct SharedOffset {
     /// What the lasting error leaves, m.
     pub left: Vector2<f64>,
     /// The lasting error, and how it displaces users in the mean.
-    pub error: Vector6<f64>,
-    pub by_pose: Matrix2x6<f64>,
+    pub state: State,
+    pub by_state: SMatrix<f64, 2, STATE>,
     /// Of what is left, per axis, m².
     pub variance: f64,
 }
@@ -63,16 +76,23 @@ impl PoseBias {
         self.prior.is_some()
     }
 
-    /// Takes one frame's residuals, `dt` seconds after the last one's; each user claims every `period_s`. `prior` is the
-    /// covariance of the pose where that is fresh: what lasts does not grow with a pose's age.
-    pub fn update(&mut self, residuals: &[Residual], prior: Option<&Matrix6<f64>>, dt: f64, period_s: f64) {
+    /// Takes one frame's residuals, `dt` seconds after the last one's; each user claims every `period_s`. `axes` turns the camera's axes to
+    /// north, east, down. `prior` is the covariance of the pose where that is fresh: what lasts does not grow with a pose's age.
+    pub fn update(
+        &mut self,
+        residuals: &[Residual],
+        axes: &Matrix3<f64>,
+        prior: Option<&Matrix6<f64>>,
+        dt: f64,
+        period_s: f64,
+    ) {
         self.prior = prior.copied().or(self.prior);
         let Some(prior) = self.prior else {
             return;
         };
         let [turn, shift] = LEAST;
         let prior = prior + Matrix6::from_diagonal(&[turn, turn, turn, shift, shift, shift].into());
-        let Some(prior_information) = prior.cholesky().map(|c| c.inverse()) else {
+        let Some(prior) = Prior::new(&prior, axes) else {
             return;
         };
         let keep = (-dt / SMOOTHING_S).exp();
@@ -87,7 +107,7 @@ impl PoseBias {
                 prior: self.prior,
                 ..Self::default()
             };
-            self.solve(&prior_information, &prior);
+            self.solve(&prior);
         }
         for r in residuals {
             let d2 = self.distance2(r);
@@ -95,12 +115,13 @@ impl PoseBias {
                 continue;
             }
             let weight = 1.0 / (1.0 + d2 / (HALF_WEIGHT * HALF_WEIGHT));
-            let information = r.by_pose.transpose() * r.by_pose * (share / r.variance);
+            let by_state = r.by_pose * prior.to_pose;
+            let information = by_state.transpose() * by_state * (share / r.variance);
             self.information += information * weight;
             self.scatter += information * weight * weight;
-            self.vector += r.by_pose.transpose() * r.offset * (share / r.variance * weight);
+            self.vector += by_state.transpose() * r.offset * (share / r.variance * weight);
         }
-        self.solve(&prior_information, &prior);
+        self.solve(&prior);
     }
 
     /// What residuals share: of what the lasting error leaves of each the median, which liars fewer than a half do not choose. None with
@@ -109,8 +130,8 @@ impl PoseBias {
         let n = residuals.len();
         (n >= MIN_SHARING).then(|| SharedOffset {
             left: median_vector(residuals.iter().map(|r| r.offset - r.by_pose * self.error.vector())),
-            error: *self.error.vector(),
-            by_pose: residuals.iter().map(|r| r.by_pose).sum::<Matrix2x6<f64>>() / n as f64,
+            state: self.state,
+            by_state: residuals.iter().map(|r| r.by_pose).sum::<Matrix2x6<f64>>() * self.to_pose / n as f64,
             variance: variance_of_median(residuals.iter().map(|r| r.variance).sum::<f64>() / n as f64, n),
         })
     }
@@ -121,18 +142,51 @@ impl PoseBias {
         mahalanobis2(r.offset - r.by_pose * self.error.vector(), spread)
     }
 
-    fn solve(&mut self, prior_information: &Matrix6<f64>, prior: &Matrix6<f64>) {
+    fn solve(&mut self, prior: &Prior) {
         // The variance of a weighted mean (Huber, 1967): newer claims and nearer ones weigh more than others.
-        let weighted = (prior_information + self.information).cholesky().map(|c| c.inverse());
-        let inverse = weighted.unwrap_or(*prior);
-        self.cov = inverse * (prior_information + self.scatter) * inverse;
-        self.error = PoseError::of(inverse * self.vector);
+        let weighted = (prior.information + self.information).cholesky().map(|c| c.inverse());
+        let inverse = weighted.unwrap_or(prior.cov);
+        let cov = inverse * (prior.information + self.scatter) * inverse;
+        self.state = inverse * self.vector;
+        self.to_pose = prior.to_pose;
+        self.cov = self.to_pose * cov * self.to_pose.transpose();
+        self.error = PoseError::of(self.to_pose * self.state);
+    }
+}
+
+/// What the poses' source says of the state.
+struct Prior {
+    /// From the state to the pose's error.
+    to_pose: ToPose,
+    cov: StateMatrix,
+    information: StateMatrix,
+}
+
+impl Prior {
+    /// `None` where `pose` is no covariance.
+    fn new(pose: &Matrix6<f64>, axes: &Matrix3<f64>) -> Option<Self> {
+        let mut to_pose = ToPose::identity();
+        to_pose.fixed_view_mut::<3, 3>(0, 6).copy_from(axes);
+        // Of two independent errors, one fixed in the world and one in the camera, whose sum is the pose's.
+        let in_world = SMatrix::<f64, STATE, 6>::identity();
+        let mut in_camera = SMatrix::<f64, STATE, 6>::zeros();
+        in_camera.fixed_view_mut::<3, 3>(3, 3).copy_from(&Matrix3::identity());
+        in_camera.fixed_view_mut::<3, 3>(6, 0).copy_from(&axes.transpose());
+        let part = |to_state: &SMatrix<f64, STATE, 6>, share: f64| to_state * pose * to_state.transpose() * share;
+        let cov = part(&in_world, IN_THE_WORLD) + part(&in_camera, 1.0 - IN_THE_WORLD);
+        let information = cov.cholesky()?.inverse();
+        Some(Self {
+            to_pose,
+            cov,
+            information,
+        })
     }
 }
 
 #[cfg(test)]
 mod tests {
     use jiff::Timestamp;
+    use nalgebra::Vector6;
     use rand::SeedableRng;
     use rand_chacha::ChaCha8Rng;
     use rand_distr::{Distribution, StandardNormal};
@@ -170,7 +224,7 @@ mod tests {
         };
         let residuals: Vec<_> = USERS[..users].iter().enumerate().map(residual).collect();
         let mut bias = PoseBias::default();
-        (0..600).for_each(|_| bias.update(&residuals, Some(&prior.cov()), 0.1, 1.0));
+        (0..600).for_each(|_| bias.update(&residuals, &Matrix3::identity(), Some(&prior.cov()), 0.1, 1.0));
         bias
     }
 
@@ -189,7 +243,7 @@ mod tests {
         let mut old = found(6, 0, &error);
         let before = *old.cov();
         // Without claims only the prior is left.
-        (0..3000).for_each(|_| old.update(&[], None, 0.1, 1.0));
+        (0..3000).for_each(|_| old.update(&[], &Matrix3::identity(), None, 0.1, 1.0));
         let stated = PoseSigmas {
             attitude_rad: 0.02,
             position_m: 1.0,
@@ -229,7 +283,7 @@ mod tests {
                     variance: 0.09,
                     by_pose,
                 });
-                (0..10).for_each(|_| bias.update(&residuals, Some(&prior.cov()), 0.1, 1.0));
+                (0..10).for_each(|_| bias.update(&residuals, &Matrix3::identity(), Some(&prior.cov()), 0.1, 1.0));
             }
             for h in by_pose {
                 let off = h * (error - bias.error().vector());
@@ -246,6 +300,41 @@ mod tests {
         assert!(left(&bias, &error) < 0.1, "{}", left(&bias, &error));
         // The prior alone leaves what the error makes.
         assert!(left(&found(0, 0, &error), &error) > 2.0);
+    }
+
+    #[test]
+    fn a_mount_s_error_is_found_on_a_platform_that_turns() {
+        let pose = |t: f64| Pose {
+            attitude: nalgebra::UnitQuaternion::from_euler_angles(0.0, 0.0, 0.1 * t),
+            ..Pose::level(Timestamp::UNIX_EPOCH, [5.0, -8.0, 300.0])
+        };
+        let prior = PoseSigmas {
+            attitude_rad: 0.02,
+            position_m: 1.0,
+        };
+        let mount = nalgebra::Vector3::new(0.02, -0.015, 0.01);
+        let mut bias = PoseBias::default();
+        let mut largest: f64 = 0.0;
+        for k in 0..900 {
+            let sight = Sight::new(&pose(0.1 * f64::from(k)), &Mount::default());
+            let axes = sight.axes();
+            let turn = axes * mount;
+            let error = Vector6::new(turn.x, turn.y, turn.z, 0.4, -0.3, 0.2);
+            let residuals = USERS.map(|[x, y]| {
+                let by_pose = sight.apparent([x, y, 0.0]).expect("below").by_pose;
+                Residual {
+                    offset: by_pose * error,
+                    variance: 0.09,
+                    by_pose,
+                }
+            });
+            bias.update(&residuals, &axes, Some(&prior.cov()), 0.1, 1.0);
+            let left = |r: &Residual| (r.by_pose * (error - bias.error().vector())).norm();
+            if k > 300 {
+                largest = residuals.iter().map(left).fold(largest, f64::max);
+            }
+        }
+        assert!(largest < 0.2, "{largest}");
     }
 
     #[test]

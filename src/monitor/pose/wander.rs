@@ -3,9 +3,9 @@
 
 use std::collections::VecDeque;
 
-use nalgebra::{Matrix2x6, Matrix6, Vector2, Vector6};
+use nalgebra::{Matrix6, SMatrix, Vector2};
 
-use super::bias::SharedOffset;
+use super::bias::{STATE, SharedOffset, State};
 use crate::monitor::stats::claim_consistency::share_after_averaging;
 
 /// Time within which a change counts, s. Longer finds a slower drag, and takes a heading's or a receiver's own wander for one.
@@ -41,8 +41,8 @@ pub struct PoseWander {
 #[derive(Clone, Copy, Debug, Default)]
 struct Mean {
     left: Vector2<f64>,
-    error: Vector6<f64>,
-    by_pose: Matrix2x6<f64>,
+    state: State,
+    by_state: SMatrix<f64, 2, STATE>,
     /// Variance per axis that tracks' common course explains, m².
     by_course: f64,
 }
@@ -50,8 +50,8 @@ struct Mean {
 impl Mean {
     fn follow(&mut self, next: &Self, gain: f64) {
         self.left += (next.left - self.left) * gain;
-        self.error += (next.error - self.error) * gain;
-        self.by_pose += (next.by_pose - self.by_pose) * gain;
+        self.state += (next.state - self.state) * gain;
+        self.by_state += (next.by_state - self.by_state) * gain;
         self.by_course += (next.by_course - self.by_course) * gain;
     }
 }
@@ -62,8 +62,8 @@ impl PoseWander {
     pub fn update(&mut self, shared: Option<SharedOffset>, course: &Matrix6<f64>, dt: f64, period_s: f64) {
         let Some(SharedOffset {
             left,
-            error,
-            by_pose,
+            state,
+            by_state,
             variance,
         }) = shared
         else {
@@ -76,10 +76,12 @@ impl PoseWander {
         self.unknown_s = 0.0;
         self.known_s += dt;
         let gain = (dt / self.known_s.min(NEWEST_S)).min(1.0);
+        // The tracks' course is in the world, as the state's first part.
+        let by_pose = by_state.fixed_columns::<6>(0);
         let seen = Mean {
             left,
-            error,
-            by_pose,
+            state,
+            by_state,
             by_course: 0.5 * (by_pose * course * by_pose.transpose()).trace(),
         };
         self.newest.follow(&seen, gain);
@@ -111,8 +113,8 @@ impl PoseWander {
         if count == 0.0 || self.known_s < SETTLES_S {
             return Vector2::zeros();
         }
-        let (left, error) = (self.newest.left - was.left, self.newest.error - was.error);
-        let [here, there] = [self.newest.by_pose, was.by_pose].map(|by_pose| left + by_pose * error);
+        let (left, state) = (self.newest.left - was.left, self.newest.state - was.state);
+        let [here, there] = [self.newest.by_state, was.by_state].map(|by_state| left + by_state * state);
         if here.norm() < there.norm() { here } else { there }
     }
 
@@ -176,7 +178,7 @@ mod tests {
 
     #[test]
     fn what_comes_and_goes_is_a_wander_and_what_claims_scatter_by_is_none() {
-        let by_pose = Matrix2x6::from_fn(|row, column| f64::from(u8::from(column == 3 + row)));
+        let by_state = SMatrix::from_fn(|row, column| f64::from(u8::from(column == 3 + row)));
         let swing = |amplitude: f64, course: f64| {
             let mut wander = PoseWander::default();
             for k in 0..1800 {
@@ -184,7 +186,7 @@ mod tests {
                 let shared = SharedOffset {
                     left: Vector2::new(x, 0.0),
                     variance: 0.03,
-                    by_pose,
+                    by_state,
                     ..SharedOffset::default()
                 };
                 wander.update(Some(shared), &(Matrix6::identity() * course), 0.1, 1.0);
@@ -202,22 +204,23 @@ mod tests {
     #[test]
     fn users_who_go_elsewhere_change_nothing() {
         // A heading that is off by 3 degrees displaces a user at 100 m by 5 m, to another side on each side.
-        let error = Vector6::new(0.0, 0.0, 0.05, 0.0, 0.0, 0.0);
-        let seen_at = |x: f64, error: Vector6<f64>| SharedOffset {
-            error,
-            by_pose: Matrix2x6::from_fn(|row, column| if (row, column) == (1, 2) { -x } else { 0.0 }),
+        let mut state = State::zeros();
+        state[2] = 0.05;
+        let seen_at = |x: f64, state: State| SharedOffset {
+            state,
+            by_state: SMatrix::from_fn(|row, column| if (row, column) == (1, 2) { -x } else { 0.0 }),
             variance: 0.03,
             ..SharedOffset::default()
         };
         let mut wander = PoseWander::default();
         for k in 0..900 {
             let x = 100.0 * (0.03 * f64::from(k)).sin();
-            wander.see(Some(seen_at(x, error)));
+            wander.see(Some(seen_at(x, state)));
             assert!(wander.change().norm() < 1e-9);
         }
         // One that turns by as much within five seconds does.
-        (0..200).for_each(|_| wander.see(Some(seen_at(100.0, error))));
-        (0..50).for_each(|_| wander.see(Some(seen_at(100.0, 2.0 * error))));
+        (0..200).for_each(|_| wander.see(Some(seen_at(100.0, state))));
+        (0..50).for_each(|_| wander.see(Some(seen_at(100.0, 2.0 * state))));
         assert!(wander.change().norm() > 1.0, "{}", wander.change());
     }
 }
