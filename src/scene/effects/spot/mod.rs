@@ -14,7 +14,8 @@ use crate::optics::Camera;
 use crate::scene::render::Spot;
 use crate::toml_file::{Key, OutOfRange};
 use image_table::ImageTable;
-pub use pupil::Zernike;
+use pupil::Cuts;
+pub use pupil::{Rim, Zernike};
 
 /// The shape of every beam's spot. Lengths are on the sensor.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -27,7 +28,16 @@ pub enum SpotEffect {
     /// A disc of even light, its edge blurred by `blur_m`.
     Defocus { radius_m: f64, blur_m: f64 },
     /// A round aperture whose wavefront departs from a sphere by Zernike polynomials that change over the field.
-    Zernike { first_zero_m: f64, term: Vec<Zernike> },
+    Zernike {
+        first_zero_m: f64,
+        #[serde(default)]
+        term: Vec<Zernike>,
+        /// Radius of what covers the aperture's middle, in its own.
+        #[serde(default)]
+        obscuration: f64,
+        #[serde(default)]
+        rim: Option<Rim>,
+    },
     /// The Gaussian of σ_eff, and a reflection of a share of its light beside it.
     Ghost {
         share: f64,
@@ -106,9 +116,16 @@ impl SpotEffect {
                     (1.0 - share) * first + share * density::gaussian((x - dx).powi(2) + (y - dy).powi(2), *spread_m)
                 })
             }
-            Self::Zernike { first_zero_m, term } => {
-                let is_uniform = term.iter().all(|t| t.waves.len() == 1);
-                over_the_field(is_uniform, |at| pupil::table(camera, *first_zero_m, term, at))
+            Self::Zernike {
+                first_zero_m,
+                term,
+                obscuration,
+                rim,
+            } => {
+                let is_uniform = term.iter().all(|t| t.waves.len() == 1) && rim.is_none();
+                let (obscuration, rim) = (*obscuration, *rim);
+                let cuts = Cuts { obscuration, rim };
+                over_the_field(is_uniform, |at| pupil::table(camera, *first_zero_m, term, cuts, at))
             }
             Self::Template { file, pitch_m } => {
                 let samples = density::read_template(file, &field.at("file"))?;
@@ -188,8 +205,15 @@ impl Table for SpotEffect {
                 length("radius_m", *radius_m)?;
                 length("blur_m", *blur_m).map(drop)
             }
-            Self::Zernike { first_zero_m, term } => {
+            Self::Zernike {
+                first_zero_m,
+                term,
+                obscuration,
+                rim,
+            } => {
                 length("first_zero_m", *first_zero_m)?;
+                let (obscuration, rim) = (*obscuration, *rim);
+                Cuts { obscuration, rim }.validate(field)?;
                 term.iter()
                     .enumerate()
                     .try_for_each(|(k, t)| t.validate(&field.item("term", k)))

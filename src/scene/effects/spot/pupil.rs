@@ -18,6 +18,45 @@ pub struct Zernike {
     pub waves: Vec<f64>,
 }
 
+/// What cuts a round aperture, in its radii.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Cuts {
+    /// Radius of what covers its middle.
+    pub obscuration: f64,
+    pub rim: Option<Rim>,
+}
+
+/// The rim of another lens, through which no more light comes than through the aperture (vignetting): its centre moves over the aperture with
+/// the place in the field.
+#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Rim {
+    /// How far over half the sensor, in radii of the aperture.
+    pub moves: f64,
+    /// Its radius, in radii of the aperture.
+    pub radius: f64,
+}
+
+impl Cuts {
+    pub(super) fn validate(&self, key: &Key) -> Result<(), OutOfRange> {
+        let reason = "radii of the aperture, of which some must stay open";
+        key.at("obscuration").within(self.obscuration, 0.0..=0.9, reason)?;
+        if let Some(rim) = self.rim {
+            key.at("rim").at("moves").within(rim.moves, -0.7..=0.7, reason)?;
+            key.at("rim").at("radius").within(rim.radius, 0.7..=10.0, reason)?;
+        }
+        Ok(())
+    }
+
+    /// Share of the sample at a place of the aperture that is open; edges are soft by one sample, so that they are no staircases.
+    fn open(&self, [u, v]: [f64; 2], x: f64, y: f64) -> f64 {
+        let inside = |by: f64| (0.5 + by * 0.5 * SAMPLES as f64).clamp(0.0, 1.0);
+        let of_rim = |rim: Rim| inside(rim.radius - (x - rim.moves * u).hypot(y - rim.moves * v));
+        let rho = x.hypot(y);
+        inside(1.0 - rho) * (1.0 - inside(self.obscuration - rho)) * self.rim.map_or(1.0, of_rim)
+    }
+}
+
 /// Samples across the pupil: the image repeats after as many λF.
 const SAMPLES: usize = 64;
 /// Radii of the first dark ring out to which the image is computed.
@@ -91,7 +130,7 @@ fn radial(n: i32, m: i32, rho: f64) -> f64 {
 
 /// The image at a place of the field, (u, v) over half the sensor, by a matrix Fourier transform (Soummer et al., 2007). Its
 /// centroid is that of the wavefront's tilt: zero but for what the terms bring.
-pub(super) fn table(camera: &Camera, first_zero_m: f64, terms: &[Zernike], field: [f64; 2]) -> ImageTable {
+pub(super) fn table(camera: &Camera, first_zero_m: f64, terms: &[Zernike], cuts: Cuts, field: [f64; 2]) -> ImageTable {
     // First dark ring: v = π r/(λF).
     let scale = FIRST_ZERO / first_zero_m;
     let axes = [&camera.x, &camera.y];
@@ -109,11 +148,10 @@ pub(super) fn table(camera: &Camera, first_zero_m: f64, terms: &[Zernike], field
     let pupil: Vec<[f64; 2]> = (0..SAMPLES * SAMPLES)
         .map(|k| {
             let (x, y) = (place(k % SAMPLES), place(k / SAMPLES));
-            // The edge is soft by one sample, so that it is no staircase.
-            let inside = (0.5 + (1.0 - x.hypot(y)) * 0.5 * SAMPLES as f64).clamp(0.0, 1.0);
+            let open = cuts.open(field, x, y);
             let phase: f64 = terms.iter().zip(&waves).map(|(t, w)| w * t.value(x, y)).sum();
             let (sin, cos) = (std::f64::consts::TAU * phase).sin_cos();
-            [inside * cos, inside * sin]
+            [open * cos, open * sin]
         })
         .collect();
     let kernel = |half: usize, step: f64| -> Vec<[f64; 2]> {

@@ -83,11 +83,44 @@ fn an_aperture_without_aberrations_gives_an_airy_disc() {
     let zernike = SpotEffect::Zernike {
         first_zero_m: 1.5e-3,
         term: vec![],
+        obscuration: 0.0,
+        rim: None,
     };
     let centre = [0.000_1, 0.000_2];
     let error = worst(&image(&zernike, centre), &exact(centre, |r| density::airy(r / 1.5e-3)));
     // Beyond seven dark rings lies 1.5 % of the light.
     assert!(error < 0.02, "{error}");
+}
+
+#[test]
+fn a_covered_middle_and_a_rim_are_seen_in_the_spot() {
+    let lens = |obscuration: f64, rim: Option<Rim>| SpotEffect::Zernike {
+        first_zero_m: 1.5e-3,
+        term: vec![],
+        obscuration,
+        rim,
+    };
+    let centre = [0.000_1, 0.000_2];
+    // A ring is the difference of two discs (Born and Wolf, 1999, section 8.6.2).
+    let besinc = |v: f64| {
+        if v.abs() < 1e-9 { 1.0 } else { 2.0 * libm::j1(v) / v }
+    };
+    let ring = |r: f64| {
+        let v = density::FIRST_ZERO * r / 1.5e-3;
+        (besinc(v) - 0.16 * besinc(0.4 * v)).powi(2)
+    };
+    let error = worst(&image(&lens(0.4, None), centre), &exact(centre, ring));
+    // Of the light of a ring more lies beyond the table than of a disc's.
+    assert!(error < 0.04, "{error}");
+    // A rim half a radius off narrows the aperture along x, and widens the spot.
+    let rim = Rim {
+        moves: 0.5,
+        radius: 1.0,
+    };
+    let at_edge = [0.8 * 0.015, 0.000_2];
+    let peak = |effect: &SpotEffect| image(effect, at_edge).into_iter().fold(0.0, f64::max);
+    let ratio = peak(&lens(0.0, Some(rim))) / peak(&lens(0.0, None));
+    assert!((0.5..0.9).contains(&ratio), "{ratio}");
 }
 
 #[test]
@@ -98,6 +131,8 @@ fn coma_grows_away_from_the_middle() {
             noll: 8,
             waves: vec![0.0, 0.25],
         }],
+        obscuration: 0.0,
+        rim: None,
     };
     let skewness = |u: f64| {
         let centre = [u * 0.015 + 1e-5, 1e-5];
