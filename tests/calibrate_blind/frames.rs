@@ -159,7 +159,7 @@ fn saturated_spots_are_left_out_or_refused() {
     };
     assert_not_misled(&clipped(4.0, 200.0 * NOISE_J).1);
     let (dir, out) = clipped(1.0, 40.0 * NOISE_J);
-    assert_refused(dir.path(), &out, "hold saturated pixels and no other spots");
+    assert_refused(dir.path(), &out, "hold saturated pixels, and too little else");
 }
 
 /// Noise after the saturation hides the level: flat spots are then spots that are not alike.

@@ -32,11 +32,20 @@ pub fn shape(learner: &Learner, detected: &Coverage) -> Result<(), Error> {
 }
 
 /// Gains and shape are free together, so that a needle amid ripples may explain the held-out frames too. Spots of lenses have more than 70 %
-/// of their light within two widths.
-pub fn compact(shape: &SpotShape) -> Result<(), Error> {
+/// of their light within two widths. Where most frames are saturated, so many `of_frames`, what is left are the feet of spots.
+pub fn compact(shape: &SpotShape, of_frames: [usize; 2]) -> Result<(), Error> {
     let within = shape.encircled_energy([0.0; 2], 2.0 * shape.sigma_equivalent_m());
-    match within < COMPACT {
-        true => Err(Error::Scattered { share: 100.0 * within }),
+    if within >= COMPACT {
+        return Ok(());
+    }
+    saturated(of_frames)?;
+    Err(Error::Scattered { share: 100.0 * within })
+}
+
+/// Refuses frames most of which are saturated.
+fn saturated([saturated, frames]: [usize; 2]) -> Result<(), Error> {
+    match 2 * saturated > frames {
+        true => Err(Error::Saturated { frames, saturated }),
         false => Ok(()),
     }
 }
@@ -57,12 +66,7 @@ pub fn spots(learner: &Learner, prepared: &Prepared, frames: usize) -> Result<()
     if spots >= MIN_SPOTS {
         return Ok(());
     }
-    if 2 * prepared.saturated_frames > frames {
-        return Err(Error::Saturated {
-            frames,
-            saturated: prepared.saturated_frames,
-        });
-    }
+    saturated([prepared.saturated_frames, frames])?;
     Err(match spots {
         0 => Error::NoSpots {
             frames,
@@ -87,7 +91,11 @@ mod tests {
             let term = (FieldPolynomial::constant(1.0), profile(core, rest), profile(core, rest));
             SpotShape::from_terms(field, 1e-4, [term]).expect("light")
         };
-        assert!(compact(&shape(1.0, 0.0)).is_ok());
-        assert!(matches!(compact(&shape(1.0, 0.04)), Err(Error::Scattered { share }) if share < 40.0));
+        assert!(compact(&shape(1.0, 0.0), [10, 10]).is_ok());
+        assert!(matches!(compact(&shape(1.0, 0.04), [5, 10]), Err(Error::Scattered { share }) if share < 40.0));
+        assert!(matches!(
+            compact(&shape(1.0, 0.04), [6, 10]),
+            Err(Error::Saturated { saturated: 6, .. })
+        ));
     }
 }

@@ -11,7 +11,9 @@ pub enum Error {
         "no spots in {frames} frames: nothing is {SIGMAS} σ above the noise of {noise_j:.2e} J a pixel; are they dark frames?"
     )]
     NoSpots { frames: usize, noise_j: f64 },
-    #[error("{saturated} of {frames} frames hold saturated pixels and no other spots; reduce the exposure or the gain")]
+    #[error(
+        "{saturated} of {frames} frames hold saturated pixels, and too little else can be learned from; reduce the exposure or the gain"
+    )]
     Saturated { frames: usize, saturated: usize },
     #[error(
         "expected at least {MIN_SPOTS} spots {SIGMAS} σ above the noise, found {spots} in {frames} frames: too few or too faint"

@@ -254,7 +254,7 @@ pub fn learn(
     let separable = Separable::of(camera, &model, count).ok_or_else(dark)?;
     let shape = separable.shape(&model).ok_or_else(dark)?;
     if is_shape_better {
-        checks::compact(&shape)?;
+        checks::compact(&shape, [prepared.saturated_frames, frames.len()])?;
     }
     let peak_snr = statistics::peak_snr(&last);
     let spots = last.sources();

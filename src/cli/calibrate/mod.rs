@@ -7,13 +7,23 @@ mod surveyed;
 
 pub use args::Args;
 
-use anyhow::Context;
+use anyhow::{Context, anyhow};
 
 use super::{Failure, Outcome};
 use crate::calibrate::file;
 use crate::config::Config;
 
 pub fn run(args: Args) -> Outcome {
+    for path in std::iter::once(&args.out).chain(&args.picture) {
+        let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty());
+        if let Some(folder) = folder.filter(|folder| !folder.is_dir()) {
+            return Err(Failure::Input(anyhow!(
+                "{}: there is no folder {}",
+                path.display(),
+                folder.display()
+            )));
+        }
+    }
     let mut config = Config::load_uncalibrated(&args.config).map_err(Failure::config)?;
     if let Some(path) = config.optics.calibration.take() {
         match file::read(&path) {

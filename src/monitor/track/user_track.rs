@@ -24,12 +24,12 @@ pub struct UserTrack {
     /// ln likelihood ratio of "absent" to "missed by chance".
     pub absence: f64,
     /// The end of an absence, the longest of late.
-    returned: Option<Return>,
+    pub returned: Option<Return>,
 }
 
 /// The end of an absence.
 #[derive(Clone, Copy, Debug)]
-struct Return {
+pub struct Return {
     time: Timestamp,
     away_s: f64,
 }
