@@ -1,5 +1,7 @@
 //! Spots of lenses, known and unknown.
 
+use std::path::Path;
+
 use serde_json::Value;
 
 use super::{SIX, learned, oapwatch, scene_frames};
