@@ -190,6 +190,7 @@ mod tests {
             let exchanging = [known(60.0, 1), known(0.0, 2)].map(|mut claim| {
                 claim.before.first_seen = Some(Timestamp::UNIX_EPOCH);
                 claim.before.last_seen = Some(now);
+                claim.made = Timestamp::from_millisecond(4900).unwrap();
                 claim
             });
             let kept = [Some(1), Some(2)];
