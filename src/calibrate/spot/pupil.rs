@@ -158,14 +158,9 @@ impl Pupil {
             radius: 1.0 + self.parameters[FIELD * RIM_RADIUS],
         };
         let corners = [[-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0], [1.0, 1.0]];
-        let off = corners.map(|place| {
-            let local = self.local(place);
-            local[RIM_X].hypot(local[RIM_Y])
-        });
-        (off.into_iter()
-            .fold(rim.radius - 1.0, |least, off| least.min(rim.radius - off - 1.0))
-            < 0.0)
-            .then_some(rim)
+        let off = corners.map(|place| self.local(place));
+        let farthest = off.iter().map(|l| l[RIM_X].hypot(l[RIM_Y])).fold(0.0, f64::max);
+        (rim.radius - farthest < 1.0).then_some(rim)
     }
 
     pub fn wavefront(&self) -> Wavefront {
