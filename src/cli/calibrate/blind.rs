@@ -163,16 +163,16 @@ fn report(camera: &Camera, l: &Learned) -> Vec<String> {
     if let Some(w) = &l.wavefront {
         let mut aperture = "a round aperture".to_owned();
         if w.obscuration > LEAST_OBSCURATION {
-            aperture += &format!(", covered out to {:.2} of its radius,", w.obscuration);
+            aperture += &format!(", covered out to {:.2} of its radius", w.obscuration);
         }
         if let Some(rim) = w.rim {
             aperture += &format!(
-                ", cut off by a rim of {:.2} of its radius that moves over {:.2} of it across half the sensor (vignetting),",
+                ", cut off by a rim of {:.2} of its radius that moves over {:.2} of it across half the sensor (vignetting)",
                 rim.radius, rim.moves
             );
         }
         lines.push(format!(
-            "wavefront: {aperture} whose first dark ring is at {:.4} mm; over the sensor {:.3} waves rms of defocus, {:.3} of \
+            "wavefront: {aperture}; its first dark ring is at {:.4} mm; over the sensor {:.3} waves rms of defocus, {:.3} of \
              astigmatism, {:.3} of coma, {:.3} of trefoil, {:.3} of spherical aberration",
             1e3 * w.first_zero_m,
             w.defocus,
