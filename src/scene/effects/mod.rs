@@ -41,7 +41,7 @@ pub use pointing::Pointing;
 pub use quantisation::Quantisation;
 pub use saturation::Saturation;
 pub use shot_noise::ShotNoise;
-pub use spot::{SpotEffect, Zernike};
+pub use spot::{Pupil, Rim, SpotEffect, Zernike};
 pub use thermal_noise::ThermalNoise;
 pub use vibration::Vibration;
 pub use vignetting::Vignetting;

@@ -14,30 +14,27 @@ use crate::optics::Camera;
 use crate::scene::render::Spot;
 use crate::toml_file::{Key, OutOfRange};
 use image_table::ImageTable;
-use pupil::Cuts;
-pub use pupil::{Rim, Zernike};
+pub use pupil::{Pupil, Rim, Zernike};
 
 /// The shape of every beam's spot. Lengths are on the sensor.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "lowercase", deny_unknown_fields)]
 pub enum SpotEffect {
     /// The diffraction pattern of a round aperture, (2J₁(v)/v)² (Airy, 1835), its first dark ring at `first_zero_m`.
-    Airy { first_zero_m: f64 },
-    /// (1 + r²/core²)^−index (Moffat, 1969).
-    Moffat { core_m: f64, index: f64 },
-    /// A disc of even light, its edge blurred by `blur_m`.
-    Defocus { radius_m: f64, blur_m: f64 },
-    /// A round aperture whose wavefront departs from a sphere by Zernike polynomials that change over the field.
-    Zernike {
+    Airy {
         first_zero_m: f64,
-        #[serde(default)]
-        term: Vec<Zernike>,
-        /// Radius of what covers the aperture's middle, in its own.
-        #[serde(default)]
-        obscuration: f64,
-        #[serde(default)]
-        rim: Option<Rim>,
     },
+    /// (1 + r²/core²)^−index (Moffat, 1969).
+    Moffat {
+        core_m: f64,
+        index: f64,
+    },
+    /// A disc of even light, its edge blurred by `blur_m`.
+    Defocus {
+        radius_m: f64,
+        blur_m: f64,
+    },
+    Zernike(Pupil),
     /// The Gaussian of σ_eff, and a reflection of a share of its light beside it.
     Ghost {
         share: f64,
@@ -45,7 +42,10 @@ pub enum SpotEffect {
         spread_m: f64,
     },
     /// Measured: a text file of rows of numbers, `pitch_m` apart, bottom row first, its centroid in the middle.
-    Template { file: PathBuf, pitch_m: f64 },
+    Template {
+        file: PathBuf,
+        pitch_m: f64,
+    },
     /// What `oapwatch calibrate` learned, over the field, all lengths times `width`.
     Calibration {
         file: PathBuf,
@@ -74,7 +74,7 @@ impl SpotEffect {
             Self::Airy { .. } => "airy",
             Self::Moffat { .. } => "moffat",
             Self::Defocus { .. } => "defocus",
-            Self::Zernike { .. } => "zernike",
+            Self::Zernike(_) => "zernike",
             Self::Ghost { .. } => "ghost",
             Self::Template { .. } => "template",
             Self::Calibration { .. } => "calibration",
@@ -116,17 +116,7 @@ impl SpotEffect {
                     (1.0 - share) * first + share * density::gaussian((x - dx).powi(2) + (y - dy).powi(2), *spread_m)
                 })
             }
-            Self::Zernike {
-                first_zero_m,
-                term,
-                obscuration,
-                rim,
-            } => {
-                let is_uniform = term.iter().all(|t| t.waves.len() == 1) && rim.is_none();
-                let (obscuration, rim) = (*obscuration, *rim);
-                let cuts = Cuts { obscuration, rim };
-                over_the_field(is_uniform, |at| pupil::table(camera, *first_zero_m, term, cuts, at))
-            }
+            Self::Zernike(pupil) => over_the_field(pupil.is_uniform(), |at| pupil.table(camera, at)),
             Self::Template { file, pitch_m } => {
                 let samples = density::read_template(file, &field.at("file"))?;
                 let radius = 0.5 * samples.dim().0.max(samples.dim().1) as f64 * pitch_m;
@@ -205,19 +195,7 @@ impl Table for SpotEffect {
                 length("radius_m", *radius_m)?;
                 length("blur_m", *blur_m).map(drop)
             }
-            Self::Zernike {
-                first_zero_m,
-                term,
-                obscuration,
-                rim,
-            } => {
-                length("first_zero_m", *first_zero_m)?;
-                let (obscuration, rim) = (*obscuration, *rim);
-                Cuts { obscuration, rim }.validate(field)?;
-                term.iter()
-                    .enumerate()
-                    .try_for_each(|(k, t)| t.validate(&field.item("term", k)))
-            }
+            Self::Zernike(pupil) => pupil.validate(field),
             Self::Ghost {
                 share,
                 offset_m,

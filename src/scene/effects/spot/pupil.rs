@@ -18,11 +18,17 @@ pub struct Zernike {
     pub waves: Vec<f64>,
 }
 
-/// What cuts a round aperture, in its radii.
-#[derive(Clone, Copy, Debug, Default)]
-pub(super) struct Cuts {
-    /// Radius of what covers its middle.
+/// A round aperture whose wavefront departs from a sphere by Zernike polynomials that change over the field.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Pupil {
+    pub first_zero_m: f64,
+    #[serde(default)]
+    pub term: Vec<Zernike>,
+    /// Radius of what covers the aperture's middle, in its own.
+    #[serde(default)]
     pub obscuration: f64,
+    #[serde(default)]
     pub rim: Option<Rim>,
 }
 
@@ -37,15 +43,83 @@ pub struct Rim {
     pub radius: f64,
 }
 
-impl Cuts {
+impl Pupil {
     pub(super) fn validate(&self, key: &Key) -> Result<(), OutOfRange> {
+        key.at("first_zero_m").positive(self.first_zero_m)?;
         let reason = "radii of the aperture, of which some must stay open";
         key.at("obscuration").within(self.obscuration, 0.0..=0.9, reason)?;
         if let Some(rim) = self.rim {
             key.at("rim").at("moves").within(rim.moves, -0.7..=0.7, reason)?;
             key.at("rim").at("radius").within(rim.radius, 0.7..=10.0, reason)?;
         }
-        Ok(())
+        let mut terms = self.term.iter().enumerate();
+        terms.try_for_each(|(k, term)| term.validate(&key.item("term", k)))
+    }
+
+    /// Whether the image is the same all over the field.
+    pub(super) fn is_uniform(&self) -> bool {
+        self.term.iter().all(|t| t.waves.len() == 1) && self.rim.is_none()
+    }
+
+    /// The image at a place of the field, (u, v) over half the sensor, by a matrix Fourier transform (Soummer et al., 2007). Its
+    /// centroid is that of the wavefront's tilt: zero but for what the terms bring.
+    pub(super) fn table(&self, camera: &Camera, field: [f64; 2]) -> ImageTable {
+        let (first_zero_m, terms) = (self.first_zero_m, &self.term);
+        // First dark ring: v = π r/(λF).
+        let scale = FIRST_ZERO / first_zero_m;
+        let axes = [&camera.x, &camera.y];
+        let per_pixel = axes.map(|a| {
+            ((10.0 * a.pitch_m / first_zero_m).ceil() as usize)
+                .clamp(8, 48)
+                .next_multiple_of(2)
+        });
+        let step: [f64; 2] = std::array::from_fn(|k| axes[k].pitch_m / per_pixel[k] as f64);
+        let half = |k: usize| ((REACH * first_zero_m).min(2.0 * axes[k].half_width()) / step[k]).ceil() as usize + 1;
+        let (hx, hy) = (half(0), half(1));
+
+        let place = |k: usize| (2 * k + 1) as f64 / SAMPLES as f64 - 1.0;
+        let waves: Vec<f64> = terms.iter().map(|t| t.waves_at(field)).collect();
+        let pupil: Vec<[f64; 2]> = (0..SAMPLES * SAMPLES)
+            .map(|k| {
+                let (x, y) = (place(k % SAMPLES), place(k / SAMPLES));
+                let open = self.open(field, x, y);
+                let phase: f64 = terms.iter().zip(&waves).map(|(t, w)| w * t.value(x, y)).sum();
+                let (sin, cos) = (std::f64::consts::TAU * phase).sin_cos();
+                [open * cos, open * sin]
+            })
+            .collect();
+        let kernel = |half: usize, step: f64| -> Vec<[f64; 2]> {
+            let at = |i: usize| (i as f64 - half as f64) * step * scale;
+            let pairs = (0..=2 * half).flat_map(|i| (0..SAMPLES).map(move |k| (i, k)));
+            pairs
+                .map(|(i, k)| {
+                    let (sin, cos) = (at(i) * place(k)).sin_cos();
+                    [cos, -sin]
+                })
+                .collect()
+        };
+        let (kx, ky) = (kernel(hx, step[0]), kernel(hy, step[1]));
+        let (nx, ny) = (2 * hx + 1, 2 * hy + 1);
+        let dot = |a: &[[f64; 2]], b: &[[f64; 2]]| {
+            a.iter().zip(b).fold([0.0; 2], |[re, im], ([a, b], [c, d])| {
+                [re + a * c - b * d, im + a * d + b * c]
+            })
+        };
+        // Along x for each row of the pupil, then along y.
+        let along: Vec<[f64; 2]> = kx
+            .chunks_exact(SAMPLES)
+            .flat_map(|k| pupil.chunks_exact(SAMPLES).map(|row| dot(row, k)))
+            .collect();
+        let mut image = Array2::from_shape_fn((ny, nx), |(j, i)| {
+            let [re, im] = dot(
+                &along[i * SAMPLES..(i + 1) * SAMPLES],
+                &ky[j * SAMPLES..(j + 1) * SAMPLES],
+            );
+            re * re + im * im
+        });
+        let total = image.sum();
+        image.mapv_inplace(|v| v / total);
+        ImageTable::of_samples(image, per_pixel)
     }
 
     /// Share of the sample at a place of the aperture that is open; edges are soft by one sample, so that they are no staircases.
@@ -126,66 +200,6 @@ fn radial(n: i32, m: i32, rho: f64) -> f64 {
                 * rho.powi(n - 2 * s)
         })
         .sum()
-}
-
-/// The image at a place of the field, (u, v) over half the sensor, by a matrix Fourier transform (Soummer et al., 2007). Its
-/// centroid is that of the wavefront's tilt: zero but for what the terms bring.
-pub(super) fn table(camera: &Camera, first_zero_m: f64, terms: &[Zernike], cuts: Cuts, field: [f64; 2]) -> ImageTable {
-    // First dark ring: v = π r/(λF).
-    let scale = FIRST_ZERO / first_zero_m;
-    let axes = [&camera.x, &camera.y];
-    let per_pixel = axes.map(|a| {
-        ((10.0 * a.pitch_m / first_zero_m).ceil() as usize)
-            .clamp(8, 48)
-            .next_multiple_of(2)
-    });
-    let step: [f64; 2] = std::array::from_fn(|k| axes[k].pitch_m / per_pixel[k] as f64);
-    let half = |k: usize| ((REACH * first_zero_m).min(2.0 * axes[k].half_width()) / step[k]).ceil() as usize + 1;
-    let (hx, hy) = (half(0), half(1));
-
-    let place = |k: usize| (2 * k + 1) as f64 / SAMPLES as f64 - 1.0;
-    let waves: Vec<f64> = terms.iter().map(|t| t.waves_at(field)).collect();
-    let pupil: Vec<[f64; 2]> = (0..SAMPLES * SAMPLES)
-        .map(|k| {
-            let (x, y) = (place(k % SAMPLES), place(k / SAMPLES));
-            let open = cuts.open(field, x, y);
-            let phase: f64 = terms.iter().zip(&waves).map(|(t, w)| w * t.value(x, y)).sum();
-            let (sin, cos) = (std::f64::consts::TAU * phase).sin_cos();
-            [open * cos, open * sin]
-        })
-        .collect();
-    let kernel = |half: usize, step: f64| -> Vec<[f64; 2]> {
-        let at = |i: usize| (i as f64 - half as f64) * step * scale;
-        let pairs = (0..=2 * half).flat_map(|i| (0..SAMPLES).map(move |k| (i, k)));
-        pairs
-            .map(|(i, k)| {
-                let (sin, cos) = (at(i) * place(k)).sin_cos();
-                [cos, -sin]
-            })
-            .collect()
-    };
-    let (kx, ky) = (kernel(hx, step[0]), kernel(hy, step[1]));
-    let (nx, ny) = (2 * hx + 1, 2 * hy + 1);
-    let dot = |a: &[[f64; 2]], b: &[[f64; 2]]| {
-        a.iter().zip(b).fold([0.0; 2], |[re, im], ([a, b], [c, d])| {
-            [re + a * c - b * d, im + a * d + b * c]
-        })
-    };
-    // Along x for each row of the pupil, then along y.
-    let along: Vec<[f64; 2]> = kx
-        .chunks_exact(SAMPLES)
-        .flat_map(|k| pupil.chunks_exact(SAMPLES).map(|row| dot(row, k)))
-        .collect();
-    let mut image = Array2::from_shape_fn((ny, nx), |(j, i)| {
-        let [re, im] = dot(
-            &along[i * SAMPLES..(i + 1) * SAMPLES],
-            &ky[j * SAMPLES..(j + 1) * SAMPLES],
-        );
-        re * re + im * im
-    });
-    let total = image.sum();
-    image.mapv_inplace(|v| v / total);
-    ImageTable::of_samples(image, per_pixel)
 }
 
 #[cfg(test)]

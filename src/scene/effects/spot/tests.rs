@@ -80,12 +80,12 @@ fn images_are_those_of_their_formulas() {
 
 #[test]
 fn an_aperture_without_aberrations_gives_an_airy_disc() {
-    let zernike = SpotEffect::Zernike {
+    let zernike = SpotEffect::Zernike(Pupil {
         first_zero_m: 1.5e-3,
         term: vec![],
         obscuration: 0.0,
         rim: None,
-    };
+    });
     let centre = [0.000_1, 0.000_2];
     let error = worst(&image(&zernike, centre), &exact(centre, |r| density::airy(r / 1.5e-3)));
     // Beyond seven dark rings lies 1.5 % of the light.
@@ -94,11 +94,13 @@ fn an_aperture_without_aberrations_gives_an_airy_disc() {
 
 #[test]
 fn a_covered_middle_and_a_rim_are_seen_in_the_spot() {
-    let lens = |obscuration: f64, rim: Option<Rim>| SpotEffect::Zernike {
-        first_zero_m: 1.5e-3,
-        term: vec![],
-        obscuration,
-        rim,
+    let lens = |obscuration: f64, rim: Option<Rim>| {
+        SpotEffect::Zernike(Pupil {
+            first_zero_m: 1.5e-3,
+            term: vec![],
+            obscuration,
+            rim,
+        })
     };
     let centre = [0.000_1, 0.000_2];
     // A ring is the difference of two discs (Born and Wolf, 1999, section 8.6.2).
@@ -125,7 +127,7 @@ fn a_covered_middle_and_a_rim_are_seen_in_the_spot() {
 
 #[test]
 fn coma_grows_away_from_the_middle() {
-    let zernike = SpotEffect::Zernike {
+    let zernike = SpotEffect::Zernike(Pupil {
         first_zero_m: 1.5e-3,
         term: vec![Zernike {
             noll: 8,
@@ -133,7 +135,7 @@ fn coma_grows_away_from_the_middle() {
         }],
         obscuration: 0.0,
         rim: None,
-    };
+    });
     let skewness = |u: f64| {
         let centre = [u * 0.015 + 1e-5, 1e-5];
         let pixels = image(&zernike, centre);
