@@ -33,3 +33,20 @@ impl Frame {
         })
     }
 }
+
+#[cfg(test)]
+pub mod fixture {
+    use super::*;
+
+    /// A dark frame of one pixel.
+    pub fn frame(index: u64) -> Frame {
+        Frame {
+            index,
+            time: Timestamp::UNIX_EPOCH,
+            pixels: Array2::zeros((1, 1)),
+            masked: None,
+            exposure_s: None,
+            energy_scale: 1.0,
+        }
+    }
+}

@@ -41,22 +41,12 @@ impl Waiting {
 
 #[cfg(test)]
 mod tests {
-    use ndarray::Array2;
-
     use super::*;
-    use crate::frame::Frame;
+    use crate::frame::fixture;
     use crate::frames::Arrivals;
 
     fn frame(index: u64, waits: Duration) -> Captured {
-        let frame = Frame {
-            index,
-            time: Timestamp::UNIX_EPOCH,
-            pixels: Array2::zeros((1, 1)),
-            masked: None,
-            exposure_s: None,
-            energy_scale: 1.0,
-        };
-        let mut captured = Captured::new(Next::Frame(frame, Arrivals::default()), None);
+        let mut captured = Captured::new(Next::Frame(fixture::frame(index), Arrivals::default()), None);
         captured.at -= waits;
         captured
     }

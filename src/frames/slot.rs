@@ -138,11 +138,10 @@ mod tests {
     use std::thread;
 
     use jiff::Timestamp;
-    use ndarray::Array2;
 
     use super::*;
     use crate::claim::{Claim, ClaimState};
-    use crate::frame::Frame;
+    use crate::frame::{Frame, fixture};
     use crate::frames::Arrivals;
 
     const LONG: Duration = Duration::from_secs(20);
@@ -159,15 +158,7 @@ mod tests {
             power_w: None,
             state: ClaimState::Active,
         };
-        let frame = Frame {
-            index,
-            time: Timestamp::UNIX_EPOCH,
-            pixels: Array2::zeros((1, 1)),
-            masked: None,
-            exposure_s: None,
-            energy_scale: 1.0,
-        };
-        Captured::new(Next::Frame(frame, vec![claim].into()), None)
+        Captured::new(Next::Frame(fixture::frame(index), vec![claim].into()), None)
     }
 
     fn unusable(index: u64) -> Captured {

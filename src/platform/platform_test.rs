@@ -1,3 +1,5 @@
+//! A moving platform's poses at the times of frames, and the delay that is learned.
+
 use nalgebra::UnitQuaternion;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
