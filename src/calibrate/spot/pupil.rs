@@ -2,6 +2,8 @@
 //! round, or cut: its middle covered, as by a secondary mirror, and its edge by a second round one, the rim of another lens, which moves
 //! over the pupil with the place in the field (vignetting; Born and Wolf, 1999, section 4.8).
 
+use std::sync::LazyLock;
+
 use faer::{Mat, c64};
 use ndarray::Array2;
 
@@ -181,61 +183,102 @@ impl Pupil {
     }
 }
 
-/// Samples of the unit pupil.
-pub struct Aperture {
-    /// Share of each sample that lies inside.
-    open: Mat<f64>,
-    polynomials: [Mat<f64>; ZERNIKES],
+/// Samples of the unit pupil that lie inside, at least in part.
+pub struct Aperture(Vec<Sample>);
+
+struct Sample {
+    row: usize,
+    column: usize,
+    /// Share that lies inside.
+    open: f64,
+    polynomials: [f64; ZERNIKES],
 }
 
 fn sample(k: usize) -> f64 {
     (2.0 * k as f64 + 1.0) / SAMPLES as f64 - 1.0
 }
 
-impl Aperture {
-    pub fn new() -> Self {
+impl Sample {
+    /// None where nothing of it lies inside.
+    fn of(row: usize, column: usize) -> Option<Self> {
         let part = |k: usize, a: usize| sample(k) + ((2.0 * a as f64 + 1.0) / EDGE_PARTS as f64 - 1.0) / SAMPLES as f64;
-        // The mean of a function over the open part of each sample, by that share of it.
-        let over_open = |value: &dyn Fn(f64, f64) -> f64| {
-            Mat::from_fn(SAMPLES, SAMPLES, |j, i| {
-                let parts = (0..EDGE_PARTS * EDGE_PARTS).map(|p| (part(i, p % EDGE_PARTS), part(j, p / EDGE_PARTS)));
-                let open = parts.filter(|(x, y)| x * x + y * y < 1.0);
-                open.map(|(x, y)| value(x, y)).sum::<f64>() / (EDGE_PARTS * EDGE_PARTS) as f64
-            })
-        };
-        let open = over_open(&|_, _| 1.0);
-        let polynomial = |k: usize| {
-            let sums = over_open(&|x, y| zernike(k, x, y));
-            Mat::from_fn(SAMPLES, SAMPLES, |j, i| {
-                if open[(j, i)] > 0.0 {
-                    sums[(j, i)] / open[(j, i)]
-                } else {
-                    0.0
-                }
-            })
-        };
-        Self {
-            polynomials: std::array::from_fn(polynomial),
-            open,
-        }
+        let parts = (0..EDGE_PARTS * EDGE_PARTS).map(|p| (part(column, p % EDGE_PARTS), part(row, p / EDGE_PARTS)));
+        let inside: Vec<(f64, f64)> = parts.filter(|(x, y)| x * x + y * y < 1.0).collect();
+        let mean = |k: usize| inside.iter().map(|(x, y)| zernike(k, *x, *y)).sum::<f64>() / inside.len() as f64;
+        (!inside.is_empty()).then(|| Self {
+            row,
+            column,
+            open: inside.len() as f64 / (EDGE_PARTS * EDGE_PARTS) as f64,
+            polynomials: std::array::from_fn(mean),
+        })
+    }
+
+    /// The wave that leaves it.
+    fn wave(&self, local: &[f64; Pupil::CHANGES]) -> c64 {
+        let waves = local[1..=ZERNIKES].iter().zip(&self.polynomials);
+        let phase: f64 = waves.map(|(w, z)| w * z).sum();
+        let (sin, cos) = (std::f64::consts::TAU * phase).sin_cos();
+        c64::new(cos, sin) * self.open * uncut(local, sample(self.column), sample(self.row))
+    }
+}
+
+impl Aperture {
+    /// The only one there is.
+    pub fn unit() -> &'static Self {
+        static UNIT: LazyLock<Aperture> = LazyLock::new(|| {
+            let samples = (0..SAMPLES * SAMPLES).filter_map(|k| Sample::of(k / SAMPLES, k % SAMPLES));
+            Aperture(samples.collect())
+        });
+        &UNIT
     }
 
     /// Spline coefficients of unit light of the spot on `n` × `n` knots, `knot_m` apart, by a Fourier transform that is sampled at them
     /// (Soummer et al., 2007).
     pub fn coefficients(&self, local: &[f64; Pupil::CHANGES], n: usize, knot_m: f64) -> Vec<f64> {
-        let per_knot = AIRY_ZERO * knot_m / local[0].exp();
-        let waves = &local[1..=ZERNIKES];
-        let wave = |j: usize, i: usize| {
-            let phase: f64 = waves.iter().zip(&self.polynomials).map(|(w, z)| w * z[(j, i)]).sum();
-            let (sin, cos) = (std::f64::consts::TAU * phase).sin_cos();
-            c64::new(cos, sin) * self.open[(j, i)] * uncut(local, sample(i), sample(j))
+        let waves = self.0.iter().map(|sample| sample.wave(local));
+        self.image(waves, &kernel(local, n, knot_m))
+    }
+
+    /// Derivatives of [`Self::coefficients`] at a place of the field by each of the pupil's changes; zero by those that it may not have.
+    pub fn derivatives(&self, pupil: &Pupil, place: [f64; 2], n: usize, knot_m: f64) -> Vec<Vec<f64>> {
+        const STEP: f64 = 1e-5;
+        let local = pupil.local(place);
+        let (waves, kernel): (Vec<c64>, _) = (
+            self.0.iter().map(|sample| sample.wave(&local)).collect(),
+            kernel(&local, n, knot_m),
+        );
+        let here = self.image(waves.iter().copied(), &kernel);
+        let stepped = |k: usize| match k {
+            // A wave that is a little later is turned.
+            1..=ZERNIKES => {
+                let turn = |sample: &Sample| c64::new(1.0, std::f64::consts::TAU * STEP * sample.polynomials[k - 1]);
+                self.image(waves.iter().zip(&self.0).map(|(w, sample)| w * turn(sample)), &kernel)
+            }
+            _ => {
+                let mut there = local;
+                there[k] += STEP;
+                self.coefficients(&there, n, knot_m)
+            }
         };
-        let pupil = Mat::from_fn(SAMPLES, SAMPLES, wave);
-        let kernel = Mat::from_fn(n, SAMPLES, |k, q| {
-            let (sin, cos) = (per_knot * (k as f64 - 0.5 * (n - 1) as f64) * sample(q)).sin_cos();
-            c64::new(cos, -sin)
-        });
-        let field = &kernel * &pupil * kernel.transpose();
+        let derivative = |k: usize| {
+            if !pupil.may_change(k) {
+                return vec![0.0; here.len()];
+            }
+            let mut change = stepped(k);
+            change.iter_mut().zip(&here).for_each(|(t, h)| *t = (*t - h) / STEP);
+            change
+        };
+        (0..Pupil::CHANGES).map(derivative).collect()
+    }
+
+    /// Spline coefficients of unit light of the spot that the samples' waves make.
+    fn image(&self, waves: impl Iterator<Item = c64>, kernel: &Mat<c64>) -> Vec<f64> {
+        let mut pupil = Mat::zeros(SAMPLES, SAMPLES);
+        for (sample, wave) in self.0.iter().zip(waves) {
+            pupil[(sample.row, sample.column)] = wave;
+        }
+        let field = kernel * &pupil * kernel.transpose();
+        let n = kernel.nrows();
         let density = Array2::from_shape_fn((n, n), |(j, i)| field[(j, i)].norm_sqr());
         let mut coefficients = Template::interpolated(density).into_raw_vec_and_offset().0;
         let total: f64 = coefficients.iter().sum();
@@ -244,12 +287,28 @@ impl Aperture {
     }
 }
 
+/// The Fourier transform of the samples along one axis at `n` knots about the middle.
+fn kernel(local: &[f64; Pupil::CHANGES], n: usize, knot_m: f64) -> Mat<c64> {
+    let per_knot = AIRY_ZERO * knot_m / local[0].exp();
+    let mut kernel = Mat::zeros(n, SAMPLES);
+    for q in 0..SAMPLES {
+        let turn = c64::cis(-per_knot * sample(q));
+        let mut wave = c64::cis(0.5 * (n - 1) as f64 * per_knot * sample(q));
+        for value in kernel.col_as_slice_mut(q) {
+            *value = wave;
+            wave *= turn;
+        }
+    }
+    kernel
+}
+
 /// Share of the sample at (x, y) that the cuts leave.
 fn uncut(local: &[f64; Pupil::CHANGES], x: f64, y: f64) -> f64 {
     // An edge within a sample is taken for a straight one across the direction to its centre.
     let inside = |distance: f64| (0.5 + 0.5 * SAMPLES as f64 * distance).clamp(0.0, 1.0);
-    let of_rim = inside(1.0 + local[RIM_RADIUS] - (x - local[RIM_X]).hypot(y - local[RIM_Y]));
-    of_rim * inside(x.hypot(y) - local[OBSCURATION].abs())
+    let distance = |x: f64, y: f64| (x * x + y * y).sqrt();
+    let of_rim = inside(1.0 + local[RIM_RADIUS] - distance(x - local[RIM_X], y - local[RIM_Y]));
+    of_rim * inside(distance(x, y) - local[OBSCURATION].abs())
 }
 
 /// Noll's polynomial 4 + `k`, of unit variance over the pupil.
@@ -274,10 +333,10 @@ mod tests {
 
     #[test]
     fn cuts_take_their_share_of_the_aperture() {
-        let aperture = Aperture::new();
+        let aperture = Aperture::unit();
         let open = |local: &[f64; Pupil::CHANGES]| {
-            let of = |j: usize, i: usize| aperture.open[(j, i)] * uncut(local, sample(i), sample(j));
-            Mat::from_fn(SAMPLES, SAMPLES, of).sum() / aperture.open.sum()
+            let all: f64 = aperture.0.iter().map(|s| s.open).sum();
+            aperture.0.iter().map(|s| s.wave(local).norm()).sum::<f64>() / all
         };
         let mut local = [0.0; Pupil::CHANGES];
         local[RIM_RADIUS] = NO_RIM;
@@ -293,14 +352,12 @@ mod tests {
 
     #[test]
     fn polynomials_are_orthonormal_over_the_aperture() {
-        let aperture = Aperture::new();
-        let area: f64 = aperture.open.sum();
+        let aperture = Aperture::unit();
+        let area: f64 = aperture.0.iter().map(|s| s.open).sum();
         for k in 0..ZERNIKES {
             for l in 0..=k {
-                let product = |j: usize, i: usize| {
-                    aperture.open[(j, i)] * aperture.polynomials[k][(j, i)] * aperture.polynomials[l][(j, i)]
-                };
-                let mean = Mat::from_fn(SAMPLES, SAMPLES, product).sum() / area;
+                let product = |s: &Sample| s.open * s.polynomials[k] * s.polynomials[l];
+                let mean = aperture.0.iter().map(product).sum::<f64>() / area;
                 let expected = f64::from(u8::from(k == l));
                 assert!((mean - expected).abs() < 0.01, "{k} {l}: {mean}");
             }
@@ -322,7 +379,7 @@ mod tests {
         let n = expected.nrows();
         let mut local = [0.0; Pupil::CHANGES];
         (local[0], local[RIM_RADIUS]) = (zero_m.ln(), NO_RIM);
-        let found = Aperture::new().coefficients(&local, n, knot_m);
+        let found = Aperture::unit().coefficients(&local, n, knot_m);
         let (total, peak) = (expected.sum(), expected[(n / 2, n / 2)]);
         for (f, e) in found.iter().zip(expected) {
             assert!((f - e / total).abs() < 1e-3 * peak / total, "{f} {}", e / total);

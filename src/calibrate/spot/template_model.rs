@@ -107,7 +107,7 @@ impl TemplateModel {
 
     /// The template of a pupil on these knots.
     pub fn with_pupil(&self, pupil: Pupil) -> Self {
-        let aperture = Aperture::new();
+        let aperture = Aperture::unit();
         let at = |place: [f64; 2]| vec![aperture.coefficients(&pupil.local(place), self.n, self.knot_m)];
         Self {
             pupil: Some(pupil),
@@ -118,23 +118,7 @@ impl TemplateModel {
     /// Derivatives of a pupil's coefficients on these knots by each of its changes, as if it were the same change everywhere; zero by those
     /// that it may not have.
     pub fn pupil_changes(&self, pupil: &Pupil) -> Vec<Vec<f64>> {
-        const STEP: f64 = 1e-5;
-        let aperture = Aperture::new();
-        let at = |place: [f64; 2]| {
-            let local = pupil.local(place);
-            let here = aperture.coefficients(&local, self.n, self.knot_m);
-            let derivative = |k: usize| {
-                if !pupil.may_change(k) {
-                    return vec![0.0; here.len()];
-                }
-                let mut there = local;
-                there[k] += STEP;
-                let mut change = aperture.coefficients(&there, self.n, self.knot_m);
-                change.iter_mut().zip(&here).for_each(|(t, h)| *t = (*t - h) / STEP);
-                change
-            };
-            (0..Pupil::CHANGES).map(derivative).collect()
-        };
+        let at = |place: [f64; 2]| Aperture::unit().derivatives(pupil, place, self.n, self.knot_m);
         self.over_field(at, pupil.varies)
             .into_iter()
             .map(|model| model.coefficients)
@@ -232,12 +216,18 @@ impl TemplateModel {
         out.clear();
         out.extend_from_slice(&coefficients[..n * n]);
         let margin = (n - self.inner) / 2;
-        for (c, p) in field_values.iter().enumerate().skip(1) {
-            let (start, m) = self.block(c);
-            for (j, line) in coefficients[start..start + m * m].chunks_exact(m).enumerate() {
-                let to = (j + margin) * n + margin;
-                for (o, v) in out[to..to + m].iter_mut().zip(line) {
-                    *o += p * v;
+        // Row by row: all components at once do not stay in a cache.
+        for (j, row) in out.chunks_exact_mut(n).skip(margin).take(self.inner).enumerate() {
+            let row = &mut row[margin..margin + self.inner];
+            let mut lines = field_values.iter().enumerate().skip(1).map(|(c, p)| {
+                let (start, m) = self.block(c);
+                (p, &coefficients[start + j * m..start + (j + 1) * m])
+            });
+            while let Some((p, line)) = lines.next() {
+                // Two at a time: the row is read and written half as often.
+                let (q, next) = lines.next().unwrap_or((&0.0, line));
+                for ((o, v), w) in row.iter_mut().zip(line).zip(next) {
+                    *o += p * v + q * w;
                 }
             }
         }
@@ -373,7 +363,7 @@ mod tests {
         let (model, changes) = (like.with_pupil(pupil), like.pupil_changes(&pupil));
         let at = [0.8 * 0.015, -0.3 * 0.015];
         let (values, mut local) = (model.field_values(at), Vec::new());
-        let exact = |pupil: &Pupil| Aperture::new().coefficients(&pupil.local([0.8, -0.3]), like.n, like.knot_m);
+        let exact = |pupil: &Pupil| Aperture::unit().coefficients(&pupil.local([0.8, -0.3]), like.n, like.knot_m);
         let largest = |v: &[f64]| v.iter().fold(0.0, |a: f64, v| a.max(v.abs()));
         let difference = |a: &[f64], b: &[f64]| largest(&a.iter().zip(b).map(|(a, b)| a - b).collect::<Vec<_>>());
         model.local(&model.coefficients, &values, &mut local);
