@@ -15,7 +15,8 @@ pub const ZERNIKES: usize = 8;
 /// Coefficients of 1, u, v, u², uv, v², u and v over half the sensor.
 pub const FIELD: usize = 6;
 /// How a cut aperture's image changes beside: by the radius of what covers its middle, the rim's centre along x and y, and the rim's
-/// radius less 1, all in radii of the aperture.
+/// radius less 1, all in radii of the aperture. A smaller rim would be the aperture itself: the sign of its parameter tells nothing, nor
+/// does that of the cover's.
 const CUTS: usize = 4;
 const OBSCURATION: usize = 1 + ZERNIKES;
 const RIM_X: usize = OBSCURATION + 1;
@@ -157,7 +158,7 @@ impl Pupil {
     fn rim(&self) -> Option<Rim> {
         let rim = Rim {
             moves: 0.5 * (self.parameters[FIELD * RIM_X + 1] + self.parameters[FIELD * RIM_Y + 2]),
-            radius: 1.0 + self.parameters[FIELD * RIM_RADIUS],
+            radius: 1.0 + self.parameters[FIELD * RIM_RADIUS].abs(),
         };
         let corners = [[-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0], [1.0, 1.0]];
         let off = corners.map(|place| self.local(place));
@@ -307,7 +308,7 @@ fn uncut(local: &[f64; Pupil::CHANGES], x: f64, y: f64) -> f64 {
     // An edge within a sample is taken for a straight one across the direction to its centre.
     let inside = |distance: f64| (0.5 + 0.5 * SAMPLES as f64 * distance).clamp(0.0, 1.0);
     let distance = |x: f64, y: f64| (x * x + y * y).sqrt();
-    let of_rim = inside(1.0 + local[RIM_RADIUS] - distance(x - local[RIM_X], y - local[RIM_Y]));
+    let of_rim = inside(1.0 + local[RIM_RADIUS].abs() - distance(x - local[RIM_X], y - local[RIM_Y]));
     of_rim * inside(distance(x, y) - local[OBSCURATION].abs())
 }
 
