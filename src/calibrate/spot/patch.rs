@@ -232,15 +232,15 @@ impl Patch {
             let cost = self.cost(camera, model);
             if cost < self.chi2 {
                 let gained = self.chi2 - cost;
+                self.chi2 = cost;
                 damping = (damping * 0.1).max(1e-10);
+                if gained < 1e-3 + 1e-9 * cost {
+                    break;
+                }
                 let Some(next) = self.linearise(camera, model) else {
                     break;
                 };
                 now = next;
-                self.chi2 = cost;
-                if gained < 1e-3 + 1e-9 * cost {
-                    break;
-                }
             } else {
                 (self.sources, self.background) = before;
                 damping *= 10.0;
