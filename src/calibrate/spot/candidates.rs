@@ -58,13 +58,15 @@ pub fn best<'a>(first: Learner<'a>, held: &[&Image], is_field_covered: bool, run
     let on_held = |learner: &Learner| {
         let held = Learner::with_model(learner.camera, held, learner.noise_j, &learner.model, learner.misfit);
         let score = held.chi2_of_images() + (2 * PER_SPOT * held.sources()) as f64;
-        (score, statistics::unexplained(&held, 0.0))
+        let unexplained = |noise: f64| statistics::unexplained(&held, noise, 0.0);
+        // A worse shape's misfit is in the noise so far, and hides this one's.
+        (score, unexplained(1.0), unexplained(statistics::residual_scale(&held)))
     };
-    let (mut least, _) = on_held(&first);
+    let (mut least, ..) = on_held(&first);
     let mut learned = |lens: Lens| {
         let wavefront = wavefront(first.camera, first.images, first.noise_j, lens, run);
-        let (score, unexplained) = on_held(&wavefront);
-        (wavefront, score, unexplained)
+        let (score, unexplained, at_own_noise) = on_held(&wavefront);
+        (wavefront, score, unexplained, at_own_noise)
     };
     let mut of_lens = learned(Lens::Varying);
     // Where no spot stood a change over the field is extrapolated, which the held-out frames do not see.
@@ -73,13 +75,13 @@ pub fn best<'a>(first: Learner<'a>, held: &[&Image], is_field_covered: bool, run
         if same.1 - of_lens.1 < BETTER {
             of_lens = same;
         }
-    } else if of_lens.2 > WHOLE && of_lens.1 < NEARLY * least {
+    } else if of_lens.3 > WHOLE && of_lens.1 < NEARLY * least {
         let cut = learned(Lens::Cut);
         if of_lens.1 - cut.1 > BETTER {
             of_lens = cut;
         }
     }
-    let (wavefront, score, unexplained) = of_lens;
+    let (wavefront, score, unexplained, _) = of_lens;
     if score < least && unexplained < EXPLAINED {
         return wavefront;
     }
@@ -89,7 +91,7 @@ pub fn best<'a>(first: Learner<'a>, held: &[&Image], is_field_covered: bool, run
         let mut varied = Learner::with_model(best.camera, best.images, best.noise_j, &best.model, best.misfit);
         varied.model.vary(*degree, FIELD_RADIUS * best.camera.spot_sigma_m);
         run(&mut varied, FIELD_ROUNDS, "its change over the field");
-        let (score, _) = on_held(&varied);
+        let (score, ..) = on_held(&varied);
         if least - score < BETTER {
             break;
         }

@@ -18,7 +18,7 @@ const COMPACT: f64 = 0.4;
 pub fn shape(learner: &Learner, detected: &Coverage) -> Result<(), Error> {
     let (covered, needed) = (Coverage::of(learner).phases, Coverage::needed(learner.camera));
     // Places that were spread over the pixel and are not any more follow a template that is none.
-    let unexplained = statistics::unexplained(learner, 0.0);
+    let unexplained = statistics::unexplained(learner, 1.0, 0.0);
     let is_locked = covered < needed && detected.phases >= needed && unexplained > UNEXPLAINED;
     if learner.misfit > UNLIKE || is_locked {
         return Err(Error::NotAlike {

@@ -233,7 +233,7 @@ pub fn learn(
     };
     let (before_fit, after_fit) = (fit(&before), fit(&after));
     let shot = statistics::variance(&after).quantum_j;
-    let unexplained = statistics::unexplained(&after, shot.unwrap_or(0.0));
+    let unexplained = statistics::unexplained(&after, 1.0, shot.unwrap_or(0.0));
     if unexplained > checks::UNEXPLAINED || odd_held > after.sources() {
         return Err(Error::NotAlike {
             share: 100.0 * unexplained,

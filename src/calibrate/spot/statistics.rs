@@ -263,15 +263,17 @@ pub fn peak_snr(learner: &Learner) -> [f64; 2] {
     [median(energies).unwrap_or(0.0), largest].map(|e| e * (peak * pixel).min(1.0) / learner.noise_j)
 }
 
-/// Share of the spots' light, root mean square over their pixels, that the template leaves unexplained beyond the noise, whose variance grows
-/// by `quantum_j` per joule.
-pub fn unexplained(learner: &Learner, quantum_j: f64) -> f64 {
+/// Share of the spots' light, root mean square over their pixels, that the template leaves unexplained beyond the noise, `noise` times the
+/// learner's, whose variance grows by `quantum_j` per joule.
+pub fn unexplained(learner: &Learner, noise: f64, quantum_j: f64) -> f64 {
+    let noise2 = noise * noise;
     let (mut excess, mut own) = (0.0, 0.0);
     for patch in &learner.patches {
         let expected = patch.expected(learner.camera, &learner.model);
         for ((e, d), w) in expected.iter().zip(&patch.data).zip(&patch.weight) {
             let light = e - patch.background;
-            excess += ((d - e) * w).powi(2) - f64::from(u8::from(*w > 0.0)) - quantum_j * light.max(0.0) * w * w;
+            let read2 = if *w > 0.0 { noise2 } else { 0.0 };
+            excess += ((d - e) * w).powi(2) - read2 - quantum_j * light.max(0.0) * w * w;
             own += (light * w).powi(2);
         }
     }
