@@ -6,6 +6,7 @@ use super::learn::Learner;
 use super::parts;
 use super::pupil::Pupil;
 use super::statistics;
+use super::template_model::TemplateModel;
 use crate::optics::Camera;
 
 /// Learns for a number of rounds and says which stage that is.
@@ -52,7 +53,7 @@ pub fn first<'a>(
 
 /// What explains the held-out images best.
 pub fn best<'a>(first: Learner<'a>, held: &[&Image], is_field_covered: bool, run: Run) -> Learner<'a> {
-    if first.model.pupil.is_some() {
+    if first.model.pupil.is_some() || is_as_said(&first) {
         return first;
     }
     let on_held = |learner: &Learner| {
@@ -98,6 +99,13 @@ pub fn best<'a>(first: Learner<'a>, held: &[&Image], is_field_covered: bool, run
         (least, best) = (score, varied);
     }
     if score < least { wavefront } else { best }
+}
+
+/// Whether nothing shows around the spots that the camera's own shape would not leave.
+fn is_as_said(learner: &Learner) -> bool {
+    let own = learner.refitted(TemplateModel::of_camera(learner.camera, &learner.model));
+    let left = statistics::variance(&own);
+    left.spot_error == 0.0 && left.quantum_j.is_none()
 }
 
 /// What a lens's wavefront may be.
