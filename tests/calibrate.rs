@@ -62,6 +62,76 @@ fn a_bent_lens_a_wrong_width_and_uneven_pixels_are_calibrated_away() {
     assert!(found > 0.99, "{found}");
 }
 
+/// With a Gaussian the halo is taken for uneven pixels, 3 % of scatter, and positions are twice as far off.
+#[test]
+fn a_spot_that_is_no_gaussian_is_learned_with_the_geometry() {
+    let dir = tempfile::tempdir().unwrap();
+    let at = |name: &str| dir.path().join(name);
+    std::fs::write(at("scene.toml"), HALO).unwrap();
+    let made = oapwatch(&[
+        &"simulate",
+        &"--scene",
+        &at("scene.toml"),
+        &"--frames",
+        &"60",
+        &"--seed",
+        &"1",
+        &"--out",
+        &dir.path(),
+    ]);
+    assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
+    let out = oapwatch(&[
+        &"calibrate",
+        &"--json",
+        &"--config",
+        &at("oapwatch.toml"),
+        &"--truth",
+        &at("truth.ndjson"),
+        &"--out",
+        &at("calibration.toml"),
+        &at("frames.npy"),
+    ]);
+    let text = String::from_utf8_lossy(&out.stdout);
+    assert!(out.status.success(), "{text}{}", String::from_utf8_lossy(&out.stderr));
+    let found: serde_json::Value = serde_json::from_str(&text).unwrap();
+    assert_eq!(found["spot"]["is_better"], true, "{text}");
+    let value = |pointer: &str| found.pointer(pointer).and_then(|v| v.as_f64()).unwrap();
+    // Both axes of 48 positions: the medians scatter by 20 %.
+    assert!(
+        value("/after/median_m2") < 1.5 * value("/after/noise_median_m2"),
+        "{text}"
+    );
+    assert_eq!(value("/after/missed"), 0.0, "{text}");
+    assert!((value("/noise_std_j") / 1e-6 - 1.0).abs() < 0.02, "{text}");
+    let written = std::fs::read_to_string(at("calibration.toml")).unwrap();
+    let scatter = written
+        .split("gain scatter ")
+        .nth(1)
+        .and_then(|rest| rest.split(' ').next());
+    assert!(scatter.unwrap().parse::<f64>().unwrap() < 0.3, "{written}");
+}
+
+/// Moffat spots through a lens with 2 % of distortion; the config says that they are Gaussian.
+const HALO: &str = r#"[optics]
+pixels = [32, 32]
+sensor_size_m = [0.0192, 0.0192]
+spot_sigma_m = 7.5e-4
+[link]
+integration_time_s = 0.1
+[random_emitters]
+count = [4, 4]
+area_m = [140.0, 140.0]
+[effects]
+thermal_noise = {}
+[effects.distortion]
+radial = [-0.15, 0.0, 0.0]
+principal_point_m = [1e-4, -5e-5]
+[effects.spot]
+kind = "moffat"
+index = 2.5
+core_m = 1.5e-3
+"#;
+
 #[test]
 fn even_light_on_all_frames_is_not_taken_for_the_device() {
     let dir = tempfile::tempdir().unwrap();

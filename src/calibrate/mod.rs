@@ -14,6 +14,8 @@ pub mod spot;
 mod survey_residuals;
 pub mod truth;
 
+use std::fmt::{self, Display, Formatter};
+
 use ndarray::Array2;
 
 use crate::estimate::{self, Estimator, is_usable};
@@ -44,6 +46,8 @@ pub struct Calibrated {
     /// Fitted to all frames.
     pub fitted: Fitted,
     pub frames: usize,
+    /// What the same frames teach of the spot beside the Gaussian or the shape that was fitted with.
+    pub spot: Result<spot::Learned, spot::Error>,
     /// Score of the camera before calibration on the held-out frames.
     pub before: Score,
     /// Score of the camera fitted to the other frames on the held-out frames.
@@ -76,12 +80,22 @@ pub enum Error {
 }
 
 /// Progress of a fit.
-#[derive(Clone, Copy, Debug)]
-pub struct Progress {
-    pub stage: &'static str,
-    pub round: usize,
-    pub reduced_chi2: f64,
-    pub survey_std_m: f64,
+struct Progress {
+    stage: &'static str,
+    round: usize,
+    reduced_chi2: f64,
+    survey_std_m: f64,
+}
+
+impl Display for Progress {
+    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
+        let Self { stage, round, .. } = self;
+        let (chi2, std) = (self.reduced_chi2, self.survey_std_m);
+        write!(
+            f,
+            "{stage}: round {round}, reduced χ² {chi2:.3}, positions within {std:.3} m"
+        )
+    }
 }
 
 /// Fewest frames: cross-validation needs one of each five.
@@ -89,13 +103,14 @@ const MIN_FRAMES: usize = 5;
 /// One frame in this many is held out.
 const HELD_OUT: usize = 5;
 
-/// Fits to four frames in five, scores the fifth with the estimators that `build` makes, and refits to all.
+/// Fits to four frames in five, scores the fifth with the estimators that `build` makes, and refits to all. Where the fitted spot leaves
+/// a shape to be learned, the fits are made with that.
 pub fn calibrate(
     camera: &Camera,
     frames: &[(usize, &Array2<f64>)],
     beacons: &[Beacon],
     build: &mut dyn FnMut(&Camera) -> Result<Box<dyn Estimator>, estimate::ConfigError>,
-    progress: &mut dyn FnMut(Progress),
+    progress: &mut dyn FnMut(&dyn Display),
 ) -> Result<Calibrated, Error> {
     if frames.len() < MIN_FRAMES {
         return Err(Error::TooLittle { frames: frames.len() });
@@ -106,27 +121,42 @@ pub fn calibrate(
         chosen.map(|(_, frame)| *frame).collect()
     };
     let (held, fitted_to) = (part(true), part(false));
-    let mut report = |stage, round, reduced_chi2, survey_std_m| {
-        progress(Progress {
-            stage,
-            round,
-            reduced_chi2,
-            survey_std_m,
-        });
+    const FIRST: &str = "fitting to four frames in five";
+    let fit = |start: &Camera, frames: &[(usize, &Array2<f64>)], stage, progress: &mut dyn FnMut(&dyn Display)| {
+        fit(start, frames, beacons, &mut |round, reduced_chi2, survey_std_m| {
+            progress(&Progress {
+                stage,
+                round,
+                reduced_chi2,
+                survey_std_m,
+            });
+        })
     };
-    let first = fit(camera, &fitted_to, beacons, &mut |round, chi2, std| {
-        report("fitting to four frames in five", round, chi2, std)
-    });
-    let trial = first.calibration.applied_to(camera)?;
+    let fitted = fit(camera, &fitted_to, FIRST, progress);
+    let mut trial = fitted.calibration.applied_to(camera)?;
+    // What a wrong shape did to noise and pixels is not kept; estimators do not use the growth, and do a shape that changes.
+    let with_its_spot = Calibration {
+        spot_growth: 0.0,
+        noise_std_j: camera.noise_std_j,
+        pixels: camera.pixels.clone(),
+        ..Calibration::of(&trial)
+    };
+    let spot = spot::learn(&with_its_spot.applied_to(camera)?, &fitted_to, &mut |p| progress(&p));
+    if let Ok(learned) = &spot
+        && learned.is_shape_better
+    {
+        let with_shape = learned.calibration.applied_to(&trial)?;
+        let fitted = fit(&with_shape, &fitted_to, FIRST, progress);
+        trial = fitted.calibration.applied_to(&with_shape)?;
+    }
     let before = cross_validation::score(&mut *build(camera)?, &held, beacons);
     let after = cross_validation::score(&mut *build(&trial)?, &held, beacons);
-    let fitted = fit(&trial, frames, beacons, &mut |round, chi2, std| {
-        report("fitting to all frames", round, chi2, std)
-    });
+    let fitted = fit(&trial, frames, "fitting to all frames", progress);
     fitted.calibration.applied_to(camera)?;
     Ok(Calibrated {
         fitted,
         frames: frames.len(),
+        spot,
         before,
         after,
     })

@@ -3,7 +3,7 @@
 use super::coverage::CELLS;
 
 /// Why nothing was learned.
-#[derive(Debug, thiserror::Error)]
+#[derive(Clone, Debug, thiserror::Error)]
 pub enum Error {
     #[error("expected at least {MIN_FRAMES} frames, found {frames}")]
     TooFewFrames { frames: usize },

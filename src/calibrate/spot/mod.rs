@@ -24,6 +24,7 @@ mod template_model;
 mod terms;
 mod wavefront;
 
+use std::fmt::{self, Display, Formatter};
 use std::sync::Arc;
 
 use ndarray::Array2;
@@ -116,6 +117,16 @@ pub struct Progress {
     pub round: usize,
     pub reduced_chi2: f64,
     pub spots: usize,
+}
+
+impl Display for Progress {
+    fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
+        let Self {
+            stage, round, spots, ..
+        } = self;
+        let chi2 = self.reduced_chi2;
+        write!(f, "{stage}: round {round}, {spots} spots, reduced χ² {chi2:.3}")
+    }
 }
 
 /// Learns from frames of shape (Ny, Nx), J, each with its number in the recording; starts from the camera's Gaussian.

@@ -15,33 +15,15 @@ use crate::frames::{npy, record};
 use crate::optics::Camera;
 
 pub fn run(args: &Args, camera: &Camera) -> Outcome {
-    if let Some(path) = args
-        .picture
-        .as_ref()
-        .filter(|p| p.extension().is_none_or(|e| e != "svg"))
-    {
-        let found = path.display();
-        return Err(Failure::Other(anyhow!(
-            "--picture: expected a file name that ends in .svg, found {found}"
-        )));
-    }
     let frames = read(args, camera)?;
     let list: Vec<(usize, &Array2<f64>)> = frames.iter().enumerate().collect();
     let mut steps = Steps::unbounded();
-    let learned = spot::learn(camera, &list, &mut |p| {
-        steps.next(&format!(
-            "{}: round {}, {} spots, reduced χ² {:.3}",
-            p.stage, p.round, p.spots, p.reduced_chi2
-        ));
-    });
+    let learned = spot::learn(camera, &list, &mut |p| steps.next(&p.to_string()));
     steps.finish();
     let learned =
         learned.map_err(|e: Error| Failure::Input(anyhow::Error::new(e).context(args.frames.display().to_string())))?;
     if let Some(path) = &args.picture {
-        let svg = picture::draw(camera, &learned).map_err(Failure::Other)?;
-        std::fs::write(path, svg)
-            .with_context(|| path.display().to_string())
-            .map_err(Failure::Other)?;
+        picture::write(path, camera, &learned)?;
     }
     let mut out = std::io::stdout().lock();
     let lines = report(camera, &learned);
@@ -129,9 +111,6 @@ const LEAST_OBSCURATION: f64 = 0.05;
 const AS_EXPECTED: std::ops::Range<f64> = 0.8..1.5;
 
 fn report(camera: &Camera, l: &Learned) -> Vec<String> {
-    let shape = &l.shape;
-    let sigma = shape.sigma_equivalent_m();
-    let pitch = camera.x.pitch_m;
     let mut lines = vec![format!(
         "{} frames, {} spots with a median peak of {:.0} σ and a largest of {:.0} σ, on {} of {} pixel phases and {} of 9 parts of the \
          sensor; {} held-out spots left out as odd",
@@ -144,13 +123,23 @@ fn report(camera: &Camera, l: &Learned) -> Vec<String> {
         l.coverage.field,
         l.odd
     )];
+    lines.extend(shape(camera, l));
+    lines.extend(pixels(camera, l));
+    lines
+}
+
+/// What was learned of the spot's shape.
+pub fn shape(camera: &Camera, l: &Learned) -> Vec<String> {
+    let shape = &l.shape;
+    let sigma = shape.sigma_equivalent_m();
+    let pitch = camera.x.pitch_m;
     let field = match l.field_degree {
         0 if l.coverage.is_field_covered() => "the same all over the sensor".to_owned(),
         0 => "its change over the sensor is not known: the spots stand on too few parts of it".to_owned(),
         degree if l.coverage.is_field_covered() => format!("changing over the sensor (degree {degree})"),
         degree => format!("changing over the sensor (degree {degree}), by a guess where no spots stand"),
     };
-    lines.push(format!(
+    let mut lines = vec![format!(
         "spot: as wide as a Gaussian of {:.4} mm ({:.3} pixels; the config: {:.4} mm), {:.1} % of its light within 2 σ (a Gaussian: 86.5 %), {field}; {} separable terms. \
          Shares are of the light within {:.2} mm: what lies further out cannot be told from the background",
         1e3 * sigma,
@@ -159,7 +148,7 @@ fn report(camera: &Camera, l: &Learned) -> Vec<String> {
         100.0 * shape.encircled_energy([0.0; 2], 2.0 * sigma),
         shape.terms(),
         1e3 * shape.radius_m()
-    ));
+    )];
     if let Some(w) = &l.wavefront {
         let mut aperture = "a round aperture".to_owned();
         if w.obscuration > LEAST_OBSCURATION {
@@ -183,12 +172,12 @@ fn report(camera: &Camera, l: &Learned) -> Vec<String> {
         ));
     }
     lines.push(format!(
-        "held-out frames: reduced χ² {:.4} with the config's spot, {:.4} with the learned one{}",
+        "held-out frames: reduced χ² {:.4} with the spot so far, {:.4} with the learned one{}",
         l.before.reduced(),
         l.after.reduced(),
         match l.is_shape_better {
             true => "",
-            false => ": the config's is as good and stays",
+            false => ": the spot so far is as good and stays",
         }
     ));
     if !AS_EXPECTED.contains(&l.after.reduced()) {
@@ -210,16 +199,21 @@ fn report(camera: &Camera, l: &Learned) -> Vec<String> {
     lines.push(format!(
         "spot error {error:.2e}: the share of a spot's light that the shape leaves unexplained{beyond}"
     ));
+    lines
+}
+
+/// What was learned of the noise and of single pixels.
+fn pixels(camera: &Camera, l: &Learned) -> Vec<String> {
     let gain = l.quantum_j.map_or_else(String::new, |g| {
         let counts = camera
             .joules_per_count
             .map_or_else(String::new, |c| format!(" ({:.4} counts)", g / c));
         format!("; the variance grows by {g:.3e} J per joule{counts}")
     });
-    lines.push(format!(
+    let mut lines = vec![format!(
         "noise {:.4e} J a pixel (the config: {:.4e} J){gain}",
         l.noise_std_j, camera.noise_std_j
-    ));
+    )];
     let gains = l.gain_scatter.map_or_else(
         || "no difference between gains shows".to_owned(),
         |scatter| format!("gain scatter {:.3} % rms", 100.0 * scatter),
@@ -247,7 +241,6 @@ fn report(camera: &Camera, l: &Learned) -> Vec<String> {
 
 fn object(args: &Args, camera: &Camera, l: &Learned) -> serde_json::Value {
     let written = l.is_better(camera).then(|| args.out.display().to_string());
-    let radii: Vec<f64> = (1..=20).map(|k| 0.5 * f64::from(k) * camera.spot_sigma_m).collect();
     serde_json::json!({
         "written": written,
         "frames": l.frames,
@@ -255,16 +248,7 @@ fn object(args: &Args, camera: &Camera, l: &Learned) -> serde_json::Value {
         "odd_spots": l.odd,
         "peak_snr": { "median": l.peak_snr[0], "largest": l.peak_snr[1] },
         "coverage": l.coverage,
-        "spot": {
-            "is_better": l.is_shape_better,
-            "terms": l.shape.terms(),
-            "field_degree": l.field_degree,
-            "wavefront": l.wavefront,
-            "sigma_equivalent_m": l.shape.sigma_equivalent_m(),
-            "reach_m": l.shape.radius_m(),
-            "beyond": l.shape.beyond(),
-            "encircled_energy": radii.iter().map(|r| [*r, l.shape.encircled_energy([0.0; 2], *r)]).collect::<Vec<_>>(),
-        },
+        "spot": shape_object(camera, l),
         "spot_error": l.calibration.spot_error,
         "noise_std_j": l.noise_std_j,
         "gain_j": l.quantum_j,
@@ -275,5 +259,20 @@ fn object(args: &Args, camera: &Camera, l: &Learned) -> serde_json::Value {
         "cut_off_frames": l.cut_off_frames,
         "before": { "chi2": l.before.chi2, "degrees_of_freedom": l.before.degrees_of_freedom },
         "after": { "chi2": l.after.chi2, "degrees_of_freedom": l.after.degrees_of_freedom },
+    })
+}
+
+/// The learned shape as JSON.
+pub fn shape_object(camera: &Camera, l: &Learned) -> serde_json::Value {
+    let radii: Vec<f64> = (1..=20).map(|k| 0.5 * f64::from(k) * camera.spot_sigma_m).collect();
+    serde_json::json!({
+        "is_better": l.is_shape_better,
+        "terms": l.shape.terms(),
+        "field_degree": l.field_degree,
+        "wavefront": l.wavefront,
+        "sigma_equivalent_m": l.shape.sigma_equivalent_m(),
+        "reach_m": l.shape.radius_m(),
+        "beyond": l.shape.beyond(),
+        "encircled_energy": radii.iter().map(|r| [*r, l.shape.encircled_energy([0.0; 2], *r)]).collect::<Vec<_>>(),
     })
 }

@@ -7,6 +7,8 @@ mod surveyed;
 
 pub use args::Args;
 
+use std::path::PathBuf;
+
 use anyhow::{Context, anyhow};
 
 use super::{Failure, Outcome};
@@ -14,6 +16,13 @@ use crate::calibrate::file;
 use crate::config::Config;
 
 pub fn run(args: Args) -> Outcome {
+    let is_svg = |path: &PathBuf| path.extension().is_some_and(|e| e == "svg");
+    if let Some(path) = args.picture.as_ref().filter(|path| !is_svg(path)) {
+        return Err(Failure::Other(anyhow!(
+            "--picture: expected a file name that ends in .svg, found {}",
+            path.display()
+        )));
+    }
     for path in std::iter::once(&args.out).chain(&args.picture) {
         let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty());
         if let Some(folder) = folder.filter(|folder| !folder.is_dir()) {

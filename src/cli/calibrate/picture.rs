@@ -1,9 +1,13 @@
 //! The picture of a learned spot: its template, its change over the field, the residuals, the encircled energy.
 
+use std::path::Path;
+
+use anyhow::Context;
 use plotters::coord::Shift;
 use plotters::prelude::*;
 
 use crate::calibrate::spot::Learned;
+use crate::cli::{Failure, Outcome};
 use crate::optics::{Camera, SpotShape};
 
 type Area<'a> = DrawingArea<SVGBackend<'a>, Shift>;
@@ -18,8 +22,16 @@ const FONT: (&str, u32) = ("sans-serif", 15);
 /// For a caption that is wider than its chart in [`FONT`].
 const SMALL: (&str, u32) = ("sans-serif", 11);
 
+/// Writes the SVG file.
+pub fn write(path: &Path, camera: &Camera, learned: &Learned) -> Outcome {
+    let svg = draw(camera, learned).map_err(Failure::Other)?;
+    std::fs::write(path, svg)
+        .with_context(|| path.display().to_string())
+        .map_err(Failure::Other)
+}
+
 /// An SVG text.
-pub fn draw(camera: &Camera, learned: &Learned) -> anyhow::Result<String> {
+fn draw(camera: &Camera, learned: &Learned) -> anyhow::Result<String> {
     let mut svg = String::new();
     {
         let root = SVGBackend::with_string(&mut svg, (960, 660)).into_drawing_area();

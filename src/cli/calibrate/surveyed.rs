@@ -1,5 +1,6 @@
 //! `oapwatch calibrate --truth`: fits the calibration of a device to frames with known positions.
 
+use std::fmt::Display;
 use std::io::Write;
 use std::path::Path;
 
@@ -7,6 +8,7 @@ use anyhow::{Context, anyhow};
 use ndarray::Array2;
 
 use super::args::Args;
+use super::{blind, picture};
 use crate::calibrate::{self, Calibrated, file, truth};
 use crate::cli::progress::Steps;
 use crate::cli::{Failure, Outcome};
@@ -25,12 +27,7 @@ pub fn run(args: &Args, truth_file: &Path, config: &Config, camera: &Camera) -> 
     let list: Vec<(usize, &Array2<f64>)> = frames.iter().map(|(k, pixels)| (*k, pixels)).collect();
 
     let mut steps = Steps::unbounded();
-    let mut progress = |p: calibrate::Progress| {
-        steps.next(&format!(
-            "{}: round {}, reduced χ² {:.3}, positions within {:.3} m",
-            p.stage, p.round, p.reduced_chi2, p.survey_std_m
-        ));
-    };
+    let mut progress = |p: &dyn Display| steps.next(&p.to_string());
     let mut build = |camera: &Camera| estimate::build(&config.estimator, camera);
     // Checked before the long fit.
     build(camera).with_context(in_config).map_err(Failure::Config)?;
@@ -43,10 +40,13 @@ pub fn run(args: &Args, truth_file: &Path, config: &Config, camera: &Camera) -> 
         calibrate::Error::Estimator(e) => Failure::Config(anyhow::Error::new(e).context(in_config())),
         calibrate::Error::Unusable(_) => Failure::other(e),
     })?;
+    if let (Some(path), Ok(learned)) = (&args.picture, &calibrated.spot) {
+        picture::write(path, camera, learned)?;
+    }
+    let lines = report(camera, &calibrated);
     let mut out = std::io::stdout().lock();
     if !args.json {
-        let lines = report(&calibrated).join("\n");
-        writeln!(out, "{lines}").map_err(Failure::other)?;
+        writeln!(out, "{}", lines.join("\n")).map_err(Failure::other)?;
     }
     let (before, after) = (calibrated.before, calibrated.after);
     if !(after.cost_m2 < before.cost_m2) {
@@ -80,10 +80,10 @@ pub fn run(args: &Args, truth_file: &Path, config: &Config, camera: &Camera) -> 
         )));
     }
     let mut remarks = vec!["Written by `oapwatch calibrate`; name it in [optics] calibration.".to_owned()];
-    remarks.extend(report(&calibrated));
+    remarks.extend(lines);
     file::write(&args.out, &file::render(&calibrated.fitted.calibration, &remarks)).map_err(Failure::other)?;
     match args.json {
-        true => writeln!(out, "{}", object(&calibrated, &args.out)),
+        true => writeln!(out, "{}", object(camera, &calibrated, &args.out)),
         false => writeln!(out, "written to {}", args.out.display()),
     }
     .map_err(Failure::other)
@@ -127,7 +127,7 @@ fn read_frames(
 }
 
 /// The report as JSON.
-fn object(c: &Calibrated, written: &Path) -> serde_json::Value {
+fn object(camera: &Camera, c: &Calibrated, written: &Path) -> serde_json::Value {
     let (fitted, k) = (&c.fitted, &c.fitted.calibration);
     let lines: Vec<usize> = fitted.rejected.iter().map(|b| b.line).collect();
     serde_json::json!({
@@ -144,6 +144,7 @@ fn object(c: &Calibrated, written: &Path) -> serde_json::Value {
             "radial": k.distortion.radial,
             "tangential": k.distortion.tangential,
         },
+        "spot": c.spot.as_ref().ok().map(|learned| blind::shape_object(camera, learned)),
         "spot_sigma_m": k.spot_sigma_m,
         "spot_growth": k.spot_growth,
         "noise_std_j": k.noise_std_j,
@@ -153,7 +154,7 @@ fn object(c: &Calibrated, written: &Path) -> serde_json::Value {
     })
 }
 
-fn report(c: &Calibrated) -> Vec<String> {
+fn report(camera: &Camera, c: &Calibrated) -> Vec<String> {
     let fitted = &c.fitted;
     let k = &fitted.calibration;
     let d = &k.distortion;
@@ -195,12 +196,23 @@ fn report(c: &Calibrated) -> Vec<String> {
         d.tangential[0],
         d.tangential[1]
     ));
+    match &c.spot {
+        Ok(learned) if learned.is_shape_better => lines.extend(blind::shape(camera, learned)),
+        why => {
+            lines.push(format!(
+                "spot {:.5} mm on axis, {:+.2} % at the corner",
+                1e3 * k.spot_sigma_m,
+                1e2 * k.spot_growth
+            ));
+            lines.push(match why {
+                Ok(_) => "no other shape of it explains the held-out frames better".to_owned(),
+                Err(why) => format!("no other shape of it was learned: {why}"),
+            });
+        }
+    }
     lines.push(format!(
-        "spot {:.5} mm on axis, {:+.2} % at the corner; noise {:.4e} J; positions scatter by {:.4} m beyond the noise",
-        1e3 * k.spot_sigma_m,
-        1e2 * k.spot_growth,
-        k.noise_std_j,
-        fitted.survey_std_m
+        "noise {:.4e} J; positions scatter by {:.4} m beyond the noise",
+        k.noise_std_j, fitted.survey_std_m
     ));
     lines.push(match &k.pixels {
         None => "too few frames for gain and dark maps".to_owned(),
