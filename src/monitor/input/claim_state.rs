@@ -184,6 +184,11 @@ impl Scope<'_> {
 }
 
 impl ActiveClaim {
+    /// Whether the user's beam was taken up when they claimed to be beyond the view, as they do still: it is theirs while it may be.
+    pub fn is_provisional(&self) -> bool {
+        self.before.is_provisional && !self.expected
+    }
+
     fn new(standing: &Standing, reach: Reach, before: UserTrack, scope: &Scope) -> Self {
         let claim = standing.claim;
         let position = scope.view.apparent(claim.x_m, claim.y_m, claim.z_m);

@@ -73,7 +73,8 @@ impl Memory {
                 continue;
             };
             let user = self.entry(&claim.claim.user);
-            if claim.ended {
+            let is_provisional = frame.users.get(&claim.claim.user).is_some_and(|u| u.is_provisional);
+            if claim.ended || is_provisional {
                 continue;
             }
             let confusion_m = frame.confusion_m(track);

@@ -4,6 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use super::beam_track::{GATE, Track};
 use super::eligibility::Eligibility;
+use super::identity::Identity;
 use super::tracker::Tracker;
 use crate::assign::assign;
 use crate::monitor::input::claim_state::ActiveClaim;
@@ -58,18 +59,8 @@ pub fn associate(claims: &[ActiveClaim], tracker: &Tracker, eligibility: &Eligib
     let owners: BTreeMap<u64, &ActiveClaim> = claims.iter().filter_map(|a| Some((a.before.current()?, a))).collect();
     let hit: Vec<&Track> = tracker.tracks.iter().filter(|t| t.hit).collect();
     let merged: Vec<&Track> = tracker.tracks.iter().filter(|t| t.merged_into.is_some()).collect();
-    // A frame that misses a user's beam must not let another beam nearby pass for it.
-    let is_held = |a: &ActiveClaim| {
-        let track = a.before.track.and_then(|id| tracker.get(id));
-        track.is_some_and(Track::is_just_missed)
-    };
-    let held: Vec<bool> = claims.iter().map(is_held).collect();
-    // A user's beam that goes on is theirs: no claim makes another's of it that it cannot have been taken for.
-    let has_own = |a: &ActiveClaim, track: &Track| {
-        let own = a.before.current().and_then(|id| tracker.get(id));
-        let own = own.filter(|own| own.id != track.id && own.hit && own.confirmed && own.unresolved_from.is_none());
-        own.is_some_and(|own| a.before.is_established() && own.is_old() && !own.has_met(track))
-    };
+    let identity = Identity { tracker, eligibility };
+    let held: Vec<bool> = claims.iter().map(|claim| identity.is_held(claim)).collect();
     let mut association = Association::none(claims.len());
     for tracks in [&hit, &merged] {
         let open: Vec<usize> = (0..claims.len())
@@ -84,7 +75,8 @@ pub fn associate(claims: &[ActiveClaim], tracker: &Tracker, eligibility: &Eligib
             };
             let cov = claim.association_cov(eligibility.config.tolerated_distance_m, gone_m);
             let d2 = mahalanobis2(beam - claim.position, track.filter.position_cov() + cov);
-            if d2 > GATE || !eligibility.allows(claim, track, owners.get(&track.id).copied()) || has_own(claim, track) {
+            let owner = owners.get(&track.id).copied();
+            if d2 > GATE || !eligibility.allows(claim, track, owner) || identity.refuses(claim, track) {
                 f64::INFINITY
             } else if claim.before.track == Some(track.id) {
                 d2
@@ -100,8 +92,9 @@ pub fn associate(claims: &[ActiveClaim], tracker: &Tracker, eligibility: &Eligib
         if association.track_of[i].is_none()
             && eligibility.crowding.is_evidence(claim)
             && let Some(id) = claim.before.track
-            && hit.iter().any(|t| t.id == id)
+            && hit.iter().any(|t| t.id == id && !identity.refuses(claim, t))
             && !association.contains(id)
+            && !claim.is_provisional()
         {
             association.assign(i, id);
         }

@@ -157,6 +157,13 @@ impl Track {
         has_been_near(self, other) || has_been_near(other, self)
     }
 
+    /// Whether the beam has moved by more than `least_m` since a time, and is nearer to `place` than half of that.
+    pub fn has_gone_with(&self, place: Vector2<f64>, since: Timestamp, least_m: f64) -> bool {
+        let here = self.filter.position();
+        let moved_m = self.at(since).map_or(0.0, |then| (here - then).norm());
+        moved_m > least_m && (here - place).norm() < 0.5 * moved_m
+    }
+
     /// Distance from a spot of a resolution within which the beam merges into it, m.
     fn merges_within_m(&self, resolution_m: f64) -> f64 {
         let spread = largest_eigenvalue(&self.filter.position_cov()).sqrt().min(1.0);

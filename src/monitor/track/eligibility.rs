@@ -46,7 +46,8 @@ impl Eligibility<'_> {
         // Who may be hidden beside others, as who may be out of view, is not where a beam comes on elsewhere.
         let must_be_seen = claim.expected && !claim.is_unresolvable;
         let is_anothers = owner.is_some_and(|o| o.claim.user != claim.claim.user);
-        if claim.before.track != Some(track.id) && !must_be_seen && !self.may_have_come(claim, track, owner) {
+        let is_known = claim.before.track == Some(track.id) && !claim.is_provisional();
+        if !is_known && !must_be_seen && !self.may_have_come(claim, track, owner) {
             return false;
         }
         // Who claims to be where a known light is must bring a beam of their own.

@@ -5,6 +5,7 @@ pub(super) mod beam_track;
 pub(super) mod common_course;
 pub(super) mod detection;
 pub(super) mod eligibility;
+pub(super) mod identity;
 mod kalman;
 pub(super) mod manoeuvring;
 pub(super) mod registration;

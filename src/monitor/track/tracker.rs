@@ -11,7 +11,7 @@ use crate::time::seconds;
 
 /// Handicap, in squared Mahalanobis distance, of a track whose measurement was merged into another's: a spot that two beams share
 /// stays with the track that it was followed by. Not measured.
-const MERGED_HANDICAP: f64 = 4.0;
+const MERGED_HANDICAP: f64 = 9.0;
 /// Blindness after which positions have nothing to do with those before, s. Longer gives a stranger the identity of one who has
 /// left, shorter gives users new ones. Not measured.
 const FORGET_AFTER_S: f64 = 30.0;

@@ -23,6 +23,8 @@ pub struct UserTrack {
     pub unseen_since: Option<Timestamp>,
     /// ln likelihood ratio of "absent" to "missed by chance".
     pub absence: f64,
+    /// The track was found while no beam of theirs had to be in view, as it has not had to since.
+    pub is_provisional: bool,
     /// The end of an absence, the longest of late.
     pub returned: Option<Return>,
 }

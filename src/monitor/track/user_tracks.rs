@@ -31,7 +31,9 @@ impl UserTracks {
         for (i, claim) in claims.iter().enumerate() {
             let user = self.entry(&claim.claim.user);
             if let Some(track) = association.track_id(i) {
+                let is_new = user.track != Some(track);
                 user.seen(track, now);
+                user.is_provisional = !claim.expected && (is_new || user.is_provisional);
             } else if claim.is_unresolvable || !(claim.expected || claim.may_have_left) {
                 user.unseen_since = None;
                 user.absence = 0.0;

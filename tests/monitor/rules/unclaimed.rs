@@ -50,6 +50,35 @@ fn a_beam_that_stays_after_its_claim_ended_is_unclaimed() {
     tell(&Story::new(7, actors)).expect(&[(UnclaimedEmitter, None, 12.5, 17.0)]);
 }
 
+#[test]
+fn who_shines_in_the_pauses_of_a_user_in_bursts_is_a_stranger() {
+    for (seed, away) in [(13, 4.0), (14, 7.0), (15, 10.0)] {
+        let mut actors = crowd();
+        let is_on = |t: f64| (2.0 * t) as i64 % 2 == 0;
+        actors[3] = Actor::new("u-3", |_| [-80.0, 50.0]).beam(move |t| is_on(t).then_some([-80.0, 50.0]));
+        actors.push(Actor::intruder(move |t| {
+            (t >= 20.0 && !is_on(t)).then_some([-80.0 + away, 50.0])
+        }));
+        tell(&Story::new(seed, actors)).expect(&[(UnclaimedEmitter, None, 20.0, 25.0)]);
+    }
+}
+
+/// At the edge where a user walks out of view: the user's claims go on, the stranger stays.
+#[test]
+fn a_stranger_where_a_user_left_the_view_is_not_that_user() {
+    for (seed, from_s) in [(16, 10.0), (17, 30.0)] {
+        let mut actors = crowd();
+        // The edge is at 125 m, and passed after 26 s.
+        actors[3] = Actor::new("u-3", |t| [88.0 + 1.4 * t, 20.0]);
+        actors.push(Actor::intruder(move |t| (t >= from_s).then_some([122.0, 20.0])));
+        let mut story = Story::new(seed, actors);
+        story.seconds = 60.0;
+        let told = tell(&story);
+        told.expect(&[(UnclaimedEmitter, None, from_s, from_s + 2.0)]);
+        assert!(told.cleared().is_empty(), "{:?}", told.cleared());
+    }
+}
+
 /// Step by step with a user, never near enough to share the spot for long, never claimed.
 #[test]
 fn an_eavesdropper_that_follows_a_user_is_one_alert() {

@@ -41,6 +41,23 @@ fn users_that_end_or_leave_the_view_raise_nothing() {
     tell(&Story::new(6, actors)).expect(&[]);
 }
 
+/// Neither to hide who is dark nor to blame them: the beam that goes on was somebody else's before.
+#[test]
+fn an_alerted_stranger_beside_a_user_who_goes_dark_is_not_that_user() {
+    for (seed, away) in [(20, 4.0), (21, 7.0), (22, 10.0)] {
+        let mut actors = crowd();
+        let dark = 20.0..24.0;
+        actors[3] = Actor::new("u-3", |_| [-80.0, 50.0]).beam(move |t| (!dark.contains(&t)).then_some([-80.0, 50.0]));
+        actors.push(Actor::intruder(move |t| (t >= 10.0).then_some([-80.0 + away, 50.0])));
+        let told = tell(&Story::new(seed, actors));
+        told.expect(&[
+            (UnclaimedEmitter, None, 10.0, 11.0),
+            (UserUnseen, Some("u-3"), 20.0, 22.5),
+        ]);
+        assert!(matches!(told.cleared()[..], [(UserUnseen, ..)]), "{:?}", told.cleared());
+    }
+}
+
 /// A hundred and twenty users who are nowhere, claimed for twenty seconds: some alerts of their own, one for the rest, and one of
 /// their own for a user whose beam goes off meanwhile.
 #[test]
