@@ -32,6 +32,7 @@ const TELL = {
     return [
       isNumber(e.distance_m) && ["The beam of ", user, ` is ${roughly(e.distance_m)} from the claimed place; ${isNumber(e.tolerated_distance_m) ? `${roughly(e.tolerated_distance_m)} are tolerated.` : ""}`],
       isNumber(e.mean_distance_m) && e.claims_in_window > 1 && [`Over the last ${e.claims_in_window} claims it was ${roughly(e.mean_distance_m)} on average.`],
+      e.may_be_of?.length && ["It may also be the beam of ", ...list(e.may_be_of), ": the beams were too near to each other to be told apart, and both claim to be at one place."],
       e.answered_from_elsewhere && ["Another beam is at the claimed place or answers instead."],
       Math.abs(e.clock_offset_s) > 0.5 && [`The clock of the claims is ${+Math.abs(e.clock_offset_s).toPrecision(2)} s ${e.clock_offset_s > 0 ? "ahead" : "behind"}; that has been taken into account.`],
     ];

@@ -7,9 +7,11 @@ use crate::monitor::by_user::ByUser;
 use crate::monitor::evidence::{claimed, power_against_reported};
 use crate::monitor::finding::{Cause, Content, Finding};
 use crate::monitor::frame_context::FrameContext;
+use crate::monitor::input::claim_state::ActiveClaim;
 use crate::monitor::stats::claim_consistency::{ClaimConsistency, WINDOWS};
 use crate::monitor::stats::error_budget::TestFamily;
 use crate::monitor::stats::gaussian::neg_log_p_outside;
+use crate::monitor::track::beam_track::Track;
 
 /// Frames in a row that must show a beam outside before a single claim's evidence stands. More delay the alert of a jump, fewer let
 /// one odd frame raise it.
@@ -166,11 +168,27 @@ impl User {
             "frames_outside": self.outside,
             "clock_offset_s": frame.clock_offset_s,
             "answered_from_elsewhere": self.is_displaced,
+            "may_be_of": may_be_of(frame, i, track),
             "power_against_reported": power_against_reported(frame, i),
         });
         let content = Content::new(severity, evidence).at(frame.place(track), frame.position_cov(track));
         Some(content.with_claim(claimed(claim)))
     }
+}
+
+/// Users whose beam the track may be as well: theirs and this one may have been taken for each other, and they claim to be where the user of
+/// claim `i` does.
+fn may_be_of<'a>(frame: &'a FrameContext, i: usize, track: &Track) -> Vec<&'a str> {
+    let here = frame.claims[i].position;
+    let is_there = |other: &ActiveClaim| {
+        let away_m = (other.position - here).norm();
+        away_m <= other.reach_m(frame.tolerated_distance_m(here))
+    };
+    let others = frame.claims.iter().enumerate().filter(|(j, _)| *j != i);
+    others
+        .filter(|(j, other)| is_there(other) && frame.track(*j).is_some_and(|theirs| theirs.has_met(track)))
+        .map(|(_, other)| other.claim.user.as_str())
+        .collect()
 }
 
 #[cfg(test)]
