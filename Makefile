@@ -27,10 +27,10 @@ build: setup
 	cargo build --release --locked
 
 # Tests share the program's build. Where CI is set nothing is skipped: what a test needs is installed first, and this crate (not its
-# dependencies) has overflow checks and debug assertions.
-CHECKED := --config 'profile.release.package.oapwatch.debug-assertions=true' --config 'profile.release.package.oapwatch.overflow-checks=true'
+# dependencies) has overflow checks and debug assertions, in the camera's test and the package too, so that it is built once.
+CHECKED := $(if $(CI),--config 'profile.release.package.oapwatch.debug-assertions=true' --config 'profile.release.package.oapwatch.overflow-checks=true')
 test: setup $(if $(CI),setup-test,test-skips)
-	cargo test --release --locked $(if $(CI),$(CHECKED))
+	cargo test --release --locked $(CHECKED)
 
 .PHONY: test-skips
 test-skips:
@@ -69,7 +69,7 @@ deb: setup
 	$(call need,sh -c 'command -v lintian && command -v python3 && command -v systemd-analyze',lintian python3-minimal systemd)
 	@# Earlier than 3.8, it takes the options of one unit for all.
 	@case "$$(cargo deb --version 2>/dev/null)" in 3.[89].*|3.[1-9][0-9]*|[4-9]*) ;; *) cargo install --locked cargo-deb ;; esac
-	cargo build --profile $(PROFILE) --locked
+	cargo build --profile $(PROFILE) --locked $(if $(filter release,$(PROFILE)),$(CHECKED))
 	rm -rf target/man target/completions && mkdir -p target/completions
 	target/$(PROFILE)/oapwatch man target/man
 	target/$(PROFILE)/oapwatch completions bash > target/completions/oapwatch.bash
@@ -82,7 +82,7 @@ deb: setup
 # Capture from a real V4L2 device (the kernel's virtual camera) in a virtual machine.
 test-v4l2: setup
 	$(call need,sh -c 'command -v qemu-system-x86_64 && command -v busybox && command -v depmod && command -v cpio && command -v v4l2-ctl && command -v xz',qemu-system-x86 busybox-static kmod cpio v4l-utils xz-utils)
-	cargo build --release --locked --bin oapwatch --example v4l2_guest
+	cargo build --release --locked $(CHECKED) --bin oapwatch --example v4l2_guest
 	tests/v4l2/run.sh target/release/examples/v4l2_guest target/release/oapwatch
 
 .PHONY: test-deploy
