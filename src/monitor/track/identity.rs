@@ -25,16 +25,13 @@ impl Identity<'_> {
         own.is_some_and(|own| own.is_just_missed() || is_in_pause())
     }
 
+    /// Whether the track is somebody else's.
     pub fn refuses(&self, claim: &ActiveClaim, track: &Track) -> bool {
         self.has_own(claim, track) || self.was_beside(claim, track) || self.has_left(claim, track)
     }
 
     fn last_track(&self, claim: &ActiveClaim) -> Option<&Track> {
         self.tracker.get(claim.before.track?)
-    }
-
-    fn is_alerted(&self, track: &Track) -> bool {
-        self.eligibility.alerts.is_open(&Cause::Track(track.id))
     }
 
     /// A user's beam that goes on is theirs: no claim makes another's of it that it cannot have been taken for.
@@ -64,8 +61,9 @@ impl Identity<'_> {
         let here = track.filter.position();
         let away_m = (track.at(claim.made).unwrap_or(here) - claim.position).norm();
         let is_here = |t: &&Track| (t.filter.position() - here).norm() <= track.detection.resolution_m;
+        let is_alerted = |t: &Track| self.eligibility.alerts.is_open(&Cause::Track(t.id));
         away_m > self.eligibility.config.tolerated_distance_m + LEFT * claim.variance.sqrt()
-            && self.tracker.tracks.iter().filter(is_here).any(|t| self.is_alerted(t))
+            && self.tracker.tracks.iter().filter(is_here).any(is_alerted)
     }
 }
 
